@@ -82,6 +82,7 @@ def assert_goes_on_at_the_kink(branch):
     assert changes[i - 1] < 1.1 * max(changes[i - 2], changes[i])
 
 
+@pytest.mark.slow
 def test_a_branch_goes_on_where_contacts_change_their_order():
     branch = continue_friction(250.0, 0.3296, 0.3292, 0.3296)
     assert branch.values[[0, -1]].tolist() == [0.3292, 0.3296]

@@ -385,7 +385,6 @@ def test_long_double_support_is_found_if_round_off_exceeds_the_tolerance():
     np.testing.assert_array_equal(solution, first_cycles.found)
 
 
-@pytest.mark.slow
 def test_a_cycle_walked_twice_has_the_multipliers_squared():
     once = vrw.limit_cycle(vrw.WheelParams())
     twice = vrw.limit_cycle(vrw.WheelParams(), guess=once, period_n=2)

@@ -25,7 +25,12 @@ def compute_reference_margins(index):
     )
 
 
-@pytest.mark.parametrize("by_lanes", [*mark_slow(False), True], ids=["wheel", "lanes"])
+BOTH_ENGINES = pytest.mark.parametrize(
+    "by_lanes", [*mark_slow(False), True], ids=["wheel", "lanes"]
+)
+
+
+@BOTH_ENGINES
 @pytest.mark.parametrize(
     "index",
     [*mark_slow(0, 1), 5],
@@ -68,11 +73,15 @@ def test_every_margin_equals_the_reference(index, by_lanes):
     )
 
 
-def test_energy_losses_equal_the_reference():
+@BOTH_ENGINES
+def test_energy_losses_equal_the_reference(by_lanes):
     start = reference_values.stack_quantity("step", "start")[0]
     reference = five_coordinates.step(five_coordinates.TABLE_1, start)
     solution = compute_full_steps(
-        reference_values.REFERENCE_PARAMETERS[0], start, vrw.StepOptions.tight()
+        reference_values.REFERENCE_PARAMETERS[0],
+        start,
+        vrw.StepOptions.tight(),
+        uses_lane_engine=by_lanes,
     )
     for ours, theirs in [
         (solution.energy.landing, "energy_lost_landing"),
@@ -82,14 +91,18 @@ def test_energy_losses_equal_the_reference():
         np.testing.assert_allclose(ours[0], reference[theirs], rtol=1e-9, atol=1e-10)
 
 
-def test_the_step_of_the_reference_code_agrees():
+@BOTH_ENGINES
+def test_the_step_of_the_reference_code_agrees(by_lanes):
     for index in CASE_INDICES:
         params = {k: float(v) for k, v in reference_values.REFERENCE_CASES[index]["params"].items()}
         params["n_legs"] = int(params["n_legs"])
         start = reference_values.stack_quantity("step", "start")[index]
         reference = five_coordinates.step(params, start)
         solution = compute_full_steps(
-            reference_values.REFERENCE_PARAMETERS[index], start, vrw.StepOptions.tight()
+            reference_values.REFERENCE_PARAMETERS[index],
+            start,
+            vrw.StepOptions.tight(),
+            uses_lane_engine=by_lanes,
         )
         np.testing.assert_allclose(
             solution.section_state[0], reference["section_state"], atol=1e-11
@@ -97,13 +110,12 @@ def test_the_step_of_the_reference_code_agrees():
         np.testing.assert_allclose(solution.durations[0], reference["durations"], atol=1e-11)
 
 
-def assert_agrees_with_reference(vector, start):
+def assert_agrees_with_reference(vector, start, by_lanes):
     """Require the same outcome, durations and next state, for every branch of Section 5.1."""
     params = dict(zip(NAMES, map(float, vector), strict=True)) | {"n_legs": 8}
     reference = five_coordinates.step(params, start)
-    solution = jax.tree.map(
-        lambda leaf: leaf[0], compute_full_steps(vector, start, vrw.StepOptions.tight())
-    )
+    steps = compute_full_steps(vector, start, vrw.StepOptions.tight(), uses_lane_engine=by_lanes)
+    solution = jax.tree.map(lambda leaf: leaf[0], steps)
     assert reference["outcome"] == five_coordinates.STEPPED
     assert int(solution.outcome) == vrw.Outcome.STEPPED
     np.testing.assert_allclose(solution.durations, reference["durations"], atol=1e-10)
@@ -111,18 +123,20 @@ def assert_agrees_with_reference(vector, start):
     return solution
 
 
-def test_a_landing_that_would_pull_the_rear_foot_frees_it():
+@BOTH_ENGINES
+def test_a_landing_that_would_pull_the_rear_foot_frees_it(by_lanes):
     # (A3): Leg 1 extends before the landing.
     vector = make_parameter_rows(damping=60.0, slope=0.23)[0]
-    solution = assert_agrees_with_reference(vector, np.array([0.34, 1.35, 1.14]))
+    solution = assert_agrees_with_reference(vector, np.array([0.34, 1.35, 1.14]), by_lanes)
     assert float(solution.indicators.lambda_I4) < 0.0
     assert float(solution.durations[0]) == 0.0
 
 
-def test_a_rear_foot_without_load_after_the_landing_skips_double_support():
+@BOTH_ENGINES
+def test_a_rear_foot_without_load_after_the_landing_skips_double_support(by_lanes):
     # (B3): the impulse holds the rear foot, the damper then pulls it up.
     vector = make_parameter_rows(damping=225.0, slope=0.39)[0]
-    solution = assert_agrees_with_reference(vector, np.array([0.34, 1.63, -0.43]))
+    solution = assert_agrees_with_reference(vector, np.array([0.34, 1.63, -0.43]), by_lanes)
     assert float(solution.indicators.lambda_I4) > 0.0
     assert float(solution.indicators.lambda_4) < 0.0
     assert float(solution.durations[0]) == 0.0

@@ -48,7 +48,7 @@ def test_a_solver_that_runs_out_of_steps_is_a_code():
     assert int(result.solver_steps) >= vrw.StepOptions().max_solver_steps
 
 
-@pytest.mark.parametrize("engine", ["lanes", "diffrax"])
+@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
 @pytest.mark.parametrize("model", [None, vrw.UnilateralWheel()], ids=lambda m: type(m).__name__)
 def test_a_step_without_touchdown_ends_at_the_time_limit(model, engine):
     options = vrw.StepOptions(max_phase_time=0.15, engine=engine)

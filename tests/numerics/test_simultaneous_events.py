@@ -40,7 +40,9 @@ def height_at(time, start):
     return RESTITUTION * G * impact * left - 0.5 * G * left**2
 
 
-@pytest.mark.parametrize("options", [vrw.StepOptions(), TIGHT], ids=["default", "tight"])
+@pytest.mark.parametrize(
+    "options", [*mark_slow(vrw.StepOptions()), TIGHT], ids=["default", "tight"]
+)
 @pytest.mark.parametrize("n", [*mark_slow(2), 3])
 def test_balls_that_land_together_have_the_derivatives_of_one_ball(n, options):
     jacobian = jax.jit(jax.jacfwd(lambda start: heights_at(0.7, start, n, options)))

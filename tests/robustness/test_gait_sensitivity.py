@@ -92,6 +92,7 @@ def test_norms_are_infinite_at_unstable_gaits_of_a_branch():
     assert np.isinf(norm_values[-1])
 
 
+@pytest.mark.slow
 def test_the_linear_map_is_that_of_differences_of_walks():
     # Central differences with steps of 1e-4 have errors near 1e-9 of derivatives near 1.
     cycle, h = vrw.limit_cycle(TABLE_1), 1e-4
@@ -114,6 +115,7 @@ def test_the_linear_map_is_that_of_differences_of_walks():
         assert abs(extrapolated - exact[i]) < 1e-8, i
 
 
+@pytest.mark.slow
 def test_gradients_are_central_differences():
     norm = lambda damping: vrw.gait_sensitivity(vrw.WheelParams(damping=damping), "period").norm[0]
     gradient, h = float(jax.jit(jax.grad(norm))(180.0)), 0.05

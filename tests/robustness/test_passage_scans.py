@@ -60,6 +60,7 @@ def run_command(*arguments: object) -> object:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+@pytest.mark.slow
 def test_the_command_prints_one_wheel(tmp_path: Path) -> None:
     config = tmp_path / "one.toml"
     config.write_text(f"[scan]\nslope_sd = {SLOPE_SD}\n")

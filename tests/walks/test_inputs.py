@@ -128,6 +128,7 @@ def test_a_program_that_a_process_made_in_32_bits_is_not_used_in_64():
     assert embed_section_states(rows, states, n_legs).dtype == np.float64
 
 
+@pytest.mark.slow
 def test_float32_works_if_requested():
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), vrw.WheelParams())
     start = vrw.paper_start().astype(jnp.float32)
