@@ -19,7 +19,7 @@ from tests.support.package_graph import PACKAGE_LAYERS, ImportGraph
 from vrw_jax.figures import DARK_GRAY_COLOR, PAGE_FIGURE_WIDTH_INCHES, figure_style, save
 
 ROOT = Path(__file__).parents[2]
-STEP, WIDTH, HEIGHT = 1.0, 4.3, 0.74
+STEP, WIDTH, HEIGHT = 1.0, 4.9, 0.74
 """Distance between packages, and the size of a package's box, in rows."""
 
 IMPORTS_COLOR, IMPORTED_COLOR = "#0072B2", "#D55E00"
