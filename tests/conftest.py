@@ -21,8 +21,11 @@ PACKAGE_POSITIONS = [
     if place.is_dir() and place.name != UNCHECKED_PACKAGE
 ]
 
-MAX_MEMORY_BYTES = 3_000_000_000
-"""Memory of a process above which programs are forgotten: all programs of the suite need 9 GB."""
+MAX_MEMORY_BYTES = psutil.virtual_memory().total // 5
+"""Memory of a process above which programs are forgotten.
+
+There are two processes, and all programs of the suite need several gigabytes in each.
+"""
 
 LONGEST_COMPILATIONS = (
     "test_continuation", "test_limit_cycle", "test_unilateral", "test_any_system", "test_reaching",

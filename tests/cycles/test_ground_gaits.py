@@ -282,7 +282,8 @@ def unilateral_batch():
     return damping, friction, states, walked
 
 
-def test_unilateral_batches_equal_single_wheels(unilateral_batch):
+@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+def test_unilateral_batches_equal_single_wheels(unilateral_batch, engine):
     damping, friction, states, walk_result = unilateral_batch
     solution = walk_result(slice(None))
     assert solution.engine == "lanes"
@@ -292,7 +293,7 @@ def test_unilateral_batches_equal_single_wheels(unilateral_batch):
         ground = vrw.UnilateralWheel(friction=friction[i])
         params, x, count = vrw.WheelParams(damping=damping[i]), states[i], 0
         while True:  # step by step: other tests have the program
-            step = vrw.step(params, x, model=ground, options=TIGHT_OPTIONS, engine="diffrax")
+            step = vrw.step(params, x, model=ground, options=TIGHT_OPTIONS, engine=engine)
             x, count = step.section_state, count + int(step.outcome == vrw.Outcome.STEPPED)
             if step.outcome != vrw.Outcome.STEPPED or count == 3:
                 break

@@ -198,7 +198,7 @@ def test_under_vmap_a_finer_mesh_finds_that_orbit_from_each_point(ten_step_orbit
 
 @pytest.mark.parametrize(
     "model",
-    [None, vrw.UnilateralWheel(), *mark_slow(vrw.RigidWheel())],
+    [None, *mark_slow(vrw.UnilateralWheel(), vrw.RigidWheel())],
     ids=lambda m: type(m).__name__,
 )
 def test_a_batch_of_no_wheels_has_no_cycles(model):

@@ -77,9 +77,13 @@ def test_derivative_error_is_at_most_ten_times_the_value_error():
         assert of_derivatives < 10.0 * of_values
 
 
-def test_indicators_impact_and_step_length_are_accurate():
+@pytest.mark.parametrize("by_lanes", [*mark_slow(False), True], ids=["wheel", "lanes"])
+def test_indicators_impact_and_step_length_are_accurate(by_lanes):
     solution = compute_full_steps(
-        reference_values.REFERENCE_PARAMETERS, STARTS, vrw.StepOptions.tight()
+        reference_values.REFERENCE_PARAMETERS,
+        STARTS,
+        vrw.StepOptions.tight(),
+        uses_lane_engine=by_lanes,
     )
     assert np.all(np.asarray(solution.outcome) == vrw.Outcome.STEPPED)
     for quantity, key in [
