@@ -109,8 +109,13 @@ OUTCOMES = {
 }
 """By function: the outcome of a step from `LIFT_OFF_START`."""
 
+SLOW_OUTCOMES = ("simulate", "walk")
+"""Functions with a program of their own for the same step."""
 
-@pytest.mark.parametrize("name", OUTCOMES)
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW_OUTCOMES)) for n in OUTCOMES]
+)
 def test_steps_continue_after_lift_off_only_if_the_model_allows_it(name):
     lifted, held_values = (
         int(OUTCOMES[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops)))

@@ -87,7 +87,7 @@ def test_values_and_from_values_of_a_model_are_inverse_to_each_other(model: Abst
         assert float(ground.friction) == 1.25
 
 
-@pytest.mark.parametrize("period_n", [2, *mark_slow(1)])
+@pytest.mark.parametrize("period_n", mark_slow(2, 1))
 def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is(period_n):
     """A rigid wheel's steps all contract towards one: it has gaits of one step alone."""
     model, wheel, start = (
@@ -113,6 +113,7 @@ def test_minimal_periods_of_several_wheels_are_found_under_vmap():
     np.testing.assert_array_equal(every.minimal_period, [0, 1])
 
 
+@pytest.mark.slow
 def test_a_cycle_of_two_steps_has_two_as_its_minimal_period():
     """The ends of its steps differ; made up from a gait of one step."""
     model, wheel = vrw.RigidWheel(held_landing=True), vrw.WheelParams(slope=0.1)

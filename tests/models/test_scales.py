@@ -58,7 +58,7 @@ def test_a_step_is_the_same_in_other_units():
 UNIT_SCALED_NAMES = [PARAMETER_NAMES[last] for last in UNIT_SCALING_BY_PARAMETER_INDEX]
 
 
-@pytest.mark.parametrize("name", [UNIT_SCALED_NAMES[0], *mark_slow(*UNIT_SCALED_NAMES[1:])])
+@pytest.mark.parametrize("name", mark_slow(*UNIT_SCALED_NAMES))
 def test_tangents_derived_from_units_equal_those_of_the_step(name):
     """A single column is propagated through the step; with all columns, units give two of them."""
     table, start, length, time = random_batch()

@@ -65,8 +65,8 @@ CALLS = {
     "simulate_hybrid": simulate_ball,
 }
 
-SLOW_CALLS = ("grad", "continue_branch", "tune")
-"""Calls that trace for seconds under each setting."""
+SLOW_CALLS = ("grad", "continue_branch", "tune", "unilateral contact")
+"""Calls that are traced or compiled for seconds."""
 
 
 @pytest.mark.parametrize(

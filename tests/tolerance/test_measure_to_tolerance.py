@@ -22,6 +22,7 @@ def exact_measures():
     )
 
 
+@pytest.mark.slow
 def test_measures_equal_those_of_the_paper_if_feet_cannot_slip():
     measured = vrw.measure_to_tolerance("speed", TABLE_1, 1e-6, friction=math.inf)
     assert measured.model == "viscoelastic"
