@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference_code import moreau_jean
-from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.contact.contact_state import ContactState, make_guard_layout
@@ -159,19 +158,37 @@ def test_batches_with_one_sided_stoppers_equal_single_wheels():
         np.testing.assert_allclose(batch_result.durations[i].sum(), single.period, atol=1e-9)
 
 
-@pytest.mark.parametrize("tolerance", [*mark_slow(5e-12, 5e-13), 1e-13])
-def test_round_off_does_not_repeat_the_event_of_a_released_contact(tolerance):
-    """Wheels apart by rounding alone: a leg let go from rest reads zero for 1e-8 s and longer."""
-    wheels, friction = 64, 0.7
+def compute_periods_of_close_wheels(tolerance):
+    """Return the periods of 64 wheels whose damping differs by little more than rounding."""
+    n_wheels = 64
     batch_result = vrw.step_batch(
-        vrw.WheelParams(damping=200.0 * (1.0 + 1e-12 * np.arange(wheels))),
-        np.tile(START, (wheels, 1)),
+        vrw.WheelParams(damping=200.0 * (1.0 + 1e-12 * np.arange(n_wheels))),
+        np.tile(START, (n_wheels, 1)),
         1,
-        model=make_model(friction),
+        model=make_model(0.7),
         options=vrw.StepOptions(rtol=tolerance, atol=tolerance),
     )
     assert np.all(np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED)
-    assert np.ptp(batch_result.durations.sum(1)) < 1e-10
+    return batch_result.durations.sum(1)
+
+
+CLOSE_TOLERANCES = [5e-12, 5e-13, 1e-13]
+
+
+@pytest.mark.parametrize("tolerance", CLOSE_TOLERANCES)
+def test_round_off_does_not_repeat_the_event_of_a_released_contact(tolerance):
+    """A leg that is released from rest reads zero for 1e-8 s and longer."""
+    assert np.ptp(compute_periods_of_close_wheels(tolerance)) < 1e-10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tolerance", CLOSE_TOLERANCES)
+def test_periods_of_close_wheels_are_those_of_diffrax(tolerance):
+    options = TIGHT_OPTIONS.with_engine("diffrax")
+    period = compute_step(0.7, 200.0, options=options).period
+    np.testing.assert_allclose(
+        compute_periods_of_close_wheels(tolerance), period, rtol=0, atol=1e-10
+    )
 
 
 @pytest.mark.slow
