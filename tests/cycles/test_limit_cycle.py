@@ -122,6 +122,7 @@ def test_first_derivatives_agree_with_the_reference(options, allowed):
         assert compute_relative_error(derivative, expected) < allowed, name
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not simd.is_machine_code_available(), reason="machine code is for CPUs")
 def test_gradients_of_multipliers_use_machine_code_throughout():
     radius = lambda vector: vrw.limit_cycle(reference_values.make_wheel(vector)).spectral_radius

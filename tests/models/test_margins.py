@@ -142,6 +142,7 @@ def test_a_rear_foot_without_load_after_the_landing_skips_double_support(by_lane
     assert float(solution.durations[0]) == 0.0
 
 
+@pytest.mark.slow
 def test_batches_have_all_measures_of_a_single_step():
     # Gaits, steps without double support (A3, B3), falls and a bad wheel, side by side.
     parameter_rows = make_parameter_rows(
