@@ -173,7 +173,7 @@ def test_every_printed_symbol_has_a_spelling_in_ascii() -> None:
             assert "?" not in spelled, (text, spelled)
 
 
-@pytest.mark.parametrize("encoding", ["ascii", *mark_slow("cp1252")])
+@pytest.mark.parametrize("encoding", mark_slow("ascii", "cp1252"))
 def test_a_gait_is_printed_on_a_terminal_without_greek_letters(encoding: str) -> None:
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "200"}
@@ -298,6 +298,7 @@ def test_every_kind_of_design_is_drawn(design: str, config: Path) -> None:
     assert (config.parent / "here" / "scan.png").stat().st_size > 5000
 
 
+@pytest.mark.slow
 def test_many_parameters_at_once_are_drawn_in_pairs_with_their_sobol_indices(config: Path) -> None:
     config.write_text(
         "[saltelli]\nn = 256\ndamping = [100.0, 101.0]\nslope = [0.29, 0.3]\n"

@@ -72,6 +72,7 @@ def draw_wheels_on_gentle_slopes():
     return params, np.stack([draw(*ends, N_RESTING) for ends in limits], 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-10])
 def test_a_wheel_at_rest_has_the_same_outcome_from_every_engine(tolerance):
     params, starts = draw_wheels_on_gentle_slopes()

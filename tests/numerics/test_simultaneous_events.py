@@ -83,6 +83,7 @@ def test_a_start_on_a_falling_guard_has_the_event_time_s_derivatives(height, sol
         np.testing.assert_allclose(second, reference, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_starts_on_and_above_a_guard_have_right_derivatives_in_one_batch():
     starts = jnp.array([[0.0, -2.0], [0.3, -2.0], [0.0, -1.0], [1e-12, -2.0]])
     first = jax.vmap(jax.jacfwd(lambda y: thrown(y, TIGHT)))(starts)
@@ -90,6 +91,7 @@ def test_starts_on_and_above_a_guard_have_right_derivatives_in_one_batch():
     np.testing.assert_allclose(first, reference, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_saltation_matrices_of_coinciding_events_are_composed_in_order():
     """Three constant fields, two planes that are met in the same point, and linear resets that do
     not commute: R. I. Leine and H. Nijmeijer, Dynamics and Bifurcations of Non-Smooth Mechanical

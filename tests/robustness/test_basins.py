@@ -34,6 +34,7 @@ def smallest():
     return vrw.smallest_disturbance(TABLE_1)
 
 
+@pytest.mark.slow
 def test_the_share_of_the_rigid_wheel_is_that_of_its_closed_form():
     # The landing keeps cos(2 half) of the rate, which must then exceed the critical one.
     lowest = critical_rate(-HALF_ANGLE) / np.cos(2.0 * HALF_ANGLE)

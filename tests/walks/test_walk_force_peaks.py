@@ -23,6 +23,7 @@ def test_peaks_of_a_sampled_step_are_those_of_its_gait():
     np.testing.assert_array_equal(peaks.force_step, [0, 0, 0, 1, 1, 1])
 
 
+@pytest.mark.slow
 def test_peaks_with_unilateral_contact_are_those_of_another_code():
     x = np.asarray(vrw.limit_cycle(TWO_PEAKS).section_state)
     model = vrw.UnilateralWheel(friction=0.8)
