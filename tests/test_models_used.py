@@ -5,6 +5,7 @@ import inspect
 import jax
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow_names
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
@@ -80,7 +81,7 @@ SLOW_FUNCTIONS = {
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW_FUNCTIONS)) for n in FRICTION],
+    mark_slow_names(FRICTION, SLOW_FUNCTIONS),
 )
 def test_friction_margins_use_the_friction_of_the_model(name):
     rows = [float(FRICTION[name](vrw.ViscoelasticWheel(friction=mu))) for mu in (1.0, 20.0)]
@@ -113,9 +114,7 @@ SLOW_OUTCOMES = ("simulate", "walk")
 """Functions with a program of their own for the same step."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW_OUTCOMES)) for n in OUTCOMES]
-)
+@pytest.mark.parametrize("name", mark_slow_names(OUTCOMES, SLOW_OUTCOMES))
 def test_steps_continue_after_lift_off_only_if_the_model_allows_it(name):
     lifted, held_values = (
         int(OUTCOMES[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops)))
@@ -225,9 +224,7 @@ GAITS = {
 """By function: whether it tells of that gait."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW_FUNCTIONS)) for n in GAITS]
-)
+@pytest.mark.parametrize("name", mark_slow_names(GAITS, SLOW_FUNCTIONS))
 def test_a_gait_beyond_lift_off_is_found_only_if_the_model_allows_it(name):
     lifted, held_values = (
         bool(GAITS[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops))) for stops in (True, False)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from support.slow_variants import mark_slow_names
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import HybridSolution, Termination
@@ -41,11 +42,7 @@ def get_documentation(name):
     return inspect.getdoc(operator.attrgetter(name)(vrw)) or ""
 
 
-def mark_if_slow(name):
-    return pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_EXAMPLES else [])
-
-
-@pytest.mark.parametrize("name", [*map(mark_if_slow, [*NAMES, *FIGURE_FUNCTIONS])])
+@pytest.mark.parametrize("name", mark_slow_names([*NAMES, *FIGURE_FUNCTIONS], SLOW_EXAMPLES))
 def test_the_example_of_a_public_name_runs_unchanged(name, monkeypatch):
     text = get_documentation(name)
     monkeypatch.setattr(vrw, "start_jax", lambda *_: None)  # it has started

@@ -50,7 +50,8 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: evaluate_arithmetically)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))  # leave the suite's own as it is
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)  # for child processes
     path = tmp_path / "small.toml"
     path.write_text(SCAN_CONFIG)
     return path
@@ -461,11 +462,7 @@ main()
 """
 
 
-def test_a_second_ctrl_c_ends_a_scan_at_once_with_one_sentence(
-    config: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache))
+def test_a_second_ctrl_c_ends_a_scan_at_once_with_one_sentence(config: Path) -> None:
     code = INTERRUPTED_SCAN_SCRIPT.format(tests=str(Path(__file__).parents[1]), config=str(config))
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], text=True, **pipes) as process:  # type: ignore[call-overload]

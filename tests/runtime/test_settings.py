@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow_names
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
@@ -69,9 +70,7 @@ SLOW_CALLS = ("grad", "continue_branch", "tune", "unilateral contact")
 """Calls that are traced or compiled for seconds."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=[pytest.mark.slow] * (x in SLOW_CALLS)) for x in CALLS]
-)
+@pytest.mark.parametrize("name", mark_slow_names(CALLS, SLOW_CALLS))
 def test_strict_settings_of_the_process_change_no_bit(name):
     results = [np.asarray(leaf) for leaf in jax.tree.leaves(CALLS[name]())]
     for setting, value in STRICT_SETTINGS:

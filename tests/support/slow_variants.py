@@ -1,5 +1,6 @@
-"""Marks further variants of a quick test as slow."""
+"""Marks variants of a test as slow."""
 
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import pytest
@@ -14,3 +15,8 @@ def mark_slow(*variants: Any) -> list[Any]:
         pytest.param(*(x if isinstance(x, tuple) else (x,)), marks=pytest.mark.slow)
         for x in variants
     ]
+
+
+def mark_slow_names(names: Iterable[str], slow_names: Collection[str]) -> list[Any]:
+    """Return the names as values of a parametrized test, those in `slow_names` marked as slow."""
+    return [pytest.param(x, marks=[pytest.mark.slow] * (x in slow_names)) for x in names]
