@@ -22,9 +22,9 @@ PACKAGE_POSITIONS = [
 ]
 
 MAX_MEMORY_BYTES = psutil.virtual_memory().total // 5
-"""Memory of a process above which programs are forgotten.
+"""Memory of a test process above which JAX's caches are cleared.
 
-There are two processes, and all programs of the suite need several gigabytes in each.
+There are two test processes, and the caches of all tests need several gigabytes in each.
 """
 
 LONGEST_COMPILATIONS = (

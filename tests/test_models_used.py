@@ -5,7 +5,7 @@ import inspect
 import jax
 import numpy as np
 import pytest
-from support.slow_variants import mark_slow_names
+from support.slow_variants import make_params_with_slow_marks
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
@@ -81,7 +81,7 @@ SLOW_FUNCTIONS = {
 
 @pytest.mark.parametrize(
     "name",
-    mark_slow_names(FRICTION, SLOW_FUNCTIONS),
+    make_params_with_slow_marks(FRICTION, SLOW_FUNCTIONS),
 )
 def test_friction_margins_use_the_friction_of_the_model(name):
     rows = [float(FRICTION[name](vrw.ViscoelasticWheel(friction=mu))) for mu in (1.0, 20.0)]
@@ -110,11 +110,11 @@ OUTCOMES = {
 }
 """By function: the outcome of a step from `LIFT_OFF_START`."""
 
-SLOW_OUTCOMES = ("simulate", "walk")
-"""Functions with a program of their own for the same step."""
+SLOW_OUTCOME_FUNCTIONS = ("simulate", "walk")
+"""Functions that compile a program of their own for the same walking step."""
 
 
-@pytest.mark.parametrize("name", mark_slow_names(OUTCOMES, SLOW_OUTCOMES))
+@pytest.mark.parametrize("name", make_params_with_slow_marks(OUTCOMES, SLOW_OUTCOME_FUNCTIONS))
 def test_steps_continue_after_lift_off_only_if_the_model_allows_it(name):
     lifted, held_values = (
         int(OUTCOMES[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops)))
@@ -224,7 +224,7 @@ GAITS = {
 """By function: whether it tells of that gait."""
 
 
-@pytest.mark.parametrize("name", mark_slow_names(GAITS, SLOW_FUNCTIONS))
+@pytest.mark.parametrize("name", make_params_with_slow_marks(GAITS, SLOW_FUNCTIONS))
 def test_a_gait_beyond_lift_off_is_found_only_if_the_model_allows_it(name):
     lifted, held_values = (
         bool(GAITS[name](vrw.ViscoelasticWheel(stop_at_lift_off=stops))) for stops in (True, False)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from support.slow_variants import mark_slow_names
+from support.slow_variants import make_params_with_slow_marks
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import HybridSolution, Termination
@@ -42,7 +42,9 @@ def get_documentation(name):
     return inspect.getdoc(operator.attrgetter(name)(vrw)) or ""
 
 
-@pytest.mark.parametrize("name", mark_slow_names([*NAMES, *FIGURE_FUNCTIONS], SLOW_EXAMPLES))
+@pytest.mark.parametrize(
+    "name", make_params_with_slow_marks([*NAMES, *FIGURE_FUNCTIONS], SLOW_EXAMPLES)
+)
 def test_the_example_of_a_public_name_runs_unchanged(name, monkeypatch):
     text = get_documentation(name)
     monkeypatch.setattr(vrw, "start_jax", lambda *_: None)  # it has started

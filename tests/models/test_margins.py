@@ -25,12 +25,12 @@ def compute_reference_margins(index):
     )
 
 
-BOTH_ENGINES = pytest.mark.parametrize(
+PARAMETRIZE_BY_ENGINE = pytest.mark.parametrize(
     "by_lanes", [*mark_slow(False), True], ids=["wheel", "lanes"]
 )
 
 
-@BOTH_ENGINES
+@PARAMETRIZE_BY_ENGINE
 @pytest.mark.parametrize(
     "index",
     [*mark_slow(0, 1), 5],
@@ -73,7 +73,7 @@ def test_every_margin_equals_the_reference(index, by_lanes):
     )
 
 
-@BOTH_ENGINES
+@PARAMETRIZE_BY_ENGINE
 def test_energy_losses_equal_the_reference(by_lanes):
     start = reference_values.stack_quantity("step", "start")[0]
     reference = five_coordinates.step(five_coordinates.TABLE_1, start)
@@ -91,7 +91,7 @@ def test_energy_losses_equal_the_reference(by_lanes):
         np.testing.assert_allclose(ours[0], reference[theirs], rtol=1e-9, atol=1e-10)
 
 
-@BOTH_ENGINES
+@PARAMETRIZE_BY_ENGINE
 def test_the_step_of_the_reference_code_agrees(by_lanes):
     for index in CASE_INDICES:
         params = {k: float(v) for k, v in reference_values.REFERENCE_CASES[index]["params"].items()}
@@ -123,7 +123,7 @@ def assert_agrees_with_reference(vector, start, by_lanes):
     return solution
 
 
-@BOTH_ENGINES
+@PARAMETRIZE_BY_ENGINE
 def test_a_landing_that_would_pull_the_rear_foot_frees_it(by_lanes):
     # (A3): Leg 1 extends before the landing.
     vector = make_parameter_rows(damping=60.0, slope=0.23)[0]
@@ -132,7 +132,7 @@ def test_a_landing_that_would_pull_the_rear_foot_frees_it(by_lanes):
     assert float(solution.durations[0]) == 0.0
 
 
-@BOTH_ENGINES
+@PARAMETRIZE_BY_ENGINE
 def test_a_rear_foot_without_load_after_the_landing_skips_double_support(by_lanes):
     # (B3): the impulse holds the rear foot, the damper then pulls it up.
     vector = make_parameter_rows(damping=225.0, slope=0.39)[0]

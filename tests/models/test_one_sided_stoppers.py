@@ -158,8 +158,8 @@ def test_batches_with_one_sided_stoppers_equal_single_wheels():
         np.testing.assert_allclose(batch_result.durations[i].sum(), single.period, atol=1e-9)
 
 
-def compute_periods_of_close_wheels(tolerance):
-    """Return the periods of 64 wheels whose damping differs by little more than rounding."""
+def compute_periods_of_nearly_equal_wheels(tolerance):
+    """Return the step periods of 64 wheels whose dampings differ by little more than rounding."""
     n_wheels = 64
     batch_result = vrw.step_batch(
         vrw.WheelParams(damping=200.0 * (1.0 + 1e-12 * np.arange(n_wheels))),
@@ -177,17 +177,17 @@ CLOSE_TOLERANCES = [5e-12, 5e-13, 1e-13]
 
 @pytest.mark.parametrize("tolerance", CLOSE_TOLERANCES)
 def test_round_off_does_not_repeat_the_event_of_a_released_contact(tolerance):
-    """A leg that is released from rest reads zero for 1e-8 s and longer."""
-    assert np.ptp(compute_periods_of_close_wheels(tolerance)) < 1e-10
+    """A contact released from rest keeps a gap that is computed as zero for at least 1e-8 s."""
+    assert np.ptp(compute_periods_of_nearly_equal_wheels(tolerance)) < 1e-10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance", CLOSE_TOLERANCES)
-def test_periods_of_close_wheels_are_those_of_diffrax(tolerance):
+def test_periods_of_nearly_equal_wheels_are_those_of_diffrax(tolerance):
     options = TIGHT_OPTIONS.with_engine("diffrax")
     period = compute_step(0.7, 200.0, options=options).period
     np.testing.assert_allclose(
-        compute_periods_of_close_wheels(tolerance), period, rtol=0, atol=1e-10
+        compute_periods_of_nearly_equal_wheels(tolerance), period, rtol=0, atol=1e-10
     )
 
 

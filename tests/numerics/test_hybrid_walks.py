@@ -170,7 +170,7 @@ def test_one_mode_and_one_guard_may_be_given_without_a_tuple():
             simulate_hybrid(modes, start, events=3)
 
 
-def drop_twice(height, restitution=0.8):
+def simulate_two_bounces(height, restitution=0.8):
     return simulate_hybrid(
         Mode(*bouncing(restitution)), jnp.stack([height, 0.0 * height]), events=2
     )
@@ -184,14 +184,14 @@ def drop_twice(height, restitution=0.8):
             lambda time: jax.jit(jax.jacrev(time))(1.0),
             lambda time: jax.vmap(jax.grad(time))(jnp.ones(2)),
             lambda time: jax.hessian(time)(1.0),
-            lambda _: jax.grad(lambda share: drop_twice(1.0, share).state[1])(0.8),
+            lambda _: jax.grad(lambda share: simulate_two_bounces(1.0, share).state[1])(0.8),
         ),
     ],
     ids=["grad", "jit", "vmap", "hessian", "closure"],
 )
 def test_reverse_mode_is_refused_in_a_sentence_that_names_forward_mode(differentiate):
     with pytest.raises(ValueError, match=r"has no .* use forward mode, jax.jacf"):
-        differentiate(lambda height: drop_twice(height).time)
+        differentiate(lambda height: simulate_two_bounces(height).time)
 
 
 def test_segment_maps_refuse_reverse_mode_in_a_sentence():
@@ -202,15 +202,15 @@ def test_segment_maps_refuse_reverse_mode_in_a_sentence():
 
 
 def test_forward_mode_of_a_batch_gives_the_closed_form():
-    time = lambda height: drop_twice(height).time
+    time = lambda height: simulate_two_bounces(height).time
     forwards = jax.vmap(jax.jit(jax.jacfwd(time)))(jnp.ones(2))
     np.testing.assert_allclose(forwards, 0.5 * 2.6 * np.sqrt(2.0 / 9.81), rtol=1e-12)
 
 
-def make_speeding_map(height, options=None):
-    """Return the map of a floor that gives back half of the rate and 2 m/s more.
+def make_rebound_map(height, options=None):
+    """Return the return map of a ball that rebounds at half of its impact speed plus 2 m/s.
 
-    Rates of 4 m/s return.
+    Its fixed point is a speed of 4 m/s.
     """
     embed = lambda rate: jnp.stack([height + 0.0 * rate[0], rate[0]])
     return ReturnMap(Mode(*bouncing(0.5, 2.0)), embed, lambda y: y[1:], options=options)
@@ -227,7 +227,7 @@ def make_speeding_map(height, options=None):
     ],
 )
 def test_a_return_map_repeats_no_state_at_which_a_walk_stopped(height, options, stop):
-    early, rate = make_speeding_map(height, options), jnp.array([1.0])
+    early, rate = make_rebound_map(height, options), jnp.array([1.0])
     stopped = simulate_hybrid(early.modes, early.embed(rate), events=1, options=options)
     assert Termination(int(stopped.termination)) == stop
     if stop == Termination.GUARD_VIOLATED_AT_ENTRY:
@@ -243,12 +243,12 @@ def test_a_return_map_repeats_no_state_at_which_a_walk_stopped(height, options, 
 
 def test_a_return_map_has_the_fixed_point_and_the_multiplier_of_the_closed_form():
     rate = jnp.array([1.0])
-    cycle = solve_fixed_point(make_speeding_map(0.0, TIGHT), rate)
+    cycle = solve_fixed_point(make_rebound_map(0.0, TIGHT), rate)
     assert cycle.converged
     assert Termination(int(cycle.termination)) == Termination.MAX_EVENTS_REACHED
     np.testing.assert_allclose(cycle.x, 4.0, rtol=1e-12)
     np.testing.assert_allclose(cycle.jacobian, 0.5, rtol=1e-12)
-    twice = solve_fixed_point(make_speeding_map(0.0, TIGHT), rate, period_n=2)
+    twice = solve_fixed_point(make_rebound_map(0.0, TIGHT), rate, period_n=2)
     np.testing.assert_allclose(twice.jacobian, 0.25, rtol=1e-12)
     assert Termination(int(twice.termination)) == Termination.MAX_EVENTS_REACHED
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.slow_variants import mark_slow_names
+from support.slow_variants import make_params_with_slow_marks
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
@@ -67,10 +67,10 @@ CALLS = {
 }
 
 SLOW_CALLS = ("grad", "continue_branch", "tune", "unilateral contact")
-"""Calls that are traced or compiled for seconds."""
+"""Calls whose tracing or compilation takes seconds."""
 
 
-@pytest.mark.parametrize("name", mark_slow_names(CALLS, SLOW_CALLS))
+@pytest.mark.parametrize("name", make_params_with_slow_marks(CALLS, SLOW_CALLS))
 def test_strict_settings_of_the_process_change_no_bit(name):
     results = [np.asarray(leaf) for leaf in jax.tree.leaves(CALLS[name]())]
     for setting, value in STRICT_SETTINGS:

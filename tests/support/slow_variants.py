@@ -17,6 +17,6 @@ def mark_slow(*variants: Any) -> list[Any]:
     ]
 
 
-def mark_slow_names(names: Iterable[str], slow_names: Collection[str]) -> list[Any]:
-    """Return the names as values of a parametrized test, those in `slow_names` marked as slow."""
+def make_params_with_slow_marks(names: Iterable[str], slow_names: Collection[str]) -> list[Any]:
+    """Return the names as values of a parametrized test, and mark those in `slow_names` as slow."""
     return [pytest.param(x, marks=[pytest.mark.slow] * (x in slow_names)) for x in names]

@@ -59,8 +59,8 @@ def test_energies_and_margins_of_a_step_are_those_of_an_absolute_frame():
 
 N_LINES = 4
 NAMES = [name for name in PARAMETER_NAMES if name != "slope"]
-WALK_INPUTS = np.array([*START, *(OTHER[name] for name in NAMES), *LINES[:N_LINES]])
-"""Start, parameters and slopes of a walk over three steps."""
+WALK_ARGUMENTS = np.array([*START, *(OTHER[name] for name in NAMES), *LINES[:N_LINES]])
+"""Section state at the start, parameters, and slopes of the ground, for a walk of three steps."""
 
 
 def end_walk(inputs):
@@ -75,7 +75,7 @@ def end_walk(inputs):
 @pytest.mark.slow
 def test_reverse_mode_of_a_walk_gives_the_derivatives_of_forward_mode():
     reverse, forward = (
-        transform(end_walk)(jnp.asarray(WALK_INPUTS)) for transform in (jax.jacrev, jax.jacfwd)
+        transform(end_walk)(jnp.asarray(WALK_ARGUMENTS)) for transform in (jax.jacrev, jax.jacfwd)
     )
     np.testing.assert_allclose(reverse, forward, atol=1e-11)
 
@@ -88,7 +88,7 @@ def test_derivatives_of_a_walk_are_differences_of_an_absolute_frame():
         last = uneven_ground.walk(given, inputs[:3].tolist(), inputs[-N_LINES:].tolist())[-1]
         return np.concatenate([last.section_state, last.durations])
 
-    point = WALK_INPUTS
+    point = WALK_ARGUMENTS
     forward = jax.jacfwd(end_walk)(jnp.asarray(point))
     # A wrong derivative with respect to any input changes the derivative along a random direction.
     directions = np.random.default_rng(0).standard_normal((4, len(point)))

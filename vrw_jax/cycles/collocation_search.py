@@ -788,7 +788,7 @@ def init_search_result(
     phase_sequence, period_n = collocation_system.phase_sequence, collocation_system.period_n
     section_size = phase_sequence.section_size
     make_zeros = lambda *shape: jnp.zeros((*shape, parameters.shape[-1]), parameters.dtype)
-    # No call of `predict_start_from_gait_surface`: its trace would take 30 ms of a first answer.
+    # A trace of `predict_start_from_gait_surface` would add 30 ms to the first call.
     start_solution = CollocationSolution(
         section_state=make_zeros(section_size),
         durations=make_zeros(period_n, len(phase_sequence.phases)),
