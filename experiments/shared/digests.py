@@ -51,12 +51,8 @@ def digest_steps() -> Iterator[tuple[str, NumberTable]]:
     draw = np.random.default_rng(2)
     states = np.asarray(vrw.limit_cycle(vrw.WheelParams()).section_state)
     states = states * draw.uniform(0.98, 1.02, (N_STEP_WHEELS, 3))
-    batch_result = vrw.step_batch(params, states)
-    yield "steps by lanes", collect_numbers(batch_result)
+    yield "steps by lanes", collect_numbers(vrw.step_batch(params, states))
     yield "steps by diffrax", collect_numbers(vrw.step_batch(params, states, engine="diffrax"))
-    expected = np.asarray(batch_result.durations) * draw.uniform(0.98, 1.02, (N_STEP_WHEELS, 3))
-    by_collocation = vrw.step_batch(params, states, engine="collocation", durations=expected)
-    yield "steps by collocation", collect_numbers(by_collocation)
     ground = vrw.UnilateralWheel(friction=2.0)
     first_wheels = jax.tree.map(lambda x: x[:64] if jnp.ndim(x) else x, params)
     yield (

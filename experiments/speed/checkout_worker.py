@@ -54,22 +54,17 @@ def turn() -> None:
     draw = np.random.default_rng(3).uniform
     params, selection = vrw.WheelParams(**first(N_LANES)), first(N_CYCLES)
     states = np.asarray(gaits.section_state) * draw(0.99, 1.01, (N_LANES, 3))
-    expected = np.asarray(gaits.durations) * draw(0.99, 1.01, (N_LANES, 3))
     by_lanes = lambda: vrw.step_batch(params, states)
-    known_by_name = {"engine": "collocation", "durations": expected}
-    by_collocation = lambda: vrw.step_batch(params, states, **known_by_name)
     cycles = lambda: find(selection)
     scan = lambda n: vrw.scan(vrw.samples(first(n)), MEASURES)
     short_time, long_time = (seconds(lambda n=n: scan(n)) for n in N_SAMPLES)
     result_by_name = {
         "gait steps per s, lanes": N_LANES / seconds(by_lanes),
-        "gait steps per s, collocation": N_LANES / seconds(by_collocation),
         "cycles per s, cold guess": N_CYCLES / seconds(cycles),
         "samples per s, scan": (N_SAMPLES[1] - N_SAMPLES[0]) / (long_time - short_time),
     }
     ended = {
         "lanes": int(np.sum(np.asarray(by_lanes().outcome) == 0)),
-        "collocation": int(np.sum(np.asarray(by_collocation().is_collocated))),
         "cycles": int(np.sum(np.asarray(cycles().found))),
     }
     print(json.dumps({"where": vrw.__file__, "told": result_by_name, "ended": ended}))

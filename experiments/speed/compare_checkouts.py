@@ -2,10 +2,10 @@
 
     python -m experiments.speed.compare_checkouts A B [--turns 5] [--csv FILE]
 
-Measures gait steps by lanes and by collocation, limit cycles from a cold guess, samples of a scan,
-and the import time, of the libraries in the folders A (before) and B (after). Each turn is a
-process with its own cache, and the first one, which fills the cache, does not count. Figures are
-medians over turns of the CPU time of one core, also as ratios B over A. Run it on an idle machine.
+Measures gait steps by lanes, limit cycles from a cold guess, samples of a scan, and the import
+time, of the libraries in the folders A (before) and B (after). Each turn is a process with its own
+cache, and the first one, which fills the cache, does not count. Figures are medians over turns of
+the CPU time of one core, also as ratios B over A. Run it on an idle machine.
 """
 
 import json

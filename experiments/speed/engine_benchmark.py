@@ -40,7 +40,6 @@ from vrw_jax.batches.batch_steps import order_wheels_by_work
 from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 LABELS = {
-    "collocation": "lanes by collocation, durations known to 3 %",
     "lanes": "lane engine, any start",
     "by hand": "C++ by hand, eight lanes side by side",
     "diffrax": "diffrax engine, in batches",
@@ -48,9 +47,7 @@ LABELS = {
     "heyoka": "heyoka, scalar Taylor",
     "scipy": "SciPy DOP853, compiled right-hand side",
 }
-KNOWN_AS = (
-    "collocation", "lane engine", "diffrax by hand", "diffrax engine", "numba", "heyoka", "SciPy"
-)  # fmt: skip
+KNOWN_AS = ("lane engine", "diffrax by hand", "diffrax engine", "numba", "heyoka", "SciPy")
 """Whose colour each has: those of work_precision/charts."""
 COMPARED_ERROR = 1e-8
 """Error at which engines are compared."""
@@ -65,23 +62,6 @@ def by_library(engine, solver, tolerance):
 
         def run():
             batch_result = vrw.step_batch(params, states, options=options, engine=engine)
-            return np.concatenate([batch_result.section_state, batch_result.durations], 1)
-
-        return run
-
-    return prepare
-
-
-def by_collocation(options, expected):
-    """Return a function that prepares runs by collocation; failed lanes use the lane engine."""
-
-    def prepare(rows, states):
-        params, near = make_wheels(rows), expected[: len(rows)]
-
-        def run():
-            batch_result = vrw.step_batch(
-                params, states, options=options, engine="collocation", durations=near
-            )
             return np.concatenate([batch_result.section_state, batch_result.durations], 1)
 
         return run
@@ -111,11 +91,8 @@ def by_peer(function, side_by_side=False):
     return prepare
 
 
-def candidates(durations):
+def candidates():
     """Return engine, method, tolerance, number of lanes and preparation of each table entry."""
-    near = durations * np.random.default_rng(3).uniform(0.97, 1.03, durations.shape)
-    options = vrw.StepOptions(rtol=6e-8, atol=6e-8)
-    yield "collocation", "Gauss-4", 6e-8, 1.0, by_collocation(options, near)
     for solver in ("Tsit5", "Dopri5", "Dopri8"):
         for tolerance in (1e-6, 1e-7, 6e-8, 1.5e-8, 1e-9, 1e-10):
             yield "lanes", solver, tolerance, 1.0, by_library("lanes", solver, tolerance)
@@ -146,7 +123,7 @@ def candidates(durations):
 def compare(rows, states, reference, repeats):
     """Return the table: engine, method, tolerance, p99 error, steps per second and first call."""
     table, runs = [], []
-    for engine, method, tolerance, share, make in candidates(reference[:, 3:]):
+    for engine, method, tolerance, share, make in candidates():
         n = max(int(share * len(rows)), 16)
         run = make(rows[:n], states[:n])
         begin = time.perf_counter()
@@ -280,7 +257,7 @@ def draw_charts(table, shares, cost):
                 [e["steps_per_s"] for e in selection],
                 ms=4,
                 marker=markers.get(method, "o") if several else "D",
-                linestyle="-" if name in ("lanes", "collocation") else "--",
+                linestyle="-" if name == "lanes" else "--",
                 color=colours[name],
                 label=f"{label}, {method}" if several else label,
             )

@@ -80,26 +80,6 @@ def by_library(engine: str, solver: str, dtype: type = np.float64) -> Callable:
     return make
 
 
-def by_fixed_work(spread: float, rows: np.ndarray, starts: np.ndarray) -> Run:
-    """`vrw.steps` by collocation, durations known to a spread; lanes it does not trust failed."""
-    near = vrw.step_batch(make_wheels(rows), starts).durations
-    expected_durations = np.asarray(near) * np.random.default_rng(3).uniform(
-        1.0 - spread, 1.0 + spread, (len(rows), 3)
-    )
-
-    def run() -> np.ndarray:
-        batch_result = vrw.step_batch(
-            make_wheels(rows), starts, engine="collocation", durations=expected_durations
-        )
-        joined_values = np.concatenate(
-            [batch_result.section_state, batch_result.durations, 0.0 * expected_durations[:, :1]], 1
-        )
-        joined_values[~np.asarray(batch_result.is_collocated)] = np.nan
-        return joined_values
-
-    return run
-
-
 def single_step(solver: str) -> Callable:
     """`vrw.return_map` of the first lane alone, compiled."""
 
@@ -548,7 +528,6 @@ METHODS = (
         for solver in ("Tsit5", "Dopri5", "Dopri8")
     ),
     Method("step", LANES, "Tsit5", f32, LOOSE, by_library("lanes", "Tsit5", np.float32), 2048),
-    Method("step", COLLOCATION, "durations known to 3 %", f64, (0.03,), by_fixed_work, 2048),
 )  # fmt: skip
 """In the order in which they are measured."""
 
@@ -562,7 +541,6 @@ BATCHES = (
             (SCIPY, "DOP853", 1e-9, by_peer("DOP853"), SIZES[:3]),
             (ENGINE, "Tsit5", 1e-8, by_library("diffrax", "Tsit5"), SIZES[:4]),
             (LANES, "Tsit5", 1e-8, by_library("lanes", "Tsit5"), SIZES),
-            (COLLOCATION, "durations known to 3 %", 0.03, by_fixed_work, SIZES),
         )
         for size in sizes
     ),

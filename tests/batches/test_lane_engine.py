@@ -246,17 +246,15 @@ def test_model_and_solver_choose_the_engine_and_the_result_names_it():
         vrw.step_batch(params, states, options=vrw.StepOptions(solver="Kvaerno5"), engine="lanes")
 
 
-@pytest.mark.parametrize("engine", ["lanes", "collocation"])
-def test_results_are_new_arrays_and_arguments_are_not_modified(engine):
-    states, near = STARTS.copy(), VALUES[:, 3:].copy()
+def test_results_are_new_arrays_and_arguments_are_not_modified():
+    states = STARTS.copy()
     params = reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS)
     for n_steps in (1, 3):
-        batch_result = vrw.step_batch(params, states, n_steps, engine=engine, durations=near)
+        batch_result = vrw.step_batch(params, states, n_steps)
         for array in jax.tree.leaves(batch_result):
             assert type(array) is np.ndarray
             array[:] = 0  # its owner may
         np.testing.assert_array_equal(states, STARTS)
-        np.testing.assert_array_equal(near, VALUES[:, 3:])
         np.testing.assert_array_equal(
             params.damping,
             reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS).damping,
@@ -375,78 +373,6 @@ def test_a_guard_that_rises_from_zero_and_comes_back_within_the_first_step_fires
     )  # back after 2 height; the first step is 0.005
     assert int(guard) == 0
     assert abs(float(duration) / (2.0 * height) - 1.0) < 1e-13
-
-
-def test_collocation_is_accurate_near_known_durations_and_marks_its_elements():
-    near = VALUES[:, 3:] * np.random.default_rng(3).uniform(0.97, 1.03, (len(VALUES), 3))
-    params = reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS)
-    batch_result = vrw.step_batch(params, STARTS, engine="collocation", durations=near)
-    assert batch_result.engine == "collocation"
-    fixed = np.asarray(batch_result.is_collocated)
-    assert np.mean(fixed) > 0.5
-    by_lanes = vrw.step_batch(params, STARTS)
-    joined_values = np.concatenate([batch_result.section_state, batch_result.durations], 1)
-    adaptive = np.concatenate([by_lanes.section_state, by_lanes.durations], 1)
-    assert reference_values.compute_scaled_error(joined_values[fixed], VALUES[fixed]) < 1e-7
-    np.testing.assert_array_equal(joined_values[~fixed], adaptive[~fixed])
-
-
-def test_collocation_passes_uncertain_elements_to_the_event_driven_engine(hard_batch):
-    parameter_rows, states, solution, codes = hard_batch
-    selection = slice(0, 3000)
-    guessed = np.tile([0.4, 0.25, 0.06], (3000, 1))
-    params = reference_values.make_wheels(parameter_rows[selection])
-    told_by = vrw.step_batch(params, states[selection], engine="collocation", durations=guessed)
-    np.testing.assert_array_equal(told_by.outcome, codes[selection])
-    joined_values = np.concatenate([told_by.section_state, told_by.durations], 1)
-    # Far from every gait that its limits were set by, a trusted lane is still right to 1e-6.
-    np.testing.assert_allclose(joined_values, solution[selection], rtol=1e-6, atol=1e-6)
-
-
-def test_collocation_rejects_falls_and_has_its_largest_errors_far_from_gaits():
-    random, n = np.random.default_rng(5), 8192
-    select = lambda low, high: random.uniform(low, high, n)
-    params = vrw.WheelParams(
-        damping=select(5, 400), stiffness=select(200, 1200), natural_length=select(1, 1.06),
-        slope=select(0.05, 0.45), leg_mass=select(0.3, 2),
-    )  # fmt: skip
-    states = random.uniform((-0.05, 0.8, -0.4), (0.2, 2.4, 0.1), (n, 3))
-    exact = vrw.step_batch(params, states, options=vrw.StepOptions(rtol=1e-11, atol=1e-11))
-    step_result = (exact.outcome == Outcome.STEPPED) & np.all(exact.durations > 0.0, 1)
-    near = np.where(step_result[:, None], exact.durations * random.uniform(0.97, 1.03, (n, 3)), 0.1)
-    batch_result = vrw.step_batch(params, states, engine="collocation", durations=near)
-    assert not np.any(batch_result.is_collocated & (exact.outcome != Outcome.STEPPED))
-    fixed = batch_result.is_collocated & step_result
-    assert np.mean(fixed[step_result]) > 0.3
-    off = np.abs(np.concatenate(
-        [batch_result.section_state - exact.section_state,
-            batch_result.durations - exact.durations], 1
-    )).max(1)[fixed]  # fmt: skip
-    # Its checks were set by lanes near gaits. Counted in 9,000 others: 5e-7 and 1.2e-5.
-    assert np.quantile(off, 0.99) < 1e-6
-    assert off.max() < 2e-5
-
-
-def test_collocation_of_a_batch_element_is_bitwise_that_of_a_single_wheel():
-    params, near = (
-        reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS),
-        VALUES[:, 3:],
-    )
-    among = vrw.step_batch(params, STARTS, engine="collocation", durations=near)
-    for i in (0, 3, 9):
-        batch_result = vrw.step_batch(
-            reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS[i : i + 1]),
-            STARTS[i : i + 1],
-            engine="collocation",
-            durations=near[i : i + 1],
-        )  # fmt: skip
-        np.testing.assert_array_equal(batch_result.section_state[0], among.section_state[i])
-        np.testing.assert_array_equal(batch_result.durations[0], among.durations[i])
-
-
-def test_collocation_needs_durations():
-    with pytest.raises(ValueError, match="durations"):
-        vrw.step_batch(vrw.WheelParams(), TABLE_1_SECTION_STATE[None], engine="collocation")
 
 
 @pytest.mark.parametrize(("solver", "published"), [("Dopri5", 3.31), ("Bosh3", 2.51)])

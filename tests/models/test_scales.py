@@ -1,6 +1,5 @@
 """A step and a gait are the same in other units, and units give two columns of a Jacobian."""
 
-import jax
 import numpy as np
 import pytest
 from support.slow_variants import mark_slow
@@ -85,11 +84,6 @@ GROUND = vrw.UnilateralWheel(friction=0.7)
 DAMPED_WHEEL = vrw.WheelParams(damping=250.0)
 
 
-NEAR_GAIT = np.array([[1.0, 1.0, 1.0], [1.0, 1.001, 1.0], [1.0, 1.01, 1.0], [1.1, 1.2, 1.5]])
-"""Factors of a gait's section state: starts near the gait, the last of which collocation rejects.
-"""
-
-
 def scale_wheel(unit, factor, params=DAMPED_WHEEL):
     """Return the similar wheel and the factors of its rates and speeds."""
     time = factor if unit == "time" else 1.0
@@ -111,27 +105,6 @@ def test_a_step_is_the_same_in_units_of_any_size(scale, engine):
         own = np.asarray(here.section_state[:2]) / [1.0, rate]
         np.testing.assert_allclose(own, there.section_state[:2], rtol=0, atol=1e-11)
         np.testing.assert_allclose(here.durations * rate, there.durations, rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize("scale", SCALES, ids=str)
-def test_collocated_steps_are_accepted_alike_in_units_of_any_size(scale):
-    """Limits of corrections in rad/s would accept any correction in a small unit of rates."""
-    gait = vrw.limit_cycle(vrw.WheelParams())
-    states, durations = np.asarray(gait.section_state) * NEAR_GAIT, np.asarray(gait.durations)
-    results = []
-    for unit, factor in (scale, ("mass", 1.0)):
-        wheel, rate, speed = scale_wheel(unit, factor, vrw.WheelParams())
-        result = vrw.step_batch(
-            jax.tree.map(lambda x: np.broadcast_to(x, len(states)), wheel),
-            states * [1.0, rate, speed],
-            engine="collocation",
-            durations=np.tile(durations / rate, (len(states), 1)),
-        )
-        results.append((result.is_collocated, result.section_state / [1.0, rate, speed]))
-    (is_collocated, section_states), (is_collocated_in_si, section_states_in_si) = results
-    assert is_collocated_in_si.tolist() == [True, True, True, False]
-    np.testing.assert_array_equal(is_collocated, is_collocated_in_si)
-    np.testing.assert_allclose(section_states, section_states_in_si, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(

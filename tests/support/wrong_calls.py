@@ -357,10 +357,10 @@ def register_wrong_calls() -> None:
         "vrw.StepOptions",
     )
     add_wrong_call(
-        "step_batch by collocation without durations",
+        "step_batch by the engine of an earlier version",
         lambda: vrw.step_batch(table_1, ones, engine="collocation"),
         "ValueError",
-        "durations",
+        "one of 'auto', 'lanes', 'diffrax'",
     )
     add_wrong_call(
         "step_batch of single numbers",

@@ -378,7 +378,6 @@ def test_derivatives_with_unilateral_contact_are_differences_of_complementarity(
         ({"n_steps": 1}, r"for each and 1 or 2 of each over its steps"),
         ({"params": vrw.WheelParams(damping=[1.0, 2.0])}, r"damping has shape \(2,\), but there"),
         ({"derivatives": ("slope",), "engine": "diffrax"}, "batches with contact need 'lanes'"),
-        ({"model": None, "engine": "collocation"}, "which takes one slope, but slope is an array"),
     ],
 )
 def test_uneven_ground_unsupported_by_batches_is_refused_in_one_sentence(changes, sentence):

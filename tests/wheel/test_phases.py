@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.batches import collocation_step as fixed_work
-from vrw_jax.collocation import PhaseMesh, PhasePoint
+from vrw_jax.collocation import PhasePoint
 from vrw_jax.cycles import phase_sequence as sequence
 from vrw_jax.hybrid import integrate_phase
 from vrw_jax.integrator import integrate_batch_phase, load_explicit_tableau
@@ -217,19 +216,6 @@ def end_by_lane_engine():
     return tuple(x[0] for x in end.q), tuple(x[0] for x in end.v)
 
 
-def end_by_step_collocation():
-    """Collocate repeatedly, because the duration is not known before."""
-    phase, q, v = make_state_at(2)
-    run = jax.jit(
-        lambda q, v, T: fixed_work.solve_phase_by_collocation(phase, q, v, T, PhaseMesh(2, 1.0))
-    )
-    duration = jnp.asarray(0.2, float)  # of no weak type, as what comes back
-    for _ in range(3):
-        end = run(q, v, duration)
-        duration = end.phase_duration
-    return end.q, end.v
-
-
 def end_by_cycle_collocation():
     """Apply Newton's method to the angle of the event."""
     phase = sequence.make_post_impact_sequence(PARAMS.n_legs).phases[2]
@@ -245,7 +231,7 @@ def end_by_cycle_collocation():
 
 @pytest.mark.parametrize(
     "engine",
-    [end_by_diffrax, end_by_lane_engine, end_by_step_collocation, end_by_cycle_collocation],
+    [end_by_diffrax, end_by_lane_engine, end_by_cycle_collocation],
 )
 def test_every_engine_ends_the_phase_at_its_guard(engine, monkeypatch):
     def height():

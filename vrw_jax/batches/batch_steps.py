@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax import simd
-from vrw_jax.batches.collocation_step import take_collocation_step
 from vrw_jax.batches.contact_step import CONTACT_STEP_INPUT_NAMES, step_batch_with_contact
 from vrw_jax.batches.stiffness import (
     SOLVER_SELECTION_OPTIONS,
@@ -66,7 +65,7 @@ from vrw_jax.wheel import (
     make_wheel_from_parameters,
 )
 
-BatchEngineName = Literal["auto", "lanes", "diffrax", "collocation"]
+BatchEngineName = Literal["auto", "lanes", "diffrax"]
 BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngineName)
 
 PAPER_STEP_INPUT_NAMES = (START_INPUT_NAME, *PARAMETER_NAMES)
@@ -90,7 +89,6 @@ def step_batch(
     model: AbstractWheel | None = None,
     options: StepOptions | None = None,
     engine: BatchEngineName = "auto",
-    durations: Array | np.ndarray | None = None,
     derivatives: Sequence[str] = (),
 ) -> StepBatchResult:
     """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
@@ -98,9 +96,8 @@ def step_batch(
 
     The engine "lanes" is the fastest. It supports the viscoelastic wheel and explicit solvers. The
     engine "diffrax" maps `model.advance` over the batch and accepts any solver. "auto" selects
-    "lanes" if possible; `StepBatchResult.engine` is the selected engine. In "lanes" and "diffrax",
-    `options` limits the error of each solver step. The results of the two engines differ by about
-    ten times the tolerance.
+    "lanes" if possible; `StepBatchResult.engine` is the selected engine. `options` limits the error
+    of each solver step. The results of the two engines differ by about ten times the tolerance.
 
     "auto" also replaces the requested solver if the airborne leg is so stiff that another solver is
     cheaper. `StepBatchResult.solver_index` identifies the selected solver. The stiffness is c/m,
@@ -110,9 +107,9 @@ def step_batch(
     c/m = 4e5 1/s at the default options, and from 1.4e5 1/s at a tolerance of 1e-6.
 
     Derivatives are those of the result of all gait steps and include their events. The derivatives
-    are zero for a wheel that fell, and not available by collocation. With unilateral contact
-    (`UnilateralWheel`) the only engine is "lanes", and friction is a scalar or an array over the
-    batch. The function compiles its programs itself, so it cannot be called inside `jax.jit`.
+    are zero for a wheel that fell. With unilateral contact (`UnilateralWheel`) the only engine is
+    "lanes", and friction is a scalar or an array over the batch. The function compiles its programs
+    itself, so it cannot be called inside `jax.jit`.
 
     On uneven ground the slope has the shape (elements, n_steps) or (elements, n_steps + 1), with
     one value per gait step as in `walk`. With unilateral contact, friction may have these shapes
@@ -126,9 +123,7 @@ def step_batch(
         n_steps: largest number of gait steps.
         model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
         options: numerical options of the gait steps.
-        engine: "auto", "lanes", "diffrax" or "collocation" (steps of a fixed amount of work, near
-            `durations`).
-        durations: for "collocation", expected durations of the phases, shape (elements, 3), s.
+        engine: "auto", "lanes" or "diffrax".
         derivatives: inputs with respect to which derivatives are computed: "section_state" and
             names of parameters; with unilateral contact "friction" too.
 
@@ -145,7 +140,7 @@ def step_batch(
         ((3, 3), [10, 10, 10], 'lanes')
     """
     require_untraced_arguments(
-        "vrw.step_batch", "map vrw.return_map over the lanes", params, states, durations
+        "vrw.step_batch", "map vrw.return_map over the lanes", params, states
     )
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
@@ -167,12 +162,8 @@ def step_batch(
                 f"{', '.join(known_input_names)}: "
                 "give names of these."
             )
-    if derivatives and engine == "collocation":
-        raise ValueError(
-            "derivatives are given, but batches have none with engine 'collocation': take "
-            "engine='lanes', or jax.jacfwd of vrw.return_map."
-        )
-    step_arguments = (
+    compute_batch = step_batch_with_contact if has_contact_kernel else _step_batch_without_contact
+    return compute_batch(
         checked_model,
         values_by_parameter,
         checked_section_states,
@@ -182,9 +173,6 @@ def step_batch(
         params.n_legs,
         derivatives,
     )
-    if has_contact_kernel:
-        return step_batch_with_contact(*step_arguments)
-    return _step_batch_without_contact(*step_arguments, durations)
 
 
 def _check_parameter_shapes(
@@ -246,7 +234,6 @@ def _step_batch_without_contact(
     requested_engine: str,
     n_legs: int,
     derivative_names: Sequence[str],
-    phase_durations: Any,
 ) -> StepBatchResult:
     """Return the result of `step_batch` for a model without unilateral contact."""
     n_wheels = len(section_states)
@@ -255,11 +242,6 @@ def _step_batch_without_contact(
     stepwise_parameters = {}
     is_ground_uneven = element_slopes.ndim == 2
     if is_ground_uneven:
-        if requested_engine == "collocation":
-            raise ValueError(
-                "engine is 'collocation', which takes one slope, but slope is an array over steps: "
-                "take 'auto', 'lanes' or 'diffrax'."
-            )
         ground_slopes = complete_slopes_over_steps(element_slopes, n_steps)
         n_slopes = element_slopes.shape[1]
         stepwise_parameters["slope"] = StepwiseParameter(
@@ -302,17 +284,6 @@ def _step_batch_without_contact(
             engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = select_engine(
                 "diffrax", dataclasses.replace(options, solver=implicit_solver)
             )
-    if requested_engine == "collocation":
-        engine_name = requested_engine
-        durations_shape = None if phase_durations is None else np.shape(phase_durations)
-        if durations_shape != section_states.shape:
-            raise ValueError(
-                f"durations have shape {durations_shape}, but collocation needs those of "
-                "DLS, SLS-I and SLS-II to some per cent, shape (elements, 3): give those of a "
-                "limit cycle, or take 'lanes'."
-            )
-        expected_durations = check_numpy_reals("durations", phase_durations)
-        walk_batch.durations[:] = expected_durations.T.take(wheel_order, -1)
     for k in range(n_steps):
         active_lanes = walk_batch.find_walking_lanes()
         if is_ground_uneven:
@@ -322,15 +293,10 @@ def _step_batch_without_contact(
             if not len(lane_indices):
                 continue
             lanes = select_lanes(lane_indices, walk_batch)
-            lane_inputs = parameter_matrix[:, lanes], walk_batch.section_state[:, lanes]
-            if requested_engine == "collocation":
-                collocation_result = _step_lanes_by_collocation(
-                    selected_engine, model, n_legs, *lane_inputs, walk_batch.durations[:, lanes]
-                )
-                walk_batch.store_lane_steps(lane_indices, *collocation_result)
-                continue
             next_slopes = (ground_slopes[k + 1][lanes],) if is_ground_uneven else ()
-            step_outputs = selected_engine.take_lane_steps(*lane_inputs, *next_slopes)
+            step_outputs = selected_engine.take_lane_steps(
+                parameter_matrix[:, lanes], walk_batch.section_state[:, lanes], *next_slopes
+            )
             if solver_index == SolverIndex.STABLE_SOLVER:
                 # A phase may last longer than `select_cheapest_solver` assumes. The implicit
                 # solver, which is next, then repeats the step.
@@ -396,7 +362,7 @@ def _select_batch_engine(
     has_lane_kernel = (
         model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
     )
-    if requested_engine in ("lanes", "collocation") and not has_lane_kernel:
+    if requested_engine == "lanes" and not has_lane_kernel:
         raise ValueError(
             f"the lane engine can't run {type(model).__name__} with {options.solver}: it supports "
             "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
@@ -490,59 +456,6 @@ def _step_lanes_by_kernel(
     kernel_results = batch_program(scalar_kernel_arguments, lane_input_arrays)
     _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
     return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
-
-
-def _step_lanes_by_collocation(
-    fallback_engine: _BatchEngine,
-    model: Any,
-    n_legs: int,
-    parameter_matrix: np.ndarray,
-    section_states: np.ndarray,
-    expected_phase_durations: np.ndarray,
-) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Return the results of one gait step for all lanes, computed by collocation, and whether each
-    lane passed the accuracy checks.
-
-    `fallback_engine` computes the step again for lanes that failed a check. The results are those
-    of `_BatchEngine.take_lane_steps`.
-    """
-    stop_at_lift_off, n_parameters = model.stop_at_lift_off, len(PARAMETER_NAMES)
-
-    def step_lanes(_: Any, lane_step_inputs: Any) -> tuple:
-        params = make_wheel_from_parameters(lane_step_inputs[:n_parameters], n_legs)
-        collocation_step = take_collocation_step(
-            params,
-            tuple(lane_step_inputs[n_parameters:-3]),
-            tuple(lane_step_inputs[-3:]),
-            stop_at_lift_off,
-        )
-        step_outputs = jnp.stack(
-            [*collocation_step.section_state, *collocation_step.phase_durations]
-        )
-        return collocation_step.is_collocation_trusted, step_outputs
-
-    lane_input_arrays = [*parameter_matrix, *section_states, *expected_phase_durations]
-    batch_program = compile_batch_program(
-        step_lanes,
-        [],
-        len(lane_input_arrays),
-        parameter_matrix.dtype,
-        ("gait step by collocation", n_legs, stop_at_lift_off),
-        batch_sizes.XLA_LANE_BATCH_SIZE,
-    )
-    is_collocation_trusted, step_outputs = batch_program([], lane_input_arrays)
-    step_outcomes, n_solver_steps = np.zeros((2, len(is_collocation_trusted)), np.int32)
-    collocated_step_outputs = step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps
-    untrusted_lanes = np.flatnonzero(~is_collocation_trusted)
-    if len(untrusted_lanes) > 0:
-        recomputed_step_outputs = fallback_engine.take_lane_steps(
-            parameter_matrix[:, untrusted_lanes], section_states[:, untrusted_lanes]
-        )
-        for collocated_output, recomputed_output in zip(
-            collocated_step_outputs, recomputed_step_outputs, strict=True
-        ):
-            collocated_output[..., untrusted_lanes] = recomputed_output
-    return collocated_step_outputs, is_collocation_trusted
 
 
 def _step_lanes_by_diffrax(

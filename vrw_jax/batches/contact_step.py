@@ -77,7 +77,6 @@ def step_batch_with_contact(
             step_outcomes,
             n_stepped,
             n_solver_steps,
-            solver_indices > 0,
             solver_indices,
             "lanes",
             (options.solver,),

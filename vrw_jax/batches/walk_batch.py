@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from vrw_jax.numerics import describe_step_ending
 from vrw_jax.printing import AbstractPrintable, LabelAndText, format_outcome_counts, format_quantity
@@ -36,11 +36,9 @@ class StepBatchResult(AbstractPrintable):
     - `outcome`: `Outcome` of the walk, which ends at the first outcome that is not STEPPED;
     - `n_stepped`: number of gait steps that ended in a touchdown;
     - `solver_steps`: number of attempted solver steps, summed over all gait steps;
-    - `is_collocated`: whether the last gait step was computed by collocation, in a fixed amount of
-      work;
     - `solver_index`: index of the element's solver in `solver_names`, which "auto" selects by
       stiffness;
-    - `engine`: "lanes", "diffrax" or "collocation";
+    - `engine`: "lanes" or "diffrax";
     - `solver_names`: names of the solvers; the first is the solver in the options;
     - `derivatives`: `StepSensitivity` by the name of the requested input.
 
@@ -55,7 +53,6 @@ class StepBatchResult(AbstractPrintable):
     outcome: Int[np.ndarray, " lanes"]
     n_stepped: Int[np.ndarray, " lanes"]
     solver_steps: Int[np.ndarray, " lanes"]
-    is_collocated: Bool[np.ndarray, " lanes"]
     solver_index: Int[np.ndarray, " lanes"]
     engine: str = eqx.field(static=True)
     solver_names: tuple[str, ...] = eqx.field(static=True)
@@ -115,14 +112,7 @@ def complete_slopes_over_steps(known_slopes_by_step: np.ndarray, n_steps: int) -
     )
 
 
-LANE_ARRAY_NAMES = (
-    "section_state",
-    "durations",
-    "outcome",
-    "n_stepped",
-    "solver_steps",
-    "is_collocated",
-)
+LANE_ARRAY_NAMES = ("section_state", "durations", "outcome", "n_stepped", "solver_steps")
 """Names of the arrays that a `WalkBatch` has in common with its `StepBatchResult`."""
 
 
@@ -148,7 +138,6 @@ class WalkBatch:
         self.section_state = section_states
         self.durations = np.zeros((3, n_lanes), section_states.dtype)
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
-        self.is_collocated = np.zeros(n_lanes, bool)
         self.derivative_names = derivative_names
         self.differentiated_parameters = {
             input_name: stepwise_parameters.get(input_name)
@@ -235,10 +224,7 @@ class WalkBatch:
         }
 
     def store_lane_steps(
-        self,
-        lane_indices: np.ndarray,
-        step_outputs: tuple[np.ndarray, ...],
-        is_collocated: np.ndarray | bool = False,
+        self, lane_indices: np.ndarray, step_outputs: tuple[np.ndarray, ...]
     ) -> None:
         """Store the results of one gait step of the lanes at `lane_indices`.
 
@@ -252,7 +238,6 @@ class WalkBatch:
         self.section_state[:, lanes] = section_state
         self.durations[:, lanes] = phase_durations
         self.outcome[lanes] = outcome
-        self.is_collocated[lanes] = is_collocated
         self.n_stepped[lanes] += outcome == Outcome.STEPPED
         self.solver_steps[lanes] += n_solver_steps
 

@@ -6,16 +6,11 @@ from vrw_jax.collocation.extrema import (
     find_quantity_extrema,
 )
 from vrw_jax.collocation.gauss import (
-    DOUBLE_END_WEIGHTS,
-    DOUBLE_INTEGRATION_MATRIX,
     END_WEIGHTS,
     GAUSS_NODES,
     INTEGRATION_MATRIX,
     N_GAUSS_NODES,
     PhaseMesh,
-    build_differentiation_matrix,
-    compute_integration_weights,
-    compute_lagrange_weights,
     transfer_accelerations,
 )
 from vrw_jax.collocation.phase_collocation import (

@@ -134,17 +134,6 @@ def transfer_accelerations(
     ).reshape(target_mesh.n_intervals, N_GAUSS_NODES, *trailing_shape)
 
 
-def build_differentiation_matrix() -> np.ndarray:
-    """Build the matrix that maps node values to the derivative of their polynomial at each node.
-
-    The interval has length 1.
-    """
-    positive_powers = _MONOMIAL_POWERS[1:]
-    return (
-        positive_powers * GAUSS_NODES[:, None] ** (positive_powers - 1)
-    ) @ _COEFFICIENTS_FROM_NODE_VALUES[1:]
-
-
 def compute_integration_weights(location_in_interval: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights with which node values enter the single and the double integral.
 

@@ -43,5 +43,4 @@ from vrw_jax.wheel.units import (
     WheelUnits,
     compute_wheel_units,
     compute_wheel_units_of_rows,
-    convert_to_wheel_units,
 )

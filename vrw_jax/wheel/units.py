@@ -15,11 +15,9 @@ from jax import lax
 
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.wheel.params import (
-    PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     UNIT_POWERS,
     Symbols,
-    WheelParams,
 )
 
 TABLE_1_LENGTH_M = 1.0
@@ -84,22 +82,6 @@ def compute_wheel_units(s: Symbols) -> WheelUnits:
     gravity_ratio = s.g / TABLE_1_GRAVITY_M_PER_S2
     return lax.stop_gradient(
         WheelUnits(length_ratio, jnp.sqrt(length_ratio / gravity_ratio), s.Mt / TABLE_1_MASS_KG)
-    )
-
-
-def convert_to_wheel_units(params: WheelParams) -> WheelParams:
-    """Return `params` in the wheel's own units.
-
-    The result is a similar wheel with the length, gravity and mass of Table 1 of the paper.
-    """
-    wheel_units = compute_wheel_units(params.symbols())
-    return WheelParams(
-        **{
-            parameter_name: getattr(params, parameter_name)
-            / wheel_units.compute_unit_in_si(parameter_domain.unit)
-            for parameter_name, parameter_domain in PARAMETER_DOMAINS.items()
-        },
-        n_legs=params.n_legs,
     )
 
 
