@@ -80,11 +80,7 @@ from vrw_jax.tolerance import (
     multifidelity_mean,
 )
 from vrw_jax.tuning import TuneResult, WheelObjective, tune
-from vrw_jax.validation import (
-    NEW_PUBLIC_NAME_BY_OLD_NAME,
-    describe_renamed_attribute,
-    format_name_suggestion,
-)
+from vrw_jax.validation import format_name_suggestion
 from vrw_jax.web import explore
 from vrw_jax.wheel import Outcome, ParameterSet, WheelParams, parameter_sets
 
@@ -180,8 +176,7 @@ def __getattr__(name: str) -> Any:
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.figures")
     raise AttributeError(
-        describe_renamed_attribute("vrw_jax", name, NEW_PUBLIC_NAME_BY_OLD_NAME)
-        or f"vrw_jax has no {name!r}{format_name_suggestion(name, __all__)}: dir(vrw_jax) lists "
+        f"vrw_jax has no {name!r}{format_name_suggestion(name, __all__)}: dir(vrw_jax) lists "
         "what it has."
     )
 

@@ -80,20 +80,6 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "a solver misspelt": ('[options]\nsolver = "Dopri9"', "solver is"),
     "a solver without an error": ('[options]\nsolver = "Euler"', "solver is"),
     "no time": ("[options]\nmax_phase_time = 0.0", "must be positive"),
-    "an old name of the model": ('[model]\nrung = "auto"', "write name in its place"),
-    "an old first step": ("[options]\nfirst_step = 1e-3", "write dt0 in its place"),
-    "old event steps": (
-        "[options]\nevent_steps = 50",
-        "write max_event_iterations in its place",
-    ),
-    "old monitor steps": (
-        "[options]\nmonitor_steps = 4",
-        "write max_margin_search_iterations in its place",
-    ),
-    "an old largest step": (
-        '[branch]\nparameter = "damping"\nbounds = [1.0, 2.0]\nlargest_step = 0.1',
-        "write max_ds in its place",
-    ),
     "part of a step": ("[options]\nmax_solver_steps = 2.5", "whole number"),
     "no events": ("[options]\nmax_event_iterations = 0", "at least 1"),
     "tolerance as text": ('[options]\nrtol = "1e-9"', "must be a finite number"),

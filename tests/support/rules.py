@@ -216,8 +216,6 @@ def find_unused_exports(
         )
         used_names = imported_names | {edge.imported_name for edge in outside_edges}
         for name in import_graph.names[init]:
-            if name == "__getattr__":  # Python calls it for names that were renamed
-                continue
             if not any(f"{used_name}.".startswith(f"{init}:{name}.") for used_name in used_names):
                 violations.append(f"{init} exports {name}, which nothing imports from there")
             if name.startswith("_"):

@@ -63,15 +63,6 @@ MAX_CONFIG_INTEGER = 2**53
 MAX_CONFIG_LEGS = 1_000
 """Largest number of legs in a config, chosen because results have one value per leg and sample."""
 
-RENAMED_CONFIG_KEYS = {
-    "rung": "name",
-    "first_step": "dt0",
-    "event_steps": "max_event_iterations",
-    "monitor_steps": "max_margin_search_iterations",
-    "largest_step": "max_ds",
-}
-"""New names of renamed keys, by old key. A config with an old key raises an error."""
-
 
 @dataclass(frozen=True)
 class ScanConfig:
@@ -689,16 +680,10 @@ def _require_known_keys(
     table_location: str,
     key_kind: str,
 ) -> None:
-    """Raise a ValueError if a table contains a key that is not allowed, or that has a new name."""
+    """Raise a ValueError if a table contains a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
     for config_key in config_table:
         raise_for_parameter_symbol(config_key, allowed_keys)
-        new_key = RENAMED_CONFIG_KEYS.get(config_key)
-        if new_key in allowed_keys:
-            raise ValueError(
-                f"{table_location.split()[0]} has the old key '{config_key}': "
-                f"write {new_key} in its place."
-            )
         if config_key not in allowed_keys:
             raise ValueError(
                 f"{table_location} has the unknown key "

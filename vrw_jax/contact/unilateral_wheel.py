@@ -47,7 +47,6 @@ from vrw_jax.validation import (
     check_int,
     check_reals,
     check_type,
-    with_renamed_arguments,
 )
 from vrw_jax.wheel import (
     FRICTION_NAME,
@@ -139,7 +138,6 @@ class AbstractContactWheel(AbstractWheel):
         return _embed_section_compiled(params, x) if x.shape == (3,) else x
 
 
-@with_renamed_arguments(infinite="infinite_friction_rule")
 class UnilateralWheel(AbstractContactWheel):
     """Model of the wheel with unilateral contact and Coulomb friction.
 

@@ -29,7 +29,6 @@ from vrw_jax.numerics import (
 from vrw_jax.validation import (
     check_int,
     check_positive,
-    with_renamed_arguments,
 )
 
 ProblemUnknowns = Any
@@ -37,13 +36,6 @@ ProblemUnknowns = Any
 SectionStateVector = Float[Array, " n"]
 
 
-@with_renamed_arguments(
-    first_step="initial_ds",
-    largest_step="max_ds",
-    smallest_step="min_ds",
-    iterations="max_newton_iterations",
-    turn="max_turn_angle",
-)
 @dataclasses.dataclass(frozen=True)
 class ArclengthOptions:
     """Numerical options of a continuation.

@@ -28,7 +28,6 @@ from vrw_jax.validation import (
     check_int,
     check_positive,
     check_reals,
-    with_renamed_arguments,
 )
 
 
@@ -96,7 +95,6 @@ the fixed point needs.
 """
 
 
-@with_renamed_arguments(iterations="max_iterations")
 def solve_fixed_point(
     function: Callable[[Array], Array],
     start: Float[Array, " n"],

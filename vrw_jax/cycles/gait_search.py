@@ -52,7 +52,6 @@ from vrw_jax.validation import (
     check_type,
     has_traced_leaf,
     require_untraced_arguments,
-    with_renamed_arguments,
 )
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, stack_parameters
 
@@ -119,7 +118,6 @@ def limit_cycle(
 
 
 @with_default_jax_settings
-@with_renamed_arguments(lost="on_failure")
 def limit_cycle(
     params: WheelParams,
     *,

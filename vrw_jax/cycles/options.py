@@ -11,18 +11,9 @@ from vrw_jax.validation import (
     check_int,
     check_positive,
     format_value,
-    with_renamed_arguments,
 )
 
 
-@with_renamed_arguments(
-    steps="mesh_intervals",
-    growth="mesh_grading",
-    iterations="max_newton_iterations",
-    first_iterations="first_newton_iterations",
-    stages="homotopy_steps",
-    block="batch_size",
-)
 @dataclasses.dataclass(frozen=True)
 class CycleOptions:
     """Numerical options of `limit_cycle`.

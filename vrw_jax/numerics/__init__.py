@@ -58,4 +58,3 @@ from vrw_jax.numerics.settings import with_default_jax_settings
 from vrw_jax.numerics.status_codes import StatusCode, describe_step_ending
 from vrw_jax.numerics.trigonometry import compute_sine_cosine
 from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
-from vrw_jax.validation import raise_missing_numerics_attribute as __getattr__

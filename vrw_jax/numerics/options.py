@@ -16,7 +16,6 @@ from vrw_jax.validation import (
     check_int,
     check_positive,
     check_reals,
-    with_renamed_arguments,
 )
 
 SolverName = Literal[
@@ -60,11 +59,6 @@ def _make_positive_int_field(option_name: str, default_value: int) -> Any:
     )
 
 
-@with_renamed_arguments(
-    first_step="dt0",
-    event_steps="max_event_iterations",
-    monitor_steps="max_margin_search_iterations",
-)
 class StepOptions(AbstractPrintable):
     """Numerical options of an event-driven walking step. Tolerances may change without
     recompilation.

@@ -37,7 +37,7 @@ from vrw_jax.scans.store import (
     read_stored_manifest,
 )
 from vrw_jax.simulation import ModelLike
-from vrw_jax.validation import check_callable, check_path, with_renamed_arguments
+from vrw_jax.validation import check_callable, check_path
 from vrw_jax.wheel import Outcome, WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
@@ -55,7 +55,6 @@ class ScanProgress:
 
 
 @with_default_jax_settings
-@with_renamed_arguments(report="on_progress")
 def scan(
     design: AbstractSampleDesign,
     measures: Iterable[str] | None = None,

@@ -36,7 +36,6 @@ from vrw_jax.validation import (
     check_reals,
     check_type,
     require_untraced_arguments,
-    with_renamed_arguments,
 )
 from vrw_jax.wheel import WheelParams, transitions
 
@@ -47,7 +46,6 @@ an axis.
 
 
 @with_default_jax_settings
-@with_renamed_arguments(most_steps="max_steps", longest_period="max_period")
 def basin(
     params: WheelParams,
     grid: StartGrid,

@@ -19,9 +19,3 @@ from vrw_jax.validation.checks import (
     require_known_name,
     require_untraced_arguments,
 )
-from vrw_jax.validation.renamed import (
-    NEW_PUBLIC_NAME_BY_OLD_NAME,
-    describe_renamed_attribute,
-    raise_missing_numerics_attribute,
-    with_renamed_arguments,
-)

@@ -13,7 +13,6 @@ from vrw_jax.validation import (
     check_int,
     check_type,
     require_untraced_arguments,
-    with_renamed_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_DOMAINS, WheelParams, require_known_friction
 
@@ -89,7 +88,6 @@ def make_page_address(params: WheelParams, model_name: str = PAGE_MODEL_NAMES[0]
     return find_wheel_page().as_uri() + page_fragment
 
 
-@with_renamed_arguments(rung="model_name")
 def explore(
     params: WheelParams | None = None,
     *,
