@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from support.package_graph import ImportGraph
 
+from experiments.shared.tables import FIGURES, format_markdown, read_table, shorten_number
+
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted(
     [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.ipynb")]
@@ -167,6 +169,56 @@ def test_every_link_of_the_built_site_leads_somewhere():
     command = [sys.executable, "-m", "website", "--stored"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+BLOCK = re.compile(r"<!-- (?!end of|runs elsewhere)([^\n]*?) -->(.*?)<!-- end of \1 -->", re.DOTALL)
+UNMEASURED_BLOCKS = {"functions and models"}
+SOURCE_LINE = re.compile(r"Command: .+; commit: .+; machine: .+; date: .+\.$")
+
+
+def find_blocks_without_source(page_text):
+    """Return names of measured blocks that do not end with command, commit, machine and date."""
+    return [
+        name
+        for name, content in BLOCK.findall(page_text)
+        if name not in UNMEASURED_BLOCKS
+        and not SOURCE_LINE.match(content.strip().splitlines()[-1] if content.strip() else "")
+    ]
+
+
+def find_blocks_unlike_their_table(page_text):
+    """Return names of blocks that show other numbers than the stored table of their name."""
+    different_names = []
+    for name, content in BLOCK.findall(page_text):
+        rows = read_table(FIGURES / f"{name}.csv") if (FIGURES / f"{name}.csv").exists() else []
+        lines = [line for line in content.splitlines() if line.startswith("|")]
+        header = [cell.strip() for cell in lines[0].strip("|").split(" | ")] if lines else []
+        if rows and set(header) <= set(rows[0]):
+            cells = [[shorten_number(row[column]) for column in header] for row in rows]
+            if format_markdown(header, cells) != "\n".join(lines):
+                different_names.append(name)
+    return different_names
+
+
+@pytest.mark.parametrize(
+    "page",
+    [path for path in DOCUMENTS if path.suffix == ".md"],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
+def test_a_measured_block_shows_stored_numbers_and_names_its_run(page):
+    assert not find_blocks_without_source(page.read_text())
+    assert not find_blocks_unlike_their_table(page.read_text())
+
+
+def test_a_measured_block_without_source_or_with_other_numbers_is_found():
+    block = "<!-- speeds -->\n\n| a |\n\n{}\n\n<!-- end of speeds -->"
+    source = "Command: `x`; commit: `y`; machine: z; date: `2026-01-01`."
+    assert find_blocks_without_source(block.format("")) == ["speeds"]
+    assert not find_blocks_without_source(block.format(source))
+    header = ["damping", "friction", "starts", "left"]
+    table = "| " + " | ".join(header) + " |\n|---|---|---|---|\n| 1 | 2 | 3 | 4 |"
+    changed_block = f"<!-- bouncing -->\n\n{table}\n\n<!-- end of bouncing -->"
+    assert find_blocks_unlike_their_table(changed_block) == ["bouncing"]
 
 
 @pytest.mark.parametrize("name", ["toml", "measures"])
