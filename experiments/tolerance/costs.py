@@ -26,7 +26,7 @@ from experiments.shared.tables import (
 )
 from experiments.shared.wheels import PARAMETER_BOX
 from vrw_jax.tolerance.measure_result import MeasureStatus
-from vrw_jax.tolerance.multifidelity import SAMPLING_OPTIONS
+from vrw_jax.tolerance.multifidelity import N_STANDARD_ERRORS
 
 TOL, FRICTION = 1e-3, (15.0, 100.0)
 TABLE = FIGURES / "answers_means.csv"
@@ -85,9 +85,7 @@ def measure_means() -> None:
                         vrw.multifidelity_mean, measure, wheels, tol, friction=friction
                     )
                     cpu, mean = _cpu(take, 3)
-                    many = (
-                        SAMPLING_OPTIONS.n_standard_errors * np.std(values) / mean.error
-                    ) ** 2 / solution
+                    many = (N_STANDARD_ERRORS * np.std(values) / mean.error) ** 2 / solution
                     n_reference_wheels = many / (1.0 + many / N_MEAN)
                     rows.append([
                         name, friction, measure, tol, int(mean.n_high_fidelity), mean.control,

@@ -459,7 +459,7 @@ def test_wheels_too_stiff_for_an_explicit_solver_use_an_implicit_one():
     )
     assert [batch_result.solver_names[i] for i in batch_result.solver_index] == [
         "Tsit5",
-        lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,
+        lane_batch.IMPLICIT_SOLVER_NAME,
     ]
     assert list(batch_result.outcome) == [Outcome.STEPPED, Outcome.STEPPED]
     _, explicit = compute_values(parameter_rows, starts, options, engine="lanes")
@@ -480,8 +480,8 @@ def test_a_stiff_wheel_with_an_unexpectedly_long_phase_uses_an_implicit_solver()
     )
     solvers = [batch_result.solver_names[i] for i in batch_result.solver_index]
     assert solvers == [
-        lane_batch.SOLVER_SELECTION_OPTIONS.implicit_solver,
-        lane_batch.SOLVER_SELECTION_OPTIONS.stable_solver,
+        lane_batch.IMPLICIT_SOLVER_NAME,
+        lane_batch.STABLE_SOLVER_NAME,
     ]
     assert list(batch_result.outcome) == [Outcome.FELL_BACK, Outcome.FELL_BACK]
     _, code = compute_values(parameter_rows[1:], starts[1:], options)

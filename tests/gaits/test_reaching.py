@@ -8,7 +8,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.cycles import gait_search
-from vrw_jax.cycles.gait_search import SEARCH_FALLBACK_OPTIONS
+from vrw_jax.cycles.gait_search import MAX_UNREFINED_MESH_ERROR
 
 WHEELS_OUTSIDE_BOX = vrw.WheelParams(
     damping=[224.5, 214.0, 119.3, 200.0],
@@ -60,7 +60,7 @@ def broadcast_wheels(values):
 def test_gaits_outside_the_fitted_box_are_found_on_a_refined_mesh(cycles):
     assert np.asarray(cycles.found).tolist() == [True, True, True, False]
     np.testing.assert_allclose(cycles.durations[:3], REFERENCE_DURATIONS, atol=2e-3)
-    assert np.all(cycles.mesh_error <= SEARCH_FALLBACK_OPTIONS.max_unrefined_mesh_error)
+    assert np.all(cycles.mesh_error <= MAX_UNREFINED_MESH_ERROR)
     assert cycles.system.cycle_options.mesh_intervals > vrw.CycleOptions().mesh_intervals
 
 

@@ -11,7 +11,8 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.contact.batch_integrator import (
-    EVENT_SEARCH_OPTIONS,
+    PAINLEVE_ATOL,
+    PAINLEVE_RTOL_FACTOR,
     EventBracket,
     _find_earliest_root,
 )
@@ -86,10 +87,7 @@ def test_the_painleve_paradox_occurs_at_the_singularity_of_another_code():
         step = vrw.step(params, starts[place], model=model, options=options)
         assert int(step.outcome) == vrw.Outcome.PAINLEVE_PARADOX
         # It ends where no more is left than `march.SINGULAR` says, of what falls by 0.8 a second.
-        left_over = (
-            EVENT_SEARCH_OPTIONS.painleve_atol
-            + EVENT_SEARCH_OPTIONS.painleve_rtol_factor * tolerance
-        ) / 0.8
+        left_over = (PAINLEVE_ATOL + PAINLEVE_RTOL_FACTOR * tolerance) / 0.8
         assert abs(step.durations.sum() - (time - 1e-6 / slope)) < 1.1 * left_over
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
-from vrw_jax.tolerance.refinement import REFINEMENT_OPTIONS, refine_gaits
+from vrw_jax.tolerance.refinement import JACOBIAN_COST_IN_STEPS, refine_gaits
 
 FIXED_VALUE = 0.3
 """First number of the fixed point; the second number is zero."""
@@ -75,7 +75,7 @@ def test_one_jacobian_serves_corrections_whose_remaining_error_is_bounded(tol):
     gaits = refine_fixed_point(np.array([0.02, 0.01]), tol, add_curvature)
     assert gaits.is_found[0]
     assert abs(gaits.measure_values[0, 0] - FIXED_VALUE) <= gaits.measure_error_bounds[0, 0] <= tol
-    n_chord_steps = gaits.n_steps[0] - REFINEMENT_OPTIONS.jacobian_cost_in_steps
+    n_chord_steps = gaits.n_steps[0] - JACOBIAN_COST_IN_STEPS
     assert 0 < n_chord_steps <= 7
 
 

@@ -6,7 +6,13 @@ import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities
-from vrw_jax.tolerance.settling import LEAP_OPTIONS, walk_until_settled
+from vrw_jax.tolerance.settling import (
+    MAX_LEAPS,
+    MAX_SETTLED_DRIFT,
+    N_STEPS_PER_LEAP,
+    N_WARMUP_STEPS,
+    walk_until_settled,
+)
 
 
 def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float] = (0.0, 0.0)):
@@ -28,8 +34,8 @@ def test_a_walk_that_drifts_for_a_thousand_steps_settles_in_ninety():
     walk = walk_scalar_map(lambda x: 0.3 + 0.995 * (x - 0.3), 1.3)
     assert walk.has_settled[0]
     fixed_point = 0.3
-    assert abs(walk.section_states[0, 0] - fixed_point) < LEAP_OPTIONS.max_settled_drift
-    max_steps = LEAP_OPTIONS.n_warmup_steps + LEAP_OPTIONS.max_leaps * LEAP_OPTIONS.steps_per_leap
+    assert abs(walk.section_states[0, 0] - fixed_point) < MAX_SETTLED_DRIFT
+    max_steps = N_WARMUP_STEPS + MAX_LEAPS * N_STEPS_PER_LEAP
     assert walk.n_steps[0] <= max_steps
 
 

@@ -21,7 +21,9 @@ from jaxtyping import Array
 from vrw_jax import simd
 from vrw_jax.batches.contact_step import CONTACT_STEP_INPUT_NAMES, step_batch_with_contact
 from vrw_jax.batches.stiffness import (
-    SOLVER_SELECTION_OPTIONS,
+    IMPLICIT_SOLVER_NAME,
+    STABLE_SOLVER_NAME,
+    STABLE_SOLVER_TIGHTENING_FACTOR,
     SolverIndex,
     select_cheapest_solver,
 )
@@ -268,21 +270,19 @@ def _step_batch_without_contact(
     solver_names: tuple[str, ...] = (options.solver,)
     engine_name = engine_by_solver[SolverIndex.REQUESTED_SOLVER].engine_name
     if requested_engine == "auto" and engine_name == "lanes":
-        stable_solver = SOLVER_SELECTION_OPTIONS.stable_solver
-        implicit_solver = SOLVER_SELECTION_OPTIONS.implicit_solver
-        solver_names = (options.solver, stable_solver, implicit_solver)
+        solver_names = (options.solver, STABLE_SOLVER_NAME, IMPLICIT_SOLVER_NAME)
         solver_indices = select_cheapest_solver(
             parameter_matrix, options.with_derivative_tolerances() if derivative_names else options
         )
         if np.any(solver_indices != SolverIndex.REQUESTED_SOLVER):
             engine_by_solver[SolverIndex.STABLE_SOLVER] = select_engine(
                 "lanes",
-                dataclasses.replace(options, solver=stable_solver).with_tightened_tolerances(
-                    SOLVER_SELECTION_OPTIONS.stable_solver_tightening_factor
+                dataclasses.replace(options, solver=STABLE_SOLVER_NAME).with_tightened_tolerances(
+                    STABLE_SOLVER_TIGHTENING_FACTOR
                 ),
             )
             engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = select_engine(
-                "diffrax", dataclasses.replace(options, solver=implicit_solver)
+                "diffrax", dataclasses.replace(options, solver=IMPLICIT_SOLVER_NAME)
             )
     for k in range(n_steps):
         active_lanes = walk_batch.find_walking_lanes()

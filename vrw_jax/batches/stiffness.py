@@ -1,6 +1,5 @@
 """Selection of the cheapest solver for each wheel, based on the stiffness of its airborne leg."""
 
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -18,34 +17,20 @@ class SolverIndex(IntEnum):
     IMPLICIT_SOLVER = 2  # for wheels that are too stiff for explicit solvers
 
 
-@dataclass(frozen=True)
-class SolverSelectionOptions:
-    """Solvers for stiff wheels, and their costs, which `select_cheapest_solver` compares."""
-
-    stable_solver: SolverName = "Tsit5"
-    """Explicit solver for wheels whose solver steps are limited by stability.
-
-    Tsit5 is chosen because it has the largest stable solver step per evaluation among diffrax's
-    solvers of order 5 and more. That step is 0.58 divided by the rate of the mode, and 0.40 for
-    Dopri8.
-    """
-    stable_solver_tightening_factor: float = 4.0
-    """Factor by which the tolerances of the stable solver are divided.
-
-    The factor is chosen because the tighter tolerance costs little. At tolerances of 1e-6 and
-    below, the error is then at most that of Dopri8.
-    """
-    implicit_solver: SolverName = "Kvaerno5"
-    """Solver for wheels that are too stiff for explicit solvers."""
-    implicit_solver_cost_evaluations: float = 6e4
-    """Cost of the implicit solver at a tolerance of 1e-6, in evaluations of an explicit solver.
-
-    The cost was measured (docs/verification/failures.md) and grows as the tolerance to the power of
-    -0.17. The cost of explicit solvers at the limit of stability does not depend on the tolerance.
-    """
-
-
-SOLVER_SELECTION_OPTIONS = SolverSelectionOptions()
+# Explicit solver for wheels whose solver steps are limited by stability. Tsit5 is chosen because it
+# has the largest stable solver step per evaluation among diffrax's solvers of order 5 and more.
+# That step is 0.58 divided by the rate of the mode, and 0.40 for Dopri8.
+STABLE_SOLVER_NAME: SolverName = "Tsit5"
+# Factor by which the tolerances of the stable solver are divided. The factor is chosen because the
+# tighter tolerance costs little. At tolerances of 1e-6 and below, the error is then at most that of
+# Dopri8.
+STABLE_SOLVER_TIGHTENING_FACTOR = 4.0
+# Solver for wheels that are too stiff for explicit solvers.
+IMPLICIT_SOLVER_NAME: SolverName = "Kvaerno5"
+# Cost of the implicit solver at a tolerance of 1e-6, in evaluations of an explicit solver. The cost
+# was measured (docs/verification/failures.md) and grows as the tolerance to the power of -0.17. The
+# cost of explicit solvers at the limit of stability does not depend on the tolerance.
+IMPLICIT_SOLVER_COST_EVALUATIONS = 6e4
 
 
 def select_cheapest_solver(parameter_matrix: np.ndarray, options: StepOptions) -> np.ndarray:
@@ -82,16 +67,11 @@ def select_cheapest_solver(parameter_matrix: np.ndarray, options: StepOptions) -
             )
 
         _, requested_solver_cost = estimate_solver_cost(options.solver)
-        n_solver_steps, stable_solver_cost = estimate_solver_cost(
-            SOLVER_SELECTION_OPTIONS.stable_solver
-        )
-        stable_solver_tolerance = (
-            relative_tolerance / SOLVER_SELECTION_OPTIONS.stable_solver_tightening_factor
-        )
+        n_solver_steps, stable_solver_cost = estimate_solver_cost(STABLE_SOLVER_NAME)
+        stable_solver_tolerance = relative_tolerance / STABLE_SOLVER_TIGHTENING_FACTOR
         is_stability_limited = n_solver_steps > stable_solver_tolerance**-0.2
         implicit_solver_cost = (
-            SOLVER_SELECTION_OPTIONS.implicit_solver_cost_evaluations
-            * (1e-6 / relative_tolerance) ** 0.17
+            IMPLICIT_SOLVER_COST_EVALUATIONS * (1e-6 / relative_tolerance) ** 0.17
         )
         solver_costs = (
             requested_solver_cost,

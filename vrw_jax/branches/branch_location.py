@@ -25,7 +25,6 @@ from vrw_jax.branches.branch_points import (
     CONTACT_ORDER_CHANGE,
     CONTACT_ORDER_COLUMN,
     CROSSING_MULTIPLIER_COUNTS,
-    LOCATED_ROOT_TOLERANCES,
     MULTIPLIER_MODULI_COLUMN,
     STEPWISE_CHANGE_NAMES,
     BranchPointTable,
@@ -67,33 +66,14 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.wheel import Outcome
 
-
-@dataclass(frozen=True)
-class SpecialPointLocationOptions:
-    """Numerical options for the location of special points.
-
-    - `parameter_accuracy`: width of the bracket, in the parameter, at which the search ends;
-    - `min_bracket_fraction`: smallest width of the bracket as a fraction of its initial width. The
-      value is chosen because near a fold the parameter varies with the square of the distance;
-    - `retry_chord_fractions`: fractions of the chord up to an ill-conditioned root, at which the
-      point next to the root is computed again;
-    - `max_unrefined_mesh_error`: estimated mesh error above which the mesh is refined.
-    """
-
-    parameter_accuracy: float = 1e-10
-    min_bracket_fraction: float = 1e-6
-    retry_chord_fractions: tuple[float, ...] = (0.99, 0.9)
-    max_unrefined_mesh_error: float = 1e-8
-
-
-LOCATION_OPTIONS = SpecialPointLocationOptions()
-"""Options for the location of all special points."""
-
-
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 """Name of a branch end at which the mesh is too coarse. Event-driven steps that start from the
 computed gaits then do not repeat.
 """
+
+
+# Estimated mesh error above which the mesh is refined.
+MAX_SPECIAL_POINT_MESH_ERROR = 1e-8
 
 
 @dataclass(frozen=True)
@@ -204,8 +184,7 @@ class AbstractContinuation(abc.ABC):
         `end_names` contains the names of the special points at the ends of the branch.
         """
         return COARSE_MESH_END_NAME in end_names or bool(
-            np.max(quantity_table.get("mesh_error", 0.0))
-            > LOCATION_OPTIONS.max_unrefined_mesh_error
+            np.max(quantity_table.get("mesh_error", 0.0)) > MAX_SPECIAL_POINT_MESH_ERROR
         )
 
     def map_over_points(
@@ -384,6 +363,20 @@ class _AdmissibleRange(NamedTuple):
     point_pairs_at_ends: dict[int, tuple[int, int]]
 
 
+# Width of the bracket, in the parameter, at which the search ends.
+LOCATION_PARAMETER_ACCURACY = 1e-10
+# Smallest width of the bracket as a fraction of its initial width. The value is chosen because near
+# a fold the parameter varies with the square of the distance.
+MIN_BRACKET_FRACTION = 1e-6
+# Fractions of the chord up to an ill-conditioned root, at which the point next to the root is
+# computed again.
+RETRY_CHORD_FRACTIONS = (0.99, 0.9)
+# Largest absolute value of a margin to the fold whose sign is only round-off. The value is chosen
+# above the round-off of a determinant of numbers of order one, which is 1e-15. Points so near to a
+# branch point are rare.
+MAX_ZERO_FOLD_MARGIN = 1e-11
+
+
 class _SpecialPointLocator(NamedTuple):
     """Locator of special points and branch ends between the computed points of branches."""
 
@@ -513,11 +506,11 @@ class _SpecialPointLocator(NamedTuple):
                 ]
             )
 
-        parameter_accuracy = LOCATION_OPTIONS.parameter_accuracy
         parameter_distances = np.abs(right_table.points.p - left_table.points.p)
         bracket_tolerances = np.minimum(
-            parameter_accuracy / np.maximum(parameter_distances, parameter_accuracy),
-            LOCATION_OPTIONS.min_bracket_fraction,
+            LOCATION_PARAMETER_ACCURACY
+            / np.maximum(parameter_distances, LOCATION_PARAMETER_ACCURACY),
+            MIN_BRACKET_FRACTION,
         )
         root_locations = locate_function_roots(
             lambda chord_fractions, request_indices: evaluate_requested_quantities(
@@ -535,7 +528,7 @@ class _SpecialPointLocator(NamedTuple):
             np.maximum(root_locations.left_bracket_ends - bracket_tolerances, 0.0),
             all_request_indices,
         )
-        for retry_chord_fraction in LOCATION_OPTIONS.retry_chord_fractions:
+        for retry_chord_fraction in RETRY_CHORD_FRACTIONS:
             retried_indices = np.flatnonzero(
                 ~(table_beside_roots.quantity_table[ADMISSIBILITY_COLUMN] > 0.0)
             )
@@ -695,7 +688,7 @@ class _SpecialPointLocator(NamedTuple):
         ]
         # At a branch point the sign of the fold's margin is determined by round-off.
         regular_point_indices = np.flatnonzero(
-            ~(np.abs(quantity_table["fold"]) < LOCATED_ROOT_TOLERANCES.max_zero_margin)
+            ~(np.abs(quantity_table["fold"]) < MAX_ZERO_FOLD_MARGIN)
         )
         root_requests = []
         for i, j, column_index in find_sign_changes(

@@ -1,7 +1,6 @@
 """Define tables of the points of branches, and the roots that are located between these points."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -56,35 +55,6 @@ QuantitiesByName = dict[str, np.ndarray]
 """Arrays of quantities with one element per point, by the name of the quantity."""
 
 
-@dataclass(frozen=True)
-class LocatedRootTolerances:
-    """Tolerances that decide whether two located roots are equal, and whether a located root is
-    valid.
-
-    - `max_zero_margin`: largest absolute value of a margin to the fold whose sign is only
-      round-off. The value is chosen above the round-off of a determinant of numbers of order one,
-      which is 1e-15. Points so near to a branch point are rare;
-    - `max_equal_location_distance`: fraction of a bracket within which ranks are treated as
-      crossing together. The value is chosen because three equal multipliers are computed to 1e-5,
-      which is 1e-4 of a bracket;
-    - `max_value_beside_root`: largest ratio of the quantity next to its root to the quantity at an
-      end of the bracket; at a jump the ratio is larger. The value is chosen because the point next
-      to the root may be at nine tenths of the distance to the root;
-    - `max_equal_parameter_distance`: relative distance below which two changes of a stepwise
-      quantity are the same change. The value is chosen because two searches may differ by the
-      change of the parameter over the shortest continuation step.
-    """
-
-    max_zero_margin: float = 1e-11
-    max_equal_location_distance: float = 1e-3
-    max_value_beside_root: float = 0.2
-    max_equal_parameter_distance: float = 1e-7
-
-
-LOCATED_ROOT_TOLERANCES = LocatedRootTolerances()
-"""Tolerances for located roots on all branches."""
-
-
 class BranchPointTable(NamedTuple):
     """Points of branches with their quantities, in the order of each wheel's branch.
 
@@ -124,6 +94,12 @@ class RootRequest(NamedTuple):
     multiplier_ranks: range = range(0)
 
 
+# Largest ratio of the quantity next to its root to the quantity at an end of the bracket; at a jump
+# the ratio is larger. The value is chosen because the point next to the root may be at nine tenths
+# of the distance to the root.
+MAX_VALUE_BESIDE_ROOT = 0.2
+
+
 class LocatedRoot(NamedTuple):
     """Located root of a quantity between two points of a branch."""
 
@@ -146,7 +122,7 @@ class LocatedRoot(NamedTuple):
         """
         evaluate_quantity = self.request.evaluate_quantity
         (value_beside_root,) = np.abs(evaluate_quantity(self.table_beside_root.quantity_table))
-        max_value_beside_root = LOCATED_ROOT_TOLERANCES.max_value_beside_root * np.max(
+        max_value_beside_root = MAX_VALUE_BESIDE_ROOT * np.max(
             np.abs(evaluate_quantity(quantity_table)[list(self.request.point_pair)])
         )
         return not value_beside_root > max_value_beside_root
@@ -164,6 +140,12 @@ def compare_with_integer(
     return np.where(np.isnan(integer_values), np.nan, equality_sign)
 
 
+# Relative distance below which two changes of a stepwise quantity are the same change. The value is
+# chosen because two searches may differ by the change of the parameter over the shortest
+# continuation step.
+MAX_EQUAL_PARAMETER_DISTANCE = 1e-7
+
+
 def drop_duplicate_changes(located_roots: list[LocatedRoot]) -> list[LocatedRoot]:
     """Return the roots, with each change of a stepwise quantity only once.
 
@@ -176,9 +158,7 @@ def drop_duplicate_changes(located_roots: list[LocatedRoot]) -> list[LocatedRoot
         has_same_kind = name == earlier_name in STEPWISE_CHANGE_NAMES.values() or (
             (name, earlier_name) == (FORCE_PEAK_COUNT_CHANGE, SECOND_PEAK_RATE_NAME)
         )
-        max_distance = LOCATED_ROOT_TOLERANCES.max_equal_parameter_distance * abs(
-            earlier_root.parameter_value
-        )
+        max_distance = MAX_EQUAL_PARAMETER_DISTANCE * abs(earlier_root.parameter_value)
         return (
             has_same_kind
             and root.request.point_pair == earlier_root.request.point_pair

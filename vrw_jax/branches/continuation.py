@@ -90,22 +90,10 @@ DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 """Advice in the error message for a caller who differentiates a branch."""
 
 
-@dataclass(frozen=True)
-class GaitContinuationOptions:
-    """Numerical options for the continuation of gaits.
-
-    - `max_measure_change_at_jump`: largest relative change of period and step length at a jump of
-      the section state within one branch. The value is chosen because a change in the order of two
-      impacts changes period and step length by 1e-4;
-    - `max_mesh_refinements`: largest number of mesh refinements.
-    """
-
-    max_measure_change_at_jump: float = 0.01
-    max_mesh_refinements: int = 3
-
-
-GAIT_CONTINUATION_OPTIONS = GaitContinuationOptions()
-"""Options for the continuation of all gaits."""
+# Largest relative change of period and step length at a jump of the section state within one
+# branch. The value is chosen because a change in the order of two impacts changes period and step
+# length by 1e-4.
+MAX_MEASURE_CHANGE_AT_JUMP = 0.01
 
 
 @dataclass(frozen=True)
@@ -156,9 +144,7 @@ class GaitContinuation(AbstractContinuation):
         """Return whether period and step length are about equal before and after each jump."""
         is_measure_similar = super().is_same_gait(table_before, table_after)
         for measure_name in ("period", "step_length"):
-            max_measure_change = GAIT_CONTINUATION_OPTIONS.max_measure_change_at_jump * np.abs(
-                table_before[measure_name]
-            )
+            max_measure_change = MAX_MEASURE_CHANGE_AT_JUMP * np.abs(table_before[measure_name])
             is_measure_similar &= (
                 np.abs(table_after[measure_name] - table_before[measure_name]) <= max_measure_change
             )
@@ -371,6 +357,10 @@ def continue_branches(
     )
 
 
+# Largest number of mesh refinements of a gait on a branch or a curve.
+MAX_BRANCH_MESH_REFINEMENTS = 3
+
+
 def _continue_gait_branches(
     branch_request: BranchRequest,
     start_cycle: Any,
@@ -385,8 +375,7 @@ def _continue_gait_branches(
     limits no branch.
     """
     can_refine_mesh = branch_request.cycle_options is None
-    max_mesh_refinements = GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
-    for refinement_index in range(1 + max_mesh_refinements):
+    for refinement_index in range(1 + MAX_BRANCH_MESH_REFINEMENTS):
         branch_start = START_FUNCTION_BY_METHOD[branch_request.model.capabilities.gait_method](
             branch_request, start_cycle
         )
@@ -401,7 +390,7 @@ def _continue_gait_branches(
         is_finest_mesh = (
             not can_refine_mesh
             or branch_start.finer_cycle_options is None
-            or refinement_index == max_mesh_refinements
+            or refinement_index == MAX_BRANCH_MESH_REFINEMENTS
         )
         branch_data_by_wheel = continue_and_locate_special_points(
             branch_continuation,

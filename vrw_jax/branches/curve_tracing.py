@@ -25,7 +25,7 @@ from vrw_jax.branches.branch_location import (
 from vrw_jax.branches.branch_points import BRANCH_POINT_KIND
 from vrw_jax.branches.continuation import (
     BRANCH_ENDING_QUANTITIES,
-    GAIT_CONTINUATION_OPTIONS,
+    MAX_BRANCH_MESH_REFINEMENTS,
     GaitContinuation,
     continue_branches,
 )
@@ -66,32 +66,6 @@ DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
 """Default continuation options of curves. The first continuation step is short because some curves
 are short.
 """
-
-
-@dataclass(frozen=True)
-class CurveTracingOptions:
-    """Numerical options of the tracing of curves. All distances are arc lengths.
-
-    - `max_distance_on_same_curve`: largest distance from a curve at which a point is treated as a
-      point of the curve;
-    - `codim2_overrun_distance`: distance beyond a point of codimension two at which the
-      continuation of the second curve through that point starts;
-    - `relative_codim2_tolerance`: tolerance for Newton's last correction at a point of codimension
-      two, relative to the values of the parameters;
-    - `max_zero_dls_duration`: largest duration of double support that is treated as zero, s. The
-      value is chosen above round-off because the duration is ill-conditioned near zero;
-    - `dls_duration_guess`: initial guess for a nonzero duration of double support, s.
-    """
-
-    max_distance_on_same_curve: float = 2e-3
-    codim2_overrun_distance: float = 3e-3
-    relative_codim2_tolerance: float = 1e-9
-    max_zero_dls_duration: float = 1e-4
-    dls_duration_guess: float = 0.1
-
-
-CURVE_TRACING_OPTIONS = CurveTracingOptions()
-"""Options for the tracing of all curves."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +174,10 @@ class CurveSeed(NamedTuple):
     z: CollocationSolution
 
 
+# Largest distance from a curve, in arc length, at which a point is treated as a point of the curve.
+MAX_DISTANCE_ON_SAME_CURVE = 2e-3
+
+
 class TracedCurve(NamedTuple):
     """Traced curve of special points, and seeds at the other special points that it meets."""
 
@@ -217,7 +195,17 @@ class TracedCurve(NamedTuple):
         if special_point_name != self.special_point_curve.name:
             return False
         distances = compute_distances_to_polyline(scaled_points, self.scaled_vertices)
-        return bool(np.max(distances) < CURVE_TRACING_OPTIONS.max_distance_on_same_curve)
+        return bool(np.max(distances) < MAX_DISTANCE_ON_SAME_CURVE)
+
+
+# Arc length beyond a point of codimension two at which the continuation of the second curve through
+# that point starts.
+CODIM2_OVERRUN_DISTANCE = 3e-3
+# Tolerance for Newton's last correction at a point of codimension two, relative to the values of
+# the parameters.
+RELATIVE_CODIM2_TOLERANCE = 1e-9
+# Initial guess for a nonzero duration of double support, s.
+DLS_DURATION_GUESS_S = 0.1
 
 
 class CurveTracer(NamedTuple):
@@ -354,9 +342,8 @@ class CurveTracer(NamedTuple):
             sorted({curve_seed.special_point_name for curve_seed in curve_seeds})
         )
         self.report_stage(f"following special points: {special_point_names}")
-        max_mesh_refinements = GAIT_CONTINUATION_OPTIONS.max_mesh_refinements
-        for refinement_index in range(1 + max_mesh_refinements):
-            is_finest_mesh = refinement_index == max_mesh_refinements
+        for refinement_index in range(1 + MAX_BRANCH_MESH_REFINEMENTS):
+            is_finest_mesh = refinement_index == MAX_BRANCH_MESH_REFINEMENTS
             branch_data_by_seed, collocation_system = self._continue_curves_of_batch(
                 quantity_group, curve_seeds, is_finest_mesh
             )
@@ -532,9 +519,7 @@ class CurveTracer(NamedTuple):
             jax.device_put(z),
             jnp.asarray(start_parameter_values),
         )
-        is_onset_found = (
-            last_relative_parameter_change < CURVE_TRACING_OPTIONS.relative_codim2_tolerance
-        )
+        is_onset_found = last_relative_parameter_change < RELATIVE_CODIM2_TOLERANCE
         first_parameter_value, second_parameter_value = (
             onset_parameter_values if is_onset_found else start_parameter_values
         )
@@ -564,20 +549,18 @@ class CurveTracer(NamedTuple):
             parameter_points[::curve_traversal_sign],
         )
         z = jax.tree.map(lambda x: x[::curve_traversal_sign], z)
-        overrun_distance = CURVE_TRACING_OPTIONS.codim2_overrun_distance
         distances_to_meeting = np.linalg.norm(scaled_vertices - scaled_vertices[0], axis=1)
         point_index = int(
-            np.argmax(distances_to_meeting >= min(overrun_distance, distances_to_meeting[-1]))
+            np.argmax(
+                distances_to_meeting >= min(CODIM2_OVERRUN_DISTANCE, distances_to_meeting[-1])
+            )
         )
         extrapolate_from_meeting = lambda x: (
-            x[0] + overrun_distance / distances_to_meeting[point_index] * (x[0] - x[point_index])
+            x[0]
+            + CODIM2_OVERRUN_DISTANCE / distances_to_meeting[point_index] * (x[0] - x[point_index])
         )
         z = jax.tree.map(lambda x: jnp.asarray(extrapolate_from_meeting(x)), z)
-        dls_duration = (
-            0.0
-            if special_point_name == DLS_VANISHING_NAME
-            else CURVE_TRACING_OPTIONS.dls_duration_guess
-        )
+        dls_duration = 0.0 if special_point_name == DLS_VANISHING_NAME else DLS_DURATION_GUESS_S
         z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
         return curve_seed._replace(
             special_point_name=special_point_name,
@@ -645,6 +628,11 @@ def compute_distances_to_polyline(
     return np.min(segment_distances, axis=1, initial=np.inf)
 
 
+# Largest duration of double support that is treated as zero, s. The value is chosen above round-off
+# because the duration is ill-conditioned near zero.
+MAX_ZERO_DLS_DURATION_S = 1e-4
+
+
 def choose_continued_special_point_name(
     special_point_name: str,
     branch_wheel: BranchWheel,
@@ -665,7 +653,7 @@ def choose_continued_special_point_name(
         return special_point_name
     dls_vanishes = (
         special_point_name != INITIAL_FORCE_FALL_NAME
-        and z.durations[0, 0] < CURVE_TRACING_OPTIONS.max_zero_dls_duration
+        and z.durations[0, 0] < MAX_ZERO_DLS_DURATION_S
     )
     return DLS_VANISHING_NAME if dls_vanishes else "lambda_4_plus"
 

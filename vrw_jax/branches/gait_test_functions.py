@@ -6,7 +6,6 @@ determine.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -96,25 +95,6 @@ FORCE_QUANTITY_NAMES = (SECOND_PEAK_RATE_NAME,)
 """Names of quantities of the gait's force, whose extrema are located on its collocation."""
 
 
-@dataclass(frozen=True)
-class TestFunctionOptions:
-    """Numerical options of the test functions of gaits.
-
-    - `n_codim2_iterations`: number of Newton iterations for a point of codimension two;
-    - `max_duration_roundoff`: largest round-off of a duration that is zero on a whole curve, s;
-    - `relative_difference_step`: finite difference of the section state and of the relative
-      parameters, for derivatives of quantities that an event-driven step determines.
-    """
-
-    n_codim2_iterations: int = 8
-    max_duration_roundoff: float = 1e-9
-    relative_difference_step: float = 1e-6
-
-
-TEST_FUNCTION_OPTIONS = TestFunctionOptions()
-"""Options of all test functions of gaits."""
-
-
 def select_test_quantity(special_point_name: str, has_double_support: bool) -> str:
     """Return the name of the quantity that vanishes at the named special point.
 
@@ -158,6 +138,13 @@ class TestFunctionWheel(NamedTuple):
 
     branch_wheel: BranchWheel
     quantity_index: Array
+
+
+# Largest round-off of a duration that is zero on a whole curve, s.
+MAX_DURATION_ROUNDOFF_S = 1e-9
+# Finite difference of the section state and of the relative parameters, for derivatives of
+# quantities that an event-driven step determines.
+RELATIVE_DIFFERENCE_STEP = 1e-6
 
 
 class GaitTestFunction(AbstractTestFunction):
@@ -252,13 +239,12 @@ class GaitTestFunction(AbstractTestFunction):
                 branch_wheel, displaced_solution, p + parameter_change
             )
 
-        difference_step = TEST_FUNCTION_OPTIONS.relative_difference_step
         quantities_at_offsets = jax.vmap(measure_gait_at_offset)(
-            difference_step * jnp.eye(3, 2, -1, p.dtype)
+            RELATIVE_DIFFERENCE_STEP * jnp.eye(3, 2, -1, p.dtype)
         )
         quantity_gradients = (
             quantities_at_offsets[1:] - quantities_at_offsets[0]
-        ) / difference_step
+        ) / RELATIVE_DIFFERENCE_STEP
         parameter_gradient = triangular_factor.T @ quantity_gradients / p[:, None]
         return quantities_at_offsets[
             0
@@ -316,7 +302,7 @@ class GaitTestFunction(AbstractTestFunction):
         return unbatch(compute_correction_norm)(z, newton_correction)
 
     def is_admissible(self, wheel: TestFunctionWheel, z: CollocationSolution, p: Array) -> Array:
-        are_durations_nonnegative = z.durations > -TEST_FUNCTION_OPTIONS.max_duration_roundoff
+        are_durations_nonnegative = z.durations > -MAX_DURATION_ROUNDOFF_S
         return jnp.all(are_durations_nonnegative | (wheel.branch_wheel.is_phase_active < 0.5))
 
 
@@ -335,6 +321,10 @@ def displace_solution(
         newton_correction,
         parameter_tangents,
     )
+
+
+# Number of Newton iterations for a point of codimension two.
+N_CODIM2_ITERATIONS = 8
 
 
 @eqx.filter_jit
@@ -379,7 +369,7 @@ def locate_jump_onset(
         take_newton_step,
         (z, p),
         None,
-        length=TEST_FUNCTION_OPTIONS.n_codim2_iterations,
+        length=N_CODIM2_ITERATIONS,
     )
     return p, jnp.max(jnp.abs(relative_parameter_changes[-1]))
 

@@ -5,7 +5,6 @@ effects of two impacts do not commute. No continuation step leads to the gait be
 however short the step is.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -14,30 +13,14 @@ import numpy as np
 from vrw_jax.continuation import ContinuationResult, ContinuationStatus
 from vrw_jax.numerics import select_tree_rows
 
-
-@dataclass(frozen=True)
-class JumpOptions:
-    """Numerical options for the continuation beyond jumps of the section state.
-
-    - `max_jumps_per_direction`: largest number of jumps in one direction of a branch;
-    - `parameter_change_fractions`: changes of the parameter, as fractions of its range, after which
-      a gait beyond a jump is searched for. The values are chosen because two impacts with
-      unilateral contact change their order within a fraction of 1e-4;
-    - `min_chord_steepness_factor`: smallest ratio, at a jump, of the steepness of the chord between
-      two points to that of both tangents. The value is chosen because continuation steps turn by at
-      most 0.2 rad. The slope of a chord is then between those of the tangents to some tenths, even
-      at a kink.
-    """
-
-    max_jumps_per_direction: int = 20
-    parameter_change_fractions: tuple[float, ...] = (
-        1e-9, 1e-7, 1e-5, 3e-5, 1e-4, 2e-4, 3e-4, 5e-4, 1e-3,
-    )  # fmt: skip
-    min_chord_steepness_factor: float = 5.0
-
-
-JUMP_OPTIONS = JumpOptions()
-"""Options for the continuation beyond all jumps."""
+# Largest number of jumps in one direction of a branch.
+MAX_JUMPS_PER_DIRECTION = 20
+# Changes of the parameter, as fractions of its range, after which a gait beyond a jump is searched
+# for. The values are chosen because two impacts with unilateral contact change their order within a
+# fraction of 1e-4.
+PARAMETER_CHANGE_FRACTIONS = (
+    1e-9, 1e-7, 1e-5, 3e-5, 1e-4, 2e-4, 3e-4, 5e-4, 1e-3,
+)  # fmt: skip
 
 
 def continue_beyond_jumps(
@@ -53,7 +36,7 @@ def continue_beyond_jumps(
     branch_indices = np.arange(len(results_by_direction.n_points))
     lower_bound, upper_bound = branch_continuation.parameter_bounds
     wheel_indices, has_search_failed = branch_indices // 2, np.zeros(len(branch_indices), bool)
-    for _ in range(JUMP_OPTIONS.max_jumps_per_direction):
+    for _ in range(MAX_JUMPS_PER_DIRECTION):
         n_points = np.asarray(results_by_direction.n_points)
         is_branch_stalled = (
             (results_by_direction.status == int(ContinuationStatus.STEP_SIZE_UNDERFLOW))
@@ -69,7 +52,7 @@ def continue_beyond_jumps(
         branch_end_quantities = branch_continuation.make_quantity_table(
             branch_end_points, wheel_indices
         )
-        for parameter_change_fraction in JUMP_OPTIONS.parameter_change_fractions:
+        for parameter_change_fraction in PARAMETER_CHANGE_FRACTIONS:
             parameter_values = branch_end_points.p + direction_signs * parameter_change_fraction * (
                 upper_bound - lower_bound
             )
@@ -135,6 +118,12 @@ def append_branch_results(
     return ContinuationResult(*joined_results)
 
 
+# Smallest ratio, at a jump, of the steepness of the chord between two points to that of both
+# tangents. The value is chosen because continuation steps turn by at most 0.2 rad. The slope of a
+# chord is then between those of the tangents to some tenths, even at a kink.
+MIN_CHORD_STEEPNESS_FACTOR = 5.0
+
+
 def find_state_jumps(
     section_states: np.ndarray,
     parameter_fractions: np.ndarray,
@@ -161,7 +150,7 @@ def find_state_jumps(
         # Across a fold the rates have opposite signs, and both parameters may be equal.
         has_same_direction = fraction_rates[left_index] * fraction_rates[right_index] > 0.0
         is_chord_steeper = (
-            JUMP_OPTIONS.min_chord_steepness_factor * abs(parameter_fraction_change)
+            MIN_CHORD_STEEPNESS_FACTOR * abs(parameter_fraction_change)
             < min_parameter_fraction_change
         )
         return bool(has_same_direction and is_chord_steeper)

@@ -12,7 +12,6 @@ import numpy as np
 
 from vrw_jax.branches.branch_points import (
     BRANCH_POINT_KIND,
-    LOCATED_ROOT_TOLERANCES,
     MULTIPLIER_MODULI_COLUMN,
     BranchPointTable,
     LocatedRoot,
@@ -86,6 +85,11 @@ def classify_crossing_ranks(
     }
 
 
+# Fraction of a bracket within which ranks are treated as crossing together. The value is chosen
+# because three equal multipliers are computed to 1e-5, which is 1e-4 of a bracket.
+MAX_EQUAL_LOCATION_DISTANCE = 1e-3
+
+
 def add_multiple_bifurcations(
     point_table: BranchPointTable,
     point_pairs: list[tuple[int, int]],
@@ -125,8 +129,7 @@ def add_multiple_bifurcations(
         if (
             last_root is not None
             and last_root.request.point_pair == root.request.point_pair
-            and abs(root.chord_fraction - last_root.chord_fraction)
-            <= LOCATED_ROOT_TOLERANCES.max_equal_location_distance
+            and abs(root.chord_fraction - last_root.chord_fraction) <= MAX_EQUAL_LOCATION_DISTANCE
         ):
             root_groups[-1].append(root)
         else:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -33,30 +32,6 @@ from vrw_jax.measures import xarray as xr
 from vrw_jax.models import ViscoelasticWheel
 from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.wheel import Outcome, WheelParams
-
-
-@dataclass(frozen=True)
-class SpecialPointMapOptions:
-    """Numerical options of the map of special points. Distances are in cells of the scan.
-
-    - `n_parallel_branches`: number of parallel branches in each parameter, from which the map
-      starts;
-    - `n_meeting_rounds`: number of rounds in which special points on new curves are continued;
-    - `max_search_rounds`: largest number of rounds in which sign changes are examined;
-    - `max_distance_to_explaining_curve`: largest distance of a sign change from a curve that
-      explains it;
-    - `min_distance_to_examined`: smallest distance between examined sign changes.
-    """
-
-    n_parallel_branches: int = 5
-    n_meeting_rounds: int = 3
-    max_search_rounds: int = 8
-    max_distance_to_explaining_curve: float = 1.0
-    min_distance_to_examined: float = 5.0
-
-
-SPECIAL_POINT_MAP_OPTIONS = SpecialPointMapOptions()
-"""Options of all maps of special points."""
 
 GAIT_CHANGE_NAME = "gait"
 """Name of the change between a sample with a gait and a sample without a gait."""
@@ -84,6 +59,10 @@ By default the curve with the name of the quantity explains the change.
 """
 
 
+# Smallest distance between examined sign changes, in cells of the scan.
+MIN_DISTANCE_TO_EXAMINED = 5.0
+
+
 class ScanSignChange(NamedTuple):
     """Sign change of a quantity between two neighboring samples of a scan."""
 
@@ -98,8 +77,14 @@ class ScanSignChange(NamedTuple):
             self.quantity_name == other.quantity_name
             and self.parameter_index == other.parameter_index
             and math.dist(self.scan_position_in_cells, other.scan_position_in_cells)
-            <= SPECIAL_POINT_MAP_OPTIONS.min_distance_to_examined
+            <= MIN_DISTANCE_TO_EXAMINED
         )
+
+
+# Number of parallel branches in each parameter, from which the map starts.
+N_PARALLEL_BRANCHES = 5
+# Largest number of rounds in which sign changes are examined.
+MAX_SEARCH_ROUNDS = 8
 
 
 @with_default_jax_settings
@@ -129,7 +114,7 @@ def trace_special_points(
         on_stage,
         measures_force_peaks=SECOND_PEAK_RATE_NAME in scan_dataset,
     )
-    curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params)
+    curve_seeds = find_seeds_oN_PARALLEL_BRANCHES(curve_tracer, params)
     traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [])
     sign_changes = find_sign_changes_in_scan(scan_dataset, curve_tracer.parameter_names)
     examined_sign_changes: list[ScanSignChange] = []
@@ -138,7 +123,7 @@ def trace_special_points(
         [traced_curve.special_point_curve for traced_curve in traced_curves],
         scan_dataset,
     )
-    for _ in range(SPECIAL_POINT_MAP_OPTIONS.max_search_rounds):
+    for _ in range(MAX_SEARCH_ROUNDS):
         new_sign_changes: list[ScanSignChange] = []
         for sign_change in find_remaining_sign_changes():
             if not any(map(sign_change.is_near, (*examined_sign_changes, *new_sign_changes))):
@@ -165,12 +150,16 @@ def trace_special_points(
                 curve_tracer,
                 parameter_index,
                 wheels_beside_sign_change,
-                SPECIAL_POINT_MAP_OPTIONS.n_parallel_branches,
+                N_PARALLEL_BRANCHES,
             )
         traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, traced_curves)
     return tuple(traced_curve.special_point_curve for traced_curve in traced_curves), tuple(
         find_remaining_sign_changes()
     )
+
+
+# Number of rounds in which special points on new curves are continued.
+N_MEETING_ROUNDS = 3
 
 
 def _trace_curves_and_meetings(
@@ -182,7 +171,7 @@ def _trace_curves_and_meetings(
 
     Return these curves together with the known curves.
     """
-    for _ in range(SPECIAL_POINT_MAP_OPTIONS.n_meeting_rounds):
+    for _ in range(N_MEETING_ROUNDS):
         new_curves = curve_tracer.trace_curves(curve_seeds, traced_curves)
         known_curves = [
             traced_curve
@@ -198,7 +187,7 @@ def _trace_curves_and_meetings(
     return traced_curves
 
 
-def find_seeds_on_parallel_lines(
+def find_seeds_oN_PARALLEL_BRANCHES(
     curve_tracer: CurveTracer,
     params: WheelParams,
 ) -> list[CurveSeed]:
@@ -207,13 +196,13 @@ def find_seeds_on_parallel_lines(
     A branch in one parameter starts at the middle of that parameter's range. The branches differ by
     evenly spaced values of the other parameter.
     """
-    curve_seeds, n_parallel_lines = [], SPECIAL_POINT_MAP_OPTIONS.n_parallel_branches
+    curve_seeds = []
     for parameter_index in range(2):
         lower_bound, upper_bound = curve_tracer.parameter_ranges[1 - parameter_index]
         line_parameter_values = lower_bound + (
-            np.arange(n_parallel_lines) + 0.5
-        ) / n_parallel_lines * (upper_bound - lower_bound)
-        start_values = np.empty((n_parallel_lines, 2))
+            np.arange(N_PARALLEL_BRANCHES) + 0.5
+        ) / N_PARALLEL_BRANCHES * (upper_bound - lower_bound)
+        start_values = np.empty((N_PARALLEL_BRANCHES, 2))
         start_values[:, parameter_index] = curve_tracer.parameter_ranges[parameter_index].mean()
         start_values[:, 1 - parameter_index] = line_parameter_values
         wheels_on_line = [
@@ -221,7 +210,7 @@ def find_seeds_on_parallel_lines(
             for start_values_on_line in start_values
         ]
         curve_seeds += _find_seeds_in_batches(
-            curve_tracer, parameter_index, wheels_on_line, n_parallel_lines
+            curve_tracer, parameter_index, wheels_on_line, N_PARALLEL_BRANCHES
         )
     return curve_seeds
 
@@ -310,6 +299,10 @@ def find_sign_changes_in_scan(
     return sign_changes
 
 
+# Largest distance of a sign change from a curve that explains it, in cells of the scan.
+MAX_DISTANCE_TO_EXPLAINING_CURVE = 1.0
+
+
 def find_unexplained_sign_changes(
     sign_changes: Sequence[ScanSignChange],
     special_point_curves: Sequence[SpecialPointCurve],
@@ -348,6 +341,6 @@ def find_unexplained_sign_changes(
             for sign_change, curve_distance in zip(
                 sign_changes_of_quantity, curve_distances, strict=True
             )
-            if curve_distance > SPECIAL_POINT_MAP_OPTIONS.max_distance_to_explaining_curve
+            if curve_distance > MAX_DISTANCE_TO_EXPLAINING_CURVE
         ]
     return unexplained_sign_changes

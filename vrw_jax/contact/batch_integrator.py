@@ -14,7 +14,6 @@ example is the guard for the normal force on a foot that has just lifted off.
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
 from typing import Any, NamedTuple
@@ -61,46 +60,6 @@ class LaneStatus(IntEnum):
 
     RUNNING = -1
     EVENT = -2
-
-
-@dataclass(frozen=True)
-class EventSearchOptions:
-    """Options of the event search with unilateral contact, and of the loop over solver steps."""
-
-    max_attempts_with_waiting_lane: int = 8
-    """Number of solver steps after which an element at an event ends the loop for the batch."""
-    painleve_atol: float = 1e-8
-    """Absolute value below which the determinant is treated as zero at Painlevé's singularity.
-
-    There, forces are a ratio of two vanishing quantities, which neither round-off nor integration
-    resolves.
-    """
-    painleve_rtol_factor: float = 1e2
-    """Factor by which the relative tolerance is multiplied before it is added to `painleve_atol`.
-
-    The value is chosen because one singularity was missed with a factor of 18.
-    """
-    n_parabola_iterations: int = 3
-    """Number of event iterations with parabolas. Later iterations use secants.
-
-    Secants converge better if a guard is negative only for a short time.
-    """
-    min_iterations_of_initiating_guard: int = 15
-    """Number of event iterations after which an initiating guard may be the event."""
-    max_roundoff_fall_duration: float = 1e-3
-    """Time in which a guard must fall by its own round-off to be treated as falling.
-
-    The value is in the wheel's unit of time, which is 1 s for the wheel in Table 1 of the paper.
-    """
-    event_time_tolerance_factor: float = 30.0
-    """Ratio of the event's time tolerance to the relative tolerance times the step size.
-
-    The time tolerance limits the last correction to the time of an event. The value is chosen
-    because the error of a parabola's root is about a hundredth of this correction.
-    """
-
-
-EVENT_SEARCH_OPTIONS = EventSearchOptions()
 
 
 class ContactIntervalPoint(NamedTuple):
@@ -267,6 +226,11 @@ def find_initiating_guards(contact_mode_dynamics: ContactModeDynamics) -> Array:
     )
 
 
+# Time in which a guard must fall by its own round-off to be treated as falling. The value is in the
+# wheel's unit of time, which is 1 s for the wheel in Table 1 of the paper.
+MAX_ROUNDOFF_FALL_DURATION = 1e-3
+
+
 @eqx.filter_jit  # This function is traced once for all call sites.
 def init_contact_interval(
     contact_mode_dynamics: ContactModeDynamics,
@@ -291,9 +255,7 @@ def init_contact_interval(
         GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
     )
     time_unit = compute_wheel_units(contact_mode_dynamics.s).time_unit
-    min_initiating_guard_rate = -guard_roundoff / (
-        EVENT_SEARCH_OPTIONS.max_roundoff_fall_duration * time_unit
-    )
+    min_initiating_guard_rate = -guard_roundoff / (MAX_ROUNDOFF_FALL_DURATION * time_unit)
     is_initiating = is_initiating | (
         (guard_values <= guard_roundoff) & (guard_rates > min_initiating_guard_rate)
     )
@@ -377,6 +339,10 @@ def integrate_contact_interval(
     )
 
 
+# Number of solver steps after which an element at an event ends the loop for the batch.
+MAX_ATTEMPTS_WITH_WAITING_LANE = 8
+
+
 def iterate_until_stopped(
     is_running: Callable[[Any], Array],
     has_unfinished_walk: Array,
@@ -385,7 +351,7 @@ def iterate_until_stopped(
 ) -> Any:
     """Return the loop state after `advance_state` was applied until no element is running.
 
-    After `EventSearchOptions.max_attempts_with_waiting_lane` applications, the loop ends as soon as
+    After `MAX_ATTEMPTS_WITH_WAITING_LANE` applications, the loop ends as soon as
     an element with an unfinished walk has stopped.
     """
 
@@ -394,7 +360,7 @@ def iterate_until_stopped(
         is_event_search_active = is_running(lane_states)
         has_stopped = jnp.any(has_unfinished_walk & ~is_event_search_active)
         return jnp.any(is_event_search_active) & (
-            (n_attempts < EVENT_SEARCH_OPTIONS.max_attempts_with_waiting_lane) | ~has_stopped
+            (n_attempts < MAX_ATTEMPTS_WITH_WAITING_LANE) | ~has_stopped
         )
 
     advance_loop_state = lambda loop_state: (advance_state(loop_state[0]), loop_state[1] + 1)
@@ -528,6 +494,14 @@ def complete_solver_step(
     )
 
 
+# Absolute value below which the determinant is treated as zero at Painlevé's singularity. There,
+# forces are a ratio of two vanishing quantities, which neither round-off nor integration resolves.
+PAINLEVE_ATOL = 1e-8
+# Factor by which the relative tolerance is multiplied before it is added to `PAINLEVE_ATOL`. The
+# value is chosen because one singularity was missed with a factor of 18.
+PAINLEVE_RTOL_FACTOR = 1e2
+
+
 def is_at_painleve_singularity(
     determinant_before: Array,
     determinant_after: Array,
@@ -537,10 +511,7 @@ def is_at_painleve_singularity(
 
     - `determinant_before`, `determinant_after`: determinants at the two times.
     """
-    zero_tolerance = (
-        EVENT_SEARCH_OPTIONS.painleve_atol
-        + EVENT_SEARCH_OPTIONS.painleve_rtol_factor * options.rtol
-    )
+    zero_tolerance = PAINLEVE_ATOL + PAINLEVE_RTOL_FACTOR * options.rtol
     is_near_zero = jnp.abs(determinant_after) <= zero_tolerance
     return (determinant_before * determinant_after <= 0.0) | is_near_zero
 
@@ -640,6 +611,17 @@ def advance_running_lanes(
     )
 
 
+# Number of event iterations with parabolas. Later iterations use secants. Secants converge better
+# if a guard is negative only for a short time.
+N_PARABOLA_ITERATIONS = 3
+# Number of event iterations after which an initiating guard may be the event.
+MIN_ITERATIONS_OF_INITIATING_GUARD = 15
+# Ratio of the event's time tolerance to the relative tolerance times the step size. The time
+# tolerance limits the last correction to the time of an event. The value is chosen because the
+# error of a parabola's root is about a hundredth of this correction.
+EVENT_TIME_TOLERANCE_FACTOR = 30.0
+
+
 def _iterate_event_search(
     lane_states: ContactIntervalState,
     attempted_step: AttemptedSolverStep,
@@ -673,9 +655,7 @@ def _iterate_event_search(
     secant_step_size, secant_guard = event_bracket.find_earliest_secant_root(
         attempted_step.guard_values, h, is_guard_crossing
     )
-    uses_secant_step = is_searching & (
-        event_bracket.n_iterations >= EVENT_SEARCH_OPTIONS.n_parabola_iterations
-    )
+    uses_secant_step = is_searching & (event_bracket.n_iterations >= N_PARABOLA_ITERATIONS)
     proposed_step_size = jnp.where(uses_secant_step, secant_step_size, h * root_fraction)
     guard_index = jnp.where(uses_secant_step, secant_guard, guard_index)
     is_past_event = jnp.any(is_guard_crossing & is_guard_negative, axis=0)
@@ -690,9 +670,7 @@ def _iterate_event_search(
     lower_step_size_bound = jnp.where(has_guard_crossed, 0.0, lower_step_size_bound)
     upper_step_size_bound = jnp.where(has_guard_crossed, h, upper_step_size_bound)
     time_resolution = 1e3 * jnp.finfo(h.dtype).eps * (lane_states.time_since_event + h)
-    time_tolerance = jnp.maximum(
-        EVENT_SEARCH_OPTIONS.event_time_tolerance_factor * options.rtol * h, time_resolution
-    )
+    time_tolerance = jnp.maximum(EVENT_TIME_TOLERANCE_FACTOR * options.rtol * h, time_resolution)
     time_tolerance = jnp.where(is_searching, event_bracket.time_tolerance, time_tolerance)
     is_step_in_bracket = (proposed_step_size >= lower_step_size_bound - time_tolerance) & (
         proposed_step_size <= upper_step_size_bound + time_tolerance
@@ -719,7 +697,7 @@ def _iterate_event_search(
     guard_roundoff = (
         GUARD_ROUNDOFF_IN_EPS
         * jnp.where(
-            event_bracket.n_iterations < EVENT_SEARCH_OPTIONS.min_iterations_of_initiating_guard,
+            event_bracket.n_iterations < MIN_ITERATIONS_OF_INITIATING_GUARD,
             1.0,
             3.0,
         )

@@ -6,7 +6,6 @@ lands.
 """
 
 import dataclasses
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -40,29 +39,11 @@ from vrw_jax.models import AbstractContactStep
 from vrw_jax.numerics import Elementwise, StepOptions
 from vrw_jax.wheel import ContactMode, Outcome, Symbols, replace_rest_outcome
 
-
-@dataclass(frozen=True)
-class BounceRestOptions:
-    """Options that determine when a bouncing foot comes to rest."""
-
-    min_bounce_height_per_atol: float = 1e-2
-    """Smallest height of a resolved bounce, divided by absolute tolerance and leg length."""
-    min_bounce_height_in_eps: float = 4e2
-    """Smallest height of a resolved bounce, in units of the round-off of a leg's length.
-
-    The height is about 1e-13 m in float64.
-    """
-    n_events_before_rest_speed_ramp: int = 100
-    """Number of events in a step after which each event raises the rest speed by its initial value.
-
-    If a quarter of the allowed events is more, that number is used instead. The value is chosen
-    because walking steps have 4 to 60 events, and chains of ever smaller bounces have hundreds.
-    After 400 events, the smallest resolved bounce is as large as with a tolerance of 1e-6 at the
-    first event.
-    """
-
-
-BOUNCE_REST_OPTIONS = BounceRestOptions()
+# Smallest height of a resolved bounce, divided by absolute tolerance and leg length.
+MIN_BOUNCE_HEIGHT_PER_ATOL = 1e-2
+# Smallest height of a resolved bounce, in units of the round-off of a leg's length. The height is
+# about 1e-13 m in float64.
+MIN_BOUNCE_HEIGHT_IN_EPS = 4e2
 
 
 def compute_min_bounce_height(L0: Elementwise, options: StepOptions) -> Array:
@@ -71,11 +52,8 @@ def compute_min_bounce_height(L0: Elementwise, options: StepOptions) -> Array:
     - `L0`: leg length, m;
     - `options`: options whose absolute tolerance determines the height.
     """
-    roundoff_height = BOUNCE_REST_OPTIONS.min_bounce_height_in_eps * jnp.finfo(L0.dtype).eps
-    return (
-        jnp.maximum(BOUNCE_REST_OPTIONS.min_bounce_height_per_atol * options.atol, roundoff_height)
-        * L0
-    )
+    roundoff_height = MIN_BOUNCE_HEIGHT_IN_EPS * jnp.finfo(L0.dtype).eps
+    return jnp.maximum(MIN_BOUNCE_HEIGHT_PER_ATOL * options.atol, roundoff_height) * L0
 
 
 def apply_friction_rule(friction: Elementwise, uses_paper_rule: bool) -> Elementwise:
@@ -97,6 +75,13 @@ def compute_rest_speed(s: Symbols, options: StepOptions) -> Elementwise:
     return jnp.sqrt(2.0 * s.g * compute_min_bounce_height(s.L0, options))
 
 
+# Number of events in a step after which each event raises the rest speed by its initial value. If a
+# quarter of the allowed events is more, that number is used instead. The value is chosen because
+# walking steps have 4 to 60 events, and chains of ever smaller bounces have hundreds. After 400
+# events, the smallest resolved bounce is as large as with a tolerance of 1e-6 at the first event.
+N_EVENTS_BEFORE_REST_SPEED_RAMP = 100
+
+
 def process_event(
     contact_law: ContactLaw,
     guard_layout: GuardLayout,
@@ -116,7 +101,7 @@ def process_event(
     off the ground. The height of a foot that lifts off grows with the third power of time. Without
     the projection, the foot would land again immediately.
     """
-    first_ramp_event = max(BOUNCE_REST_OPTIONS.n_events_before_rest_speed_ramp, max_events // 4)
+    first_ramp_event = max(N_EVENTS_BEFORE_REST_SPEED_RAMP, max_events // 4)
     contact_law = contact_law._replace(
         rest_speed=contact_law.rest_speed * (1 + jnp.maximum(n_events - first_ramp_event, 0))
     )

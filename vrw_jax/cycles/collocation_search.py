@@ -10,7 +10,6 @@ After each attempt, the wheels without a cycle are gathered for the next attempt
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -52,36 +51,6 @@ from vrw_jax.wheel import WheelParams, make_wheel_from_parameters, stack_paramet
 
 LaneParameters = Float[Array, "n_parameters lanes"]
 """Parameters of each wheel (lane) as floats, in the order of PARAMETER_NAMES."""
-
-
-@dataclass(frozen=True)
-class CycleSearchLimits:
-    """Limits in the search for limit cycles that a user cannot set."""
-
-    end_guard_tolerance: float = 1e-6
-    """Largest amount by which the guard that ends a phase may be negative at the end of the phase,
-    N, m or rad/s.
-    """
-    max_accepted_mesh_error: float = 1e-5
-    """Largest estimated mesh error of an accepted solution.
-
-    The value is chosen because the errors for some hundred random wheels are smaller, most of them
-    much smaller.
-    """
-    n_homotopy_segments: int = 16
-    """Number of segments of the last homotopy.
-
-    If no root is found, the gait of the wheel in Table 1 of the paper is continued to the searched
-    wheel. The parameters vary on the straight line between the two wheels. If the homotopy ends
-    before the searched wheel, its last segment determines the reason.
-    """
-    max_lanes_without_gathering: int = 16
-    """Largest batch size for which the wheels (lanes) that need another attempt are not
-    gathered.
-    """
-
-
-CYCLE_SEARCH_LIMITS = CycleSearchLimits()
 
 
 class CollocationSystem(NamedTuple):
@@ -462,6 +431,14 @@ def _compute_guard_minima(
     return lax.scan(update_minimum, start_guards, node_states)[0]
 
 
+# Largest amount by which the guard that ends a phase may be negative at the end of the phase, N, m
+# or rad/s.
+END_GUARD_TOLERANCE = 1e-6
+# Largest estimated mesh error of an accepted solution. The value is chosen because the errors for
+# some hundred random wheels are smaller, most of them much smaller.
+MAX_ACCEPTED_MESH_ERROR = 1e-5
+
+
 def find_first_failed_check(
     collocation_system: CollocationSystem,
     parameters: LaneParameters,
@@ -498,7 +475,7 @@ def find_first_failed_check(
             is_phase_valid = [
                 duration > 0.0,
                 *(
-                    (guard_minimum > 0.0) & (end_guard > -CYCLE_SEARCH_LIMITS.end_guard_tolerance)
+                    (guard_minimum > 0.0) & (end_guard > -END_GUARD_TOLERANCE)
                     for guard_minimum, end_guard in zip(guard_minima, end_guards, strict=True)
                 ),
             ]
@@ -525,7 +502,7 @@ def find_first_failed_check(
     (_, failed_check), _ = lax.scan(check_step_admissibility, loop_carry, step_inputs)
     is_mesh_fine_enough = (
         estimate_mesh_error(phase_sequence, collocation_system.phase_meshes, collocation_solution)
-        < CYCLE_SEARCH_LIMITS.max_accepted_mesh_error
+        < MAX_ACCEPTED_MESH_ERROR
     )
     return jnp.where(
         (failed_check == 0.0) & ~is_mesh_fine_enough, float(FAILED_MESH_CHECK_CODE), failed_check
@@ -543,6 +520,13 @@ class SearchAttempt(NamedTuple):
     # number of the segment of the last homotopy, or 0 for an attempt on the searched wheel
     homotopy_segment: Any = 0
     is_second_try: Any = False  # on the same segment
+
+
+# Number of segments of the last homotopy. If no root is found, the gait of the wheel in Table 1 of
+# the paper is continued to the searched wheel. The parameters vary on the straight line between the
+# two wheels. If the homotopy ends before the searched wheel, its last segment determines the
+# reason.
+N_HOMOTOPY_SEGMENTS = 16
 
 
 def list_search_attempts(cycle_options: CycleOptions) -> list[SearchAttempt]:
@@ -565,7 +549,7 @@ def list_search_attempts(cycle_options: CycleOptions) -> list[SearchAttempt]:
         SearchAttempt(max_iterations, homotopy_steps=cycle_options.homotopy_steps),
         SearchAttempt(max_iterations, has_dls=False),
     ]
-    for segment in range(1, 1 + CYCLE_SEARCH_LIMITS.n_homotopy_segments):
+    for segment in range(1, 1 + N_HOMOTOPY_SEGMENTS):
         search_attempts += [
             SearchAttempt(
                 max_iterations, continues_last_attempt=segment > 1, homotopy_segment=segment
@@ -593,16 +577,15 @@ def _run_search_attempt(
         lambda *values: jnp.asarray(values, jnp.int32)[attempt_index],
         *list_search_attempts(collocation_system.cycle_options),
     )
-    n_homotopy_segments = CYCLE_SEARCH_LIMITS.n_homotopy_segments
     is_on_segment = search_attempt.homotopy_segment > 0
-    is_before_target = is_on_segment & (search_attempt.homotopy_segment < n_homotopy_segments)
+    is_before_target = is_on_segment & (search_attempt.homotopy_segment < N_HOMOTOPY_SEGMENTS)
     is_second_try = search_attempt.is_second_try == 1
     table_1_wheel = WheelParams(n_legs=collocation_system.n_legs)
     table_1_parameters = jnp.broadcast_to(
         stack_parameters(table_1_wheel).astype(parameters.dtype)[:, None], parameters.shape
     )
     homotopy_fraction = (
-        search_attempt.homotopy_segment.astype(parameters.dtype) / n_homotopy_segments
+        search_attempt.homotopy_segment.astype(parameters.dtype) / N_HOMOTOPY_SEGMENTS
     )
     target_parameters = jnp.where(
         is_before_target,
@@ -706,6 +689,10 @@ def run_search_attempts(
     return lax.while_loop(has_next_attempt, run_next_attempt, (attempt_index, search_result))[1]
 
 
+# Largest batch size for which the wheels (lanes) that need another attempt are not gathered.
+MAX_LANES_WITHOUT_GATHERING = 16
+
+
 def search_all_attempts(
     collocation_system: CollocationSystem,
     run_attempts: BatchFunction,
@@ -730,7 +717,7 @@ def search_all_attempts(
         else N_DIRECT_ATTEMPTS
     )
     search_result = init_search_result(collocation_system, parameters)
-    if n_lanes <= CYCLE_SEARCH_LIMITS.max_lanes_without_gathering:
+    if n_lanes <= MAX_LANES_WITHOUT_GATHERING:
         return run_attempts(
             parameters,
             search_result,

@@ -8,7 +8,6 @@ only the search runs.
 """
 
 import functools
-from dataclasses import dataclass
 from typing import Any, Literal, get_args, overload
 
 import equinox as eqx
@@ -29,7 +28,8 @@ from vrw_jax.cycles.finder_selection import (
     resolve_model,
 )
 from vrw_jax.cycles.gait_walks import (
-    GAIT_WALK_OPTIONS,
+    MAX_NEWTON_START_DEFECT,
+    MAX_SETTLED_DEFECT,
     compute_fallback_walk_starts,
     compute_walk_starts,
     measure_period_defects,
@@ -63,23 +63,6 @@ RETRY_OUTCOMES = (
 )
 """Outcomes after which the search is repeated, because it may have missed an existing gait."""
 
-
-@dataclass(frozen=True)
-class SearchFallbackOptions:
-    """Options for finer meshes, which are fallbacks in the search for gaits of the
-    paper's model.
-    """
-
-    max_unrefined_mesh_error: float = 1e-7
-    """Estimated mesh error above which a finer mesh is used.
-
-    The value is chosen because actual errors are a hundredth of the estimate.
-    """
-    max_mesh_refinements: int = 3
-    """Largest number of times that the number of mesh intervals is doubled."""
-
-
-SEARCH_FALLBACK_OPTIONS = SearchFallbackOptions()
 
 FailureFillName = Literal["zeros", "nan"]
 FAILURE_FILLS: tuple[str, ...] = get_args(FailureFillName)
@@ -435,15 +418,13 @@ def _find_walk_end_states(
     unsettled_wheel_indices = np.flatnonzero(is_walk_needed & is_solver_explicit)
     parameter_values = parameter_matrix.T
     walk_end_states = np.full((len(is_walk_needed), 3), np.nan)
-    smallest_period_defects = np.full(
-        len(is_walk_needed), GAIT_WALK_OPTIONS.max_newton_start_defect
-    )
+    smallest_period_defects = np.full(len(is_walk_needed), MAX_NEWTON_START_DEFECT)
     if guess_states_by_wheel is not None:
         guess_states = guess_states_by_wheel[unsettled_wheel_indices]
         guess_defects = measure_period_defects(
             gait_finder, parameter_values[unsettled_wheel_indices], guess_states
         )
-        is_guess_usable = guess_defects < GAIT_WALK_OPTIONS.max_newton_start_defect
+        is_guess_usable = guess_defects < MAX_NEWTON_START_DEFECT
         walk_end_states[unsettled_wheel_indices[is_guess_usable]] = guess_states[is_guess_usable]
         unsettled_wheel_indices = unsettled_wheel_indices[~is_guess_usable]
     for start_state_function in (compute_walk_starts, compute_fallback_walk_starts):
@@ -458,9 +439,7 @@ def _find_walk_end_states(
             if period_defect < smallest_period_defects[wheel_index]:
                 smallest_period_defects[wheel_index] = period_defect
                 walk_end_states[wheel_index] = walk_end_state
-        has_not_settled = (
-            smallest_period_defects[unsettled_wheel_indices] >= GAIT_WALK_OPTIONS.max_settled_defect
-        )
+        has_not_settled = smallest_period_defects[unsettled_wheel_indices] >= MAX_SETTLED_DEFECT
         unsettled_wheel_indices = unsettled_wheel_indices[has_not_settled]
     return walk_end_states
 
@@ -502,12 +481,21 @@ def _make_search_starts(
     )
 
 
+# Estimated mesh error above which a finer mesh is used. The value is chosen because actual errors
+# are a hundredth of the estimate.
+MAX_UNREFINED_MESH_ERROR = 1e-7
+
+
 def _has_large_mesh_error(cycle: LimitCycle) -> np.ndarray:
     """Return for each wheel whether its mesh error is too large without a finer mesh."""
     mesh_errors = map_in_batches(
         lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle
     )
-    return np.asarray(mesh_errors) > SEARCH_FALLBACK_OPTIONS.max_unrefined_mesh_error
+    return np.asarray(mesh_errors) > MAX_UNREFINED_MESH_ERROR
+
+
+# Largest number of times that the number of mesh intervals is doubled.
+MAX_SEARCH_MESH_REFINEMENTS = 3
 
 
 def _find_fallback_starts(
@@ -538,7 +526,7 @@ def _find_fallback_starts(
     has_known_state = has_large_mesh_error.copy()
     is_mesh_too_coarse = search_outcomes == Outcome.MESH_TOO_COARSE
     best_finder_and_starts = None
-    n_refinements = SEARCH_FALLBACK_OPTIONS.max_mesh_refinements if can_refine_mesh else 0
+    n_refinements = MAX_SEARCH_MESH_REFINEMENTS if can_refine_mesh else 0
     for refinement_index in range(1 + n_refinements):
         if refinement_index:
             coarser_finder = gait_finder

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -12,34 +11,6 @@ from vrw_jax.batches import step_batch
 from vrw_jax.contact import embed_section_states
 from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units_of_rows
-
-
-@dataclass(frozen=True)
-class GaitWalkOptions:
-    """Numerical options of the walks that approach attracting gaits.
-
-    Distances are distances between section states, in units of the wheel.
-    """
-
-    n_steps_by_round: tuple[int, ...] = (8, 12, 30, 50, 100)
-    """Number of gait steps in each round.
-
-    After a round, settled walks stop, and walks to the same gait are merged.
-    """
-    walk_step_tolerance: float = 1e-8
-    """Tolerance of the Tsit5 solver in walks, which is independent of the tolerance of the gait."""
-    max_settled_defect: float = 1e-3
-    """Largest distance between two states of a settled walk that are one period apart."""
-    max_newton_start_defect: float = 0.1
-    """Largest period defect of an unsettled walk from whose end Newton's method starts.
-
-    The period defect is the distance between two states that are one period apart.
-    """
-    walk_merge_distance: float = 0.02
-    """Largest distance between the ends of two walks that are treated as walks to the same gait."""
-
-
-GAIT_WALK_OPTIONS = GaitWalkOptions()
 
 WALK_STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
 """Starts of walks, each described by a contraction and a rate.
@@ -156,6 +127,17 @@ class DistinctWalkEnds(NamedTuple):
     period_defects: np.ndarray  # (ends,), in units of the wheel; see `measure_period_defects`
 
 
+# Number of gait steps in each round. After a round, settled walks stop, and walks to the same gait
+# are merged.
+N_WALK_STEPS_BY_ROUND = (8, 12, 30, 50, 100)
+# Largest distance between two states of a settled walk that are one period apart, in units of the
+# wheel.
+MAX_SETTLED_DEFECT = 1e-3
+# Largest period defect of an unsettled walk from whose end Newton's method starts. The period
+# defect is the distance between two states that are one period apart, in units of the wheel.
+MAX_NEWTON_START_DEFECT = 0.1
+
+
 def walk_to_gaits(
     gait_finder: Any,
     parameter_values: np.ndarray,
@@ -194,7 +176,7 @@ def walk_to_gaits(
         n_wheels,
         max_settled_defect,
     )
-    for n_steps in GAIT_WALK_OPTIONS.n_steps_by_round:
+    for n_steps in N_WALK_STEPS_BY_ROUND:
         end_states, walk_outcomes = _simulate_wheel_walks(
             gait_finder,
             parameter_values_by_walk[active_walk_indices],
@@ -209,15 +191,15 @@ def walk_to_gaits(
             parameter_values_by_walk[active_walk_indices],
             section_states[active_walk_indices],
         )
-        is_walk_duplicate |= find_duplicates(GAIT_WALK_OPTIONS.max_settled_defect)
-        has_not_settled = period_defects >= GAIT_WALK_OPTIONS.max_settled_defect
+        is_walk_duplicate |= find_duplicates(MAX_SETTLED_DEFECT)
+        has_not_settled = period_defects >= MAX_SETTLED_DEFECT
         active_walk_indices = active_walk_indices[
             (has_not_settled & ~is_walk_duplicate)[active_walk_indices]
         ]
         if not len(active_walk_indices):
             break
-    is_walk_duplicate = find_duplicates(GAIT_WALK_OPTIONS.max_newton_start_defect)
-    is_near_gait = period_defects < GAIT_WALK_OPTIONS.max_newton_start_defect
+    is_walk_duplicate = find_duplicates(MAX_NEWTON_START_DEFECT)
+    is_near_gait = period_defects < MAX_NEWTON_START_DEFECT
     is_walk_selected = ~is_walk_duplicate & is_near_gait
     # If a wheel has no usable walk, its first start is selected.
     is_walk_selected[np.setdiff1d(np.arange(n_wheels), walk_wheel_indices[is_walk_selected])] = True
@@ -250,6 +232,10 @@ def measure_period_defects(
     return np.where(period_outcomes == Outcome.STEPPED, period_defects, np.inf)
 
 
+# Tolerance of the Tsit5 solver in walks, which is independent of the tolerance of the gait.
+WALK_STEP_TOLERANCE = 1e-8
+
+
 def _simulate_wheel_walks(
     gait_finder: Any,
     parameter_values: np.ndarray,
@@ -260,8 +246,8 @@ def _simulate_wheel_walks(
     model, params = _split_parameter_values(gait_finder, parameter_values)
     step_options = StepOptions(
         solver="Tsit5",
-        rtol=GAIT_WALK_OPTIONS.walk_step_tolerance,
-        atol=GAIT_WALK_OPTIONS.walk_step_tolerance,
+        rtol=WALK_STEP_TOLERANCE,
+        atol=WALK_STEP_TOLERANCE,
     )
     # For the stiffest wheels, the implicit solver would take minutes per walk.
     walk_result = step_batch(
@@ -279,6 +265,11 @@ def _split_parameter_values(
     return gait_finder.model.from_parameter_values(
         tuple(jax.device_put(list(parameter_values.T))), gait_finder.n_legs
     )
+
+
+# Largest distance between the ends of two walks that are treated as walks to the same gait, in
+# units of the wheel.
+WALK_MERGE_DISTANCE = 0.02
 
 
 def _find_duplicate_walks(
@@ -307,10 +298,10 @@ def _find_duplicate_walks(
         )
         merge_distances = np.where(
             other_defects < max_settled_defect,
-            np.maximum(GAIT_WALK_OPTIONS.walk_merge_distance, 3.0 * period_defects),
-            GAIT_WALK_OPTIONS.walk_merge_distance,
+            np.maximum(WALK_MERGE_DISTANCE, 3.0 * period_defects),
+            WALK_MERGE_DISTANCE,
         )
         is_end_state_same = np.abs(scaled_walk_states - other_states).max(-1) <= merge_distances
         is_walk_duplicate |= has_smaller_defect & is_end_state_same
-    is_near_gait = period_defects < GAIT_WALK_OPTIONS.max_newton_start_defect
+    is_near_gait = period_defects < MAX_NEWTON_START_DEFECT
     return (is_walk_duplicate & is_near_gait).ravel()

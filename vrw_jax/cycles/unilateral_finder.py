@@ -6,7 +6,7 @@ together, and no large program is compiled for the derivatives.
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -41,25 +41,6 @@ from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tr
 from vrw_jax.simulation import convert_step_arguments
 from vrw_jax.validation import has_traced_leaf
 from vrw_jax.wheel import Outcome, WheelParams
-
-
-@dataclass(frozen=True)
-class ContactNewtonOptions:
-    """Numerical options of Newton's method on the return map with unilateral contact."""
-
-    max_iterations: int = 15
-    """Largest number of Newton iterations."""
-    max_correction_halvings: int = 6
-    """Largest number of times that a correction is halved if no gait step completes after it."""
-    step_tolerance_far_from_gait: float = 1e-6
-    """Tolerance of gait steps that start far from a gait."""
-    max_correction_near_gait: float = 1e-4
-    """Correction below which a state is treated as near a gait, rad, rad/s, m/s."""
-    clear_convergence_fraction: float = 0.01
-    """Fraction of the tolerance below which one correction suffices for convergence."""
-
-
-CONTACT_NEWTON_OPTIONS = ContactNewtonOptions()
 
 
 class UnilateralFinder(AbstractReturnMapFinder):
@@ -353,6 +334,12 @@ def solve_linear_systems(
         )
 
 
+# Tolerance of gait steps that start far from a gait.
+STEP_TOLERANCE_FAR_FROM_GAIT = 1e-6
+# Correction below which a state is treated as near a gait, rad, rad/s, m/s.
+MAX_CORRECTION_NEAR_GAIT = 1e-4
+
+
 def find_contact_fixed_points(
     period_map: PeriodMap,
     step_options: StepOptions,
@@ -367,19 +354,17 @@ def find_contact_fixed_points(
     `step_options`, with the same Jacobian. One more step evaluates the gait with all derivatives.
     If loose steps move away from a state that an exact step hardly changes, all steps are exact.
     """
-    loose_tolerance = CONTACT_NEWTON_OPTIONS.step_tolerance_far_from_gait
     loose_step_options = replace(
         step_options,
-        rtol=jnp.maximum(step_options.rtol, loose_tolerance),
-        atol=jnp.maximum(step_options.atol, loose_tolerance),
+        rtol=jnp.maximum(step_options.rtol, STEP_TOLERANCE_FAR_FROM_GAIT),
+        atol=jnp.maximum(step_options.atol, STEP_TOLERANCE_FAR_FROM_GAIT),
     )
-    max_correction_near_gait = CONTACT_NEWTON_OPTIONS.max_correction_near_gait
     loose_fixed_points, loose_evaluation = _run_contact_newton(
         period_map,
         loose_step_options,
         start_states,
         False,
-        max_correction_near_gait,
+        MAX_CORRECTION_NEAR_GAIT,
         np.ones(len(start_states), bool),
     )
     is_near_gait = np.asarray(loose_fixed_points.converged)
@@ -391,7 +376,7 @@ def find_contact_fixed_points(
     )
     section_states[is_near_gait] += newton_correction[is_near_gait] * (
         np.abs(newton_correction / section_units)[is_near_gait].max(-1, keepdims=True)
-        < max_correction_near_gait
+        < MAX_CORRECTION_NEAR_GAIT
     )
     period_defects = np.abs((exact_evaluation.end_states - section_states) / section_units).max(-1)
     exact_fixed_points, period_evaluation = _run_contact_newton(
@@ -401,11 +386,19 @@ def find_contact_fixed_points(
         needs_parameter_derivatives,
         float(compute_newton_tolerance(step_options)),
         is_near_gait
-        | (exact_evaluation.is_period_complete & (period_defects < max_correction_near_gait)),
+        | (exact_evaluation.is_period_complete & (period_defects < MAX_CORRECTION_NEAR_GAIT)),
         stops_at_small_correction=False,
     )
     n_iterations = loose_fixed_points.n_iterations + 1 + exact_fixed_points.n_iterations
     return exact_fixed_points._replace(n_iterations=n_iterations), period_evaluation
+
+
+# Largest number of Newton iterations.
+MAX_CONTACT_NEWTON_ITERATIONS = 15
+# Largest number of times that a correction is halved if no gait step completes after it.
+MAX_CORRECTION_HALVINGS = 6
+# Fraction of the tolerance below which one correction suffices for convergence.
+CLEAR_CONVERGENCE_FRACTION = 0.01
 
 
 def _run_contact_newton(
@@ -424,7 +417,6 @@ def _run_contact_newton(
     gait is evaluated again at the corrected state. Two small corrections in succession are then
     needed, because the map may jump between two states if a foot grazes the ground.
     """
-    options = CONTACT_NEWTON_OPTIONS
     n_wheels = len(start_states)
     section_states = start_states.copy()
     last_section_states = start_states.copy()
@@ -436,7 +428,7 @@ def _run_contact_newton(
     is_gait_found = np.zeros(n_wheels, bool)
     period_evaluation = None
     active_wheels = np.arange(n_wheels)
-    for _ in range(options.max_iterations + options.max_correction_halvings):
+    for _ in range(MAX_CONTACT_NEWTON_ITERATIONS + MAX_CORRECTION_HALVINGS):
         active_states = section_states[active_wheels]
         active_map = period_map._replace(
             parameter_values=period_map.parameter_values[active_wheels]
@@ -464,7 +456,7 @@ def _run_contact_newton(
         has_small_correction = is_correction_valid & (correction_size <= newton_tolerance)
         has_converged = has_small_correction & (
             had_small_correction[active_wheels]
-            | (correction_size <= options.clear_convergence_fraction * newton_tolerance)
+            | (correction_size <= CLEAR_CONVERGENCE_FRACTION * newton_tolerance)
         )
         had_small_correction[active_wheels] = has_small_correction
         is_state_moved = is_correction_valid & (stops_at_small_correction | ~has_converged)
@@ -485,8 +477,8 @@ def _run_contact_newton(
             has_small_correction if stops_at_small_correction else has_converged
         )
         has_wheel_failed = (
-            (n_correction_halvings > options.max_correction_halvings)
-            | (n_iterations > options.max_iterations)
+            (n_correction_halvings > MAX_CORRECTION_HALVINGS)
+            | (n_iterations > MAX_CONTACT_NEWTON_ITERATIONS)
             | ~is_wheel_requested
         )
         active_wheels = active_wheels[~(is_gait_found | has_wheel_failed)[active_wheels]]

@@ -12,7 +12,6 @@ import json
 import math
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -231,23 +230,14 @@ def find_earliest_guard_minimum_fraction(
     )
 
 
-@dataclass(frozen=True)
-class StepSizeController:
-    """Parameters of the step-size controller.
-
-    The values are chosen because they are usual for explicit methods (Hairer, Norsett and Wanner,
-    Solving Ordinary Differential Equations I, Section II.4).
-    """
-
-    safety_factor: float = 0.9
-    """Factor by which the estimated step length for the tolerance is multiplied."""
-    min_step_length_ratio: float = 0.2
-    """Smallest ratio of successive step lengths."""
-    max_step_length_ratio: float = 5.0
-    """Largest ratio of successive step lengths; after a rejected step the ratio is at most 1."""
-
-
-STEP_SIZE_CONTROLLER = StepSizeController()
+# Factor by which the estimated step length for the tolerance is multiplied. This value and the two
+# following ones are chosen because they are usual for explicit methods (Hairer, Norsett and Wanner,
+# Solving Ordinary Differential Equations I, Section II.4).
+STEP_LENGTH_SAFETY_FACTOR = 0.9
+# Smallest ratio of successive step lengths.
+MIN_STEP_LENGTH_RATIO = 0.2
+# Largest ratio of successive step lengths; after a rejected step the ratio is at most 1.
+MAX_STEP_LENGTH_RATIO = 5.0
 
 
 def compute_step_size_factor(
@@ -263,9 +253,9 @@ def compute_step_size_factor(
         jnp.log(jnp.clip(mean_squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
     ).astype(float_dtype)
     return jnp.clip(
-        STEP_SIZE_CONTROLLER.safety_factor * error_power,
-        STEP_SIZE_CONTROLLER.min_step_length_ratio,
-        jnp.where(mean_squared_error <= 1.0, STEP_SIZE_CONTROLLER.max_step_length_ratio, 1.0),
+        STEP_LENGTH_SAFETY_FACTOR * error_power,
+        MIN_STEP_LENGTH_RATIO,
+        jnp.where(mean_squared_error <= 1.0, MAX_STEP_LENGTH_RATIO, 1.0),
     )
 
 

@@ -68,29 +68,6 @@ from vrw_jax.wheel import (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class StiffStartOptions:
-    """Upper bounds on the first solver step in SLS-I.
-
-    At lift-off the rear foot loses its force. This excites the fast mode of the airborne leg, which
-    decays within 0.05 s. A first solver step above these bounds would be rejected and repeated.
-    """
-
-    max_first_step_ratio: float = 0.3
-    """Upper bound, as a fraction of the step size that the controller proposes at the end of
-    DLS.
-    """
-    max_first_step_in_transient_times: float = 7.0
-    """Upper bound, as a multiple of (m/c) rtol^(1/p), where p is the order of the solver.
-
-    The value is chosen because the step-size controller settles at 7.2 to 9.5. This holds for
-    solvers of orders 5 to 8 and tolerances of 1e-4 to 1e-10.
-    """
-
-
-STIFF_START_OPTIONS = StiffStartOptions()
-
-
 class _NextPhaseInputs(NamedTuple):
     """Data that the integration of a phase passes to the integration of the next phase."""
 
@@ -210,6 +187,17 @@ def run_batch_phases(
     return run_step_phases(phase_runner, params, x, options, stop_at_lift_off, landing_function)
 
 
+# Upper bound on the first solver step in SLS-I, as a fraction of the step size that the controller
+# proposes at the end of DLS. At lift-off the rear foot loses its force. This excites the fast mode
+# of the airborne leg, which decays within 0.05 s. A first solver step above this bound and the next
+# would be rejected and repeated.
+MAX_FIRST_STEP_RATIO = 0.3
+# Upper bound on that step as a multiple of (m/c) rtol^(1/p), where p is the order of the solver.
+# The value is chosen because the step-size controller settles at 7.2 to 9.5. This holds for solvers
+# of orders 5 to 8 and tolerances of 1e-4 to 1e-10.
+MAX_FIRST_STEP_IN_TRANSIENT_TIMES = 7.0
+
+
 def _make_phase_runner(
     options: StepOptions,
     tableau: ButcherTableau,
@@ -239,14 +227,9 @@ def _make_phase_runner(
                     jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
                 ).astype(dt0.dtype)
                 max_transient_dt = (
-                    STIFF_START_OPTIONS.max_first_step_in_transient_times
-                    * tolerance_root
-                    * phase.s.m
-                    / phase.s.c
+                    MAX_FIRST_STEP_IN_TRANSIENT_TIMES * tolerance_root * phase.s.m / phase.s.c
                 )
-                stiff_dt0 = jnp.minimum(
-                    STIFF_START_OPTIONS.max_first_step_ratio * dt0, max_transient_dt
-                )
+                stiff_dt0 = jnp.minimum(MAX_FIRST_STEP_RATIO * dt0, max_transient_dt)
                 dt0 = jnp.where(next_phase_inputs.has_phase_occurred, stiff_dt0, dt0)
         float_leaves, nonarray_leaves = eqx.partition(
             (phase.s, phase.tilt_sine_cosine), eqx.is_array

@@ -46,29 +46,9 @@ from vrw_jax.wheel import (
     transitions,
 )
 
-
-@dataclasses.dataclass(frozen=True)
-class MarginMinimumSearchOptions:
-    """Options of the search for the minimum of each margin with respect to the angle.
-
-    The search samples a bracket of angles and repeatedly narrows the bracket around the lowest
-    sample.
-    """
-
-    n_angles_per_zoom_round: int = 33
-    """Number of angles that each round samples.
-
-    The value is chosen because forces are smooth over the 45 degrees of a step.
-    """
-    n_zoom_rounds: int = 5
-    """Number of rounds.
-
-    The value is chosen because the angle is then accurate to 1e-6 rad. The error of a minimum is
-    the square of the error of its angle.
-    """
-
-
-MARGIN_MINIMUM_SEARCH_OPTIONS = MarginMinimumSearchOptions()
+# Number of angles that each round of the search for minima of margins samples. The value is chosen
+# because forces are smooth over the 45 degrees of a step.
+N_ANGLES_PER_ZOOM_ROUND = 33
 
 
 class RigidWheel(AbstractWheel):
@@ -263,9 +243,7 @@ class RigidWheel(AbstractWheel):
         has_passed_apex = (angular_rate > 0.0) & (
             rolling_motion.compute_squared_rate(apex_angle) > 0.0
         )
-        sampled_angles = jnp.linspace(
-            wheel_angle, half_angle, MARGIN_MINIMUM_SEARCH_OPTIONS.n_angles_per_zoom_round
-        )
+        sampled_angles = jnp.linspace(wheel_angle, half_angle, N_ANGLES_PER_ZOOM_ROUND)
         lowest_normal_force = jnp.min(
             rolling_motion.compute_foot_force_at_angle(sampled_angles).normal
         )
@@ -428,6 +406,12 @@ class VerticalRateMap(NamedTuple):
         )
 
 
+# Number of rounds, each of which narrows the bracket of angles around the lowest sample. The value
+# is chosen because the angle is then accurate to 1e-6 rad. The error of a minimum is the square of
+# the error of its angle.
+N_ZOOM_ROUNDS = 5
+
+
 class RollingMotion(eqx.Module):
     """Rolling motion about one foot, computed from the rate at the first angle by energy
     conservation.
@@ -565,7 +549,6 @@ class RollingMotion(eqx.Module):
         The margins are those of `evaluate_margins_at_angles`. Each minimum is found by repeated
         zooming. Its error is the square of the remaining error of its angle.
         """
-        search_options = MARGIN_MINIMUM_SEARCH_OPTIONS
         middle_angle = 0.5 * (self.first_angle + self.end_angle) + 0.0 * self.initial_rate
 
         def zoom_to_minima(
@@ -577,7 +560,7 @@ class RollingMotion(eqx.Module):
                 i: Array, lowest_angles_and_margins: tuple[Array, Array]
             ) -> tuple[Array, Array]:
                 angle_offset = half_bracket_width * (
-                    i * (2.0 / (search_options.n_angles_per_zoom_round - 1)) - 1.0
+                    i * (2.0 / (N_ANGLES_PER_ZOOM_ROUND - 1)) - 1.0
                 )
                 candidate_angles = jnp.clip(
                     bracket_centers + angle_offset, self.first_angle, self.end_angle
@@ -592,18 +575,16 @@ class RollingMotion(eqx.Module):
             initial_angles_and_margins = bracket_centers, jnp.full_like(bracket_centers, jnp.inf)
             minimum_angles, _ = lax.fori_loop(
                 0,
-                search_options.n_angles_per_zoom_round,
+                N_ANGLES_PER_ZOOM_ROUND,
                 update_lowest_margins,
                 initial_angles_and_margins,
             )
-            return minimum_angles, half_bracket_width * (
-                2.5 / search_options.n_angles_per_zoom_round
-            )
+            return minimum_angles, half_bracket_width * (2.5 / N_ANGLES_PER_ZOOM_ROUND)
 
         bracket_centers = jnp.stack([middle_angle] * (1 + self.s.n))
         half_bracket_width = 0.5 * (self.end_angle - self.first_angle)
         minimum_angles, _ = lax.fori_loop(
-            0, search_options.n_zoom_rounds, zoom_to_minima, (bracket_centers, half_bracket_width)
+            0, N_ZOOM_ROUNDS, zoom_to_minima, (bracket_centers, half_bracket_width)
         )
         return self.evaluate_margins_at_angles(lax.stop_gradient(minimum_angles))
 

@@ -29,27 +29,6 @@ from vrw_jax.simulation import collect_provenance_attributes, step, walk
 from vrw_jax.wheel import Outcome, WheelParams
 
 
-@dataclasses.dataclass(frozen=True)
-class SettlingOptions:
-    """Conditions under which a walk is considered to have settled on a gait.
-
-    - `n_steps`: number of steps of a walk, chosen because the gait with the slowest convergence (c
-      = 70 N s/m) converges to round-off in 30 steps;
-    - `max_state_change`: largest change of the section state per step after a walk has settled. The
-      value is ten times the error of a step with the default options;
-    - `n_settled_steps`: number of last steps whose change must be below `max_state_change`. It is
-      above 1 because two states of a gait with a longer period may agree by chance.
-    """
-
-    n_steps: int = 30
-    max_state_change: float = 1e-8
-    n_settled_steps: int = 5
-
-
-DEFAULT_SETTLING_OPTIONS = SettlingOptions()
-"""Options of all walks in the reproduction of the paper."""
-
-
 def make_formally_continued_model() -> ViscoelasticWheel:
     """Return the paper's model with motion that continues formally after Leg 1 lifts off."""
     return ViscoelasticWheel(stop_at_lift_off=False)
@@ -63,6 +42,17 @@ def replace_wheel_parameter(
     return dataclasses.replace(params, **value_by_parameter)
 
 
+# Number of steps of a walk, chosen because the gait with the slowest convergence (c = 70 N s/m)
+# converges to round-off in 30 steps.
+N_SETTLING_STEPS = 30
+# Largest change of the section state per step after a walk has settled. The value is ten times the
+# error of a step with the default options.
+MAX_SETTLED_STATE_CHANGE = 1e-8
+# Number of last steps whose change must be below that limit. It is above 1 because two states of a
+# gait with a longer period may agree by chance.
+N_SETTLED_STEPS = 5
+
+
 def walk_into_gait(params: WheelParams, x: SectionState) -> xr.Dataset:
     """Simulate a walk into a gait, and return its section states and their change per step.
 
@@ -70,23 +60,19 @@ def walk_into_gait(params: WheelParams, x: SectionState) -> xr.Dataset:
     (rad, rad/s, m/s). `settled` states whether the walk reached a period-1 gait, that is, whether
     each of the last changes is small enough.
     """
-    settling_options = DEFAULT_SETTLING_OPTIONS
-    gait_walk = walk(params, x, settling_options.n_steps, model=make_formally_continued_model())
+    gait_walk = walk(params, x, N_SETTLING_STEPS, model=make_formally_continued_model())
     n_stepped = int(gait_walk.n_stepped)
     section_states = np.concatenate(
         [gait_walk.start[None], gait_walk.steps.section_state[:n_stepped]]
     )
     section_state_changes = np.linalg.norm(np.diff(section_states, axis=0), axis=1)
     walk_outcome = Outcome(int(gait_walk.outcome))
-    n_settled_steps = settling_options.n_settled_steps
     last_state_change = (
-        float(section_state_changes[-n_settled_steps:].max())
-        if n_stepped >= n_settled_steps
+        float(section_state_changes[-N_SETTLED_STEPS:].max())
+        if n_stepped >= N_SETTLED_STEPS
         else math.inf
     )
-    is_settled = (
-        walk_outcome == Outcome.STEPPED and last_state_change < settling_options.max_state_change
-    )
+    is_settled = walk_outcome == Outcome.STEPPED and last_state_change < MAX_SETTLED_STATE_CHANGE
     return xr.Dataset(
         {
             "section_state": (("step", "component"), section_states),

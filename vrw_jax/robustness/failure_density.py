@@ -6,7 +6,6 @@ fitted to the failures, and the inflation decreases to 1 in stages.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,81 +26,6 @@ MIN_UNIFORM_NUMBER = 2.0**-31
 
 The value is chosen because it is half the resolution of the points of a Sobol' sequence.
 """
-
-
-@dataclass(frozen=True)
-class FailureDensityOptions:
-    """Numerical options for fitting a Gaussian mixture to the slopes of failing walks."""
-
-    max_walks_per_stage: int = 4096
-    """Largest number of walks per stage.
-
-    The value is chosen because the variance of the likelihood ratios is hardly smaller with more
-    walks."""
-    n_gaussians: int = 4
-    """Number of Gaussians in a mixture.
-
-    The value is chosen because the paper's wheel fails in two ways, each in a curved region of
-    slopes."""
-    nominal_walk_fraction: float = 0.1
-    """Fraction of walks whose slopes are drawn from the nominal density.
-
-    The inverse of the fraction bounds all likelihood ratios. The nominal walks also find frequent
-    failures that the fit missed.
-    """
-    wide_walk_fraction: float = 0.2
-    """Fraction of walks whose slopes are drawn from the fitted Gaussians with wider standard
-    deviations.
-
-    The wide Gaussians bound the likelihood ratios of failures outside the fitted ones.
-    """
-    widening_factor: float = 1.7
-    """Ratio of the standard deviations of the wide Gaussians to those of the fitted Gaussians."""
-    n_uninflated_fits: int = 2
-    """Number of fits with the nominal standard deviation of the slopes.
-
-    The value is chosen because the second fit uses failures of walks that the first fit proposes.
-    """
-    max_inflation_test_walks: int = 256
-    """Largest number of walks with which an inflation factor of the slopes is tested.
-
-    The value is chosen because the standard error of the fraction of failing walks is then 0.02.
-    """
-    min_failure_fraction: float = 0.15
-    """Smallest fraction of failing walks at which the inflation of the slopes is not increased
-    further.
-
-    The value is chosen because about a third of the failing walks fail in their last step.
-    """
-    slope_inflation_factor: float = 1.3
-    """Ratio of successive inflation factors of the slopes' standard deviation."""
-    max_slope_inflation: float = 20.0
-    """Largest inflation factor of the slopes' standard deviation.
-
-    The value is chosen because failures that need a larger inflation have probabilities below
-    1e-80.
-    """
-    min_effective_failures_per_dimension: float = 60.0
-    """Smallest effective number of failures at the next, smaller inflation, per dimension of the
-    mixture.
-
-    The value is chosen because each Gaussian in five dimensions has 20 parameters.
-    """
-    min_gaussian_variance: float = 0.02
-    """Variance that is added to each fitted Gaussian in every direction.
-
-    The variance bounds the likelihood ratios if only few walks fail.
-    """
-    n_em_iterations: int = 12
-    """Number of iterations of expectation maximization.
-
-    The value is chosen because the variance of the likelihood ratios is hardly smaller with 25
-    iterations."""
-    n_em_samples: int = 2000
-    """Number of failures that are resampled by weight for each fit."""
-
-
-FAILURE_DENSITY_OPTIONS = FailureDensityOptions()
 
 
 class GaussianMixture(NamedTuple):
@@ -190,6 +114,17 @@ class GaussianMixture(NamedTuple):
         return slope_deviations
 
 
+# Number of Gaussians in a mixture. The value is chosen because the paper's wheel fails in two ways,
+# each in a curved region of slopes.
+N_GAUSSIANS = 4
+# Variance that is added to each fitted Gaussian in every direction. The variance bounds the
+# likelihood ratios if only few walks fail.
+MIN_GAUSSIAN_VARIANCE = 0.02
+# Number of iterations of expectation maximization. The value is chosen because the variance of the
+# likelihood ratios is hardly smaller with 25 iterations.
+N_EM_ITERATIONS = 12
+
+
 def fit_gaussian_mixture(
     slope_deviations: np.ndarray,
     random_generator: np.random.Generator,
@@ -201,9 +136,9 @@ def fit_gaussian_mixture(
     - `slope_deviations`: samples, shape (samples, dimensions).
     """
     n_samples, n_dimensions = slope_deviations.shape
-    covariance_floor = FAILURE_DENSITY_OPTIONS.min_gaussian_variance * np.eye(n_dimensions)
+    covariance_floor = MIN_GAUSSIAN_VARIANCE * np.eye(n_dimensions)
     gaussian_means = slope_deviations[random_generator.integers(n_samples)][None]
-    for _ in range(FAILURE_DENSITY_OPTIONS.n_gaussians - 1):
+    for _ in range(N_GAUSSIANS - 1):
         squared_distances = np.min(np.sum((slope_deviations[:, None] - gaussian_means) ** 2, -1), 1)
         total_distance = np.sum(squared_distances)
         next_mean_index = random_generator.choice(
@@ -217,7 +152,7 @@ def fit_gaussian_mixture(
         gaussian_means,
         np.tile(np.linalg.cholesky(covariance), (n_gaussians, 1, 1)),
     )
-    for _ in range(FAILURE_DENSITY_OPTIONS.n_em_iterations):
+    for _ in range(N_EM_ITERATIONS):
         log_densities = gaussian_mixture.compute_gaussian_log_densities(slope_deviations)
         membership_probabilities = np.exp(log_densities - np.logaddexp.reduce(log_densities, 0))
         # The additional sample prevents an empty Gaussian.
@@ -237,11 +172,40 @@ def fit_gaussian_mixture(
     return gaussian_mixture
 
 
+# Largest number of walks per stage. The value is chosen because the variance of the likelihood
+# ratios is hardly smaller with more walks.
+MAX_WALKS_PER_STAGE = 4096
+# Fraction of walks whose slopes are drawn from the nominal density. The inverse of the fraction
+# bounds all likelihood ratios. The nominal walks also find frequent failures that the fit missed.
+NOMINAL_WALK_FRACTION = 0.1
+# Fraction of walks whose slopes are drawn from the fitted Gaussians with wider standard deviations.
+# The wide Gaussians bound the likelihood ratios of failures outside the fitted ones.
+WIDE_WALK_FRACTION = 0.2
+# Ratio of the standard deviations of the wide Gaussians to those of the fitted Gaussians.
+WIDENING_FACTOR = 1.7
+# Number of fits with the nominal standard deviation of the slopes. The value is chosen because the
+# second fit uses failures of walks that the first fit proposes.
+N_UNINFLATED_FITS = 2
+# Largest number of walks with which an inflation factor of the slopes is tested. The value is
+# chosen because the standard error of the fraction of failing walks is then 0.02.
+MAX_INFLATION_TEST_WALKS = 256
+# Smallest fraction of failing walks at which the inflation of the slopes is not increased further.
+# The value is chosen because about a third of the failing walks fail in their last step.
+MIN_FAILURE_FRACTION = 0.15
+# Ratio of successive inflation factors of the slopes' standard deviation.
+SLOPE_INFLATION_FACTOR = 1.3
+# Largest inflation factor of the slopes' standard deviation. The value is chosen because failures
+# that need a larger inflation have probabilities below 1e-80.
+MAX_SLOPE_INFLATION = 20.0
+# Number of failures that are resampled by weight for each fit.
+N_EM_SAMPLES = 2000
+
+
 def fit_failure_density(
     run_walks: DeviationWalkFunction,
     n_dimensions: int,
     random_generator: np.random.Generator,
-    max_walks_per_stage: int = FAILURE_DENSITY_OPTIONS.max_walks_per_stage,
+    max_walks_per_stage: int = MAX_WALKS_PER_STAGE,
 ) -> GaussianMixture | None:
     """Return a density of standardized slopes on which walks often fail in their last step.
 
@@ -251,22 +215,21 @@ def fit_failure_density(
     - `n_dimensions`: number of slopes per walk;
     - `max_walks_per_stage`: a smaller limit than that of the options.
     """
-    density_options = FAILURE_DENSITY_OPTIONS
-    n_walks = min(density_options.max_walks_per_stage, max_walks_per_stage)
-    n_inflation_test_walks = min(density_options.max_inflation_test_walks, n_walks)
+    n_walks = min(MAX_WALKS_PER_STAGE, max_walks_per_stage)
+    n_inflation_test_walks = min(MAX_INFLATION_TEST_WALKS, n_walks)
     slope_inflation = 1.0
     while True:
         proposal_density = GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation)
         _, has_walk_failed = run_walks(
             proposal_density.draw_samples(n_inflation_test_walks, random_generator)
         )
-        if np.mean(has_walk_failed) >= density_options.min_failure_fraction:
+        if np.mean(has_walk_failed) >= MIN_FAILURE_FRACTION:
             break
-        slope_inflation *= density_options.slope_inflation_factor
-        if slope_inflation > density_options.max_slope_inflation:
+        slope_inflation *= SLOPE_INFLATION_FACTOR
+        if slope_inflation > MAX_SLOPE_INFLATION:
             return None
     n_uninflated_fits = 0
-    while n_uninflated_fits < density_options.n_uninflated_fits:
+    while n_uninflated_fits < N_UNINFLATED_FITS:
         slope_deviations = proposal_density.draw_samples(n_walks, random_generator)
         has_failed_in_last_step, _ = run_walks(slope_deviations)
         if not np.any(has_failed_in_last_step):
@@ -278,25 +241,27 @@ def fit_failure_density(
             slope_inflation,
         )
         resampled_indices = random_generator.choice(
-            len(failing_deviations), density_options.n_em_samples, p=failure_weights
+            len(failing_deviations), N_EM_SAMPLES, p=failure_weights
         )
         fitted_mixture = fit_gaussian_mixture(
             failing_deviations[resampled_indices], random_generator
         )
         wide_mixture = fitted_mixture._replace(
-            covariance_cholesky_factors=density_options.widening_factor
-            * fitted_mixture.covariance_cholesky_factors
+            covariance_cholesky_factors=WIDENING_FACTOR * fitted_mixture.covariance_cholesky_factors
         )
-        fitted_mixture = fitted_mixture.add_mixture(
-            wide_mixture, density_options.wide_walk_fraction
-        )
+        fitted_mixture = fitted_mixture.add_mixture(wide_mixture, WIDE_WALK_FRACTION)
         n_uninflated_fits += slope_inflation == 1.0
         slope_inflation = next_slope_inflation
         proposal_density = fitted_mixture.add_mixture(
             GaussianMixture.make_isotropic_gaussian(n_dimensions, slope_inflation),
-            density_options.nominal_walk_fraction,
+            NOMINAL_WALK_FRACTION,
         )
     return proposal_density
+
+
+# Smallest effective number of failures at the next, smaller inflation, per dimension of the
+# mixture. The value is chosen because each Gaussian in five dimensions has 20 parameters.
+MIN_EFFECTIVE_FAILURES_PER_DIMENSION = 60.0
 
 
 def _find_next_slope_inflation(
@@ -323,7 +288,7 @@ def _find_next_slope_inflation(
         return unnormalized_weights / np.sum(unnormalized_weights)
 
     min_effective_samples = min(
-        FAILURE_DENSITY_OPTIONS.min_effective_failures_per_dimension * failing_deviations.shape[1],
+        MIN_EFFECTIVE_FAILURES_PER_DIMENSION * failing_deviations.shape[1],
         0.3 * len(failing_deviations),
     )
     next_slope_inflation = slope_inflation

@@ -1,7 +1,6 @@
 """Walks of one wheel from many start states, until each walk arrives at a stable gait or fails."""
 
 import functools
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
@@ -21,24 +20,11 @@ from vrw_jax.simulation import (
 from vrw_jax.validation import check_type, require_untraced_arguments
 from vrw_jax.wheel import Outcome, WheelParams, compute_wheel_units
 
-
-@dataclass(frozen=True)
-class ArrivalOptions:
-    """Numerical options for testing whether a walk has arrived at a gait."""
-
-    max_gait_distance: float = 1e-6
-    """Largest distance between the section states of a walk and of the gait at which the walk has
-    arrived.
-
-    Distances are in units of the wheel. The value is chosen far above the errors of a gait step and
-    of a gait. It is far below the distances of most gaits from the boundaries of their basins.
-    """
-    steps_per_arrival_test: int = 10
-    """Number of gait steps between two tests, chosen because more frequent tests need many calls.
-    """
-
-
-ARRIVAL_OPTIONS = ArrivalOptions()
+# Largest distance between the section states of a walk and of the gait at which the walk has
+# arrived. Distances are in units of the wheel. The value is chosen far above the errors of a gait
+# step and of a gait. It is far below the distances of most gaits from the boundaries of their
+# basins.
+MAX_ARRIVAL_DISTANCE = 1e-6
 
 
 class StableGait(NamedTuple):
@@ -113,7 +99,7 @@ class StableGait(NamedTuple):
         n_entries = self.model.count_continuous_section_entries(self.params)
         state_differences = section_states[:, None, :n_entries] - self.section_states[:, :n_entries]
         scaled_differences = state_differences / np.asarray(state_units)[:n_entries]
-        return np.abs(scaled_differences).max(-1).min(-1) <= ARRIVAL_OPTIONS.max_gait_distance
+        return np.abs(scaled_differences).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
 
 
 class ArrivalWalkResult(NamedTuple):
@@ -122,6 +108,10 @@ class ArrivalWalkResult(NamedTuple):
     is_on_gait: np.ndarray
     walk_outcomes: np.ndarray  # `Outcome` of each walk, STEPPED if the walk continues
     n_steps_walked: np.ndarray  # to the arrival at the gait, the failure or the limit
+
+
+# Number of gait steps between two tests, chosen because more frequent tests need many calls.
+N_STEPS_PER_ARRIVAL_TEST = 10
 
 
 def walk_until_on_gait(
@@ -144,13 +134,13 @@ def walk_until_on_gait(
     )
     walking_indices = np.arange(n_starts)
     section_states = np.asarray(embed_section_states(jnp.asarray(start_states)))
-    for first_step in range(0, max_steps, ARRIVAL_OPTIONS.steps_per_arrival_test):
+    for first_step in range(0, max_steps, N_STEPS_PER_ARRIVAL_TEST):
         if not len(walking_indices):
             break
         walk_results = step_batch(
             stable_gait.params,
             section_states,
-            min(ARRIVAL_OPTIONS.steps_per_arrival_test, max_steps - first_step),
+            min(N_STEPS_PER_ARRIVAL_TEST, max_steps - first_step),
             model=stable_gait.model,
             options=stable_gait.step_options,
         )

@@ -9,7 +9,6 @@ a mean over failing walks. The terms of this mean are the hazard rate of the chi
 failure radius, times the derivative of the failure radius.
 """
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -19,39 +18,6 @@ from vrw_jax.cycles import limit_cycle
 from vrw_jax.robustness.failure_density import GaussianMixture
 from vrw_jax.robustness.sampled_passage import WalkerGroups
 from vrw_jax.wheel import Outcome, WheelParams
-
-
-@dataclass(frozen=True)
-class FirstPassageGradientOptions:
-    """Numerical options for the derivatives of mean numbers of gait steps from sampled walks."""
-
-    n_failing_walks: int = 1024
-    """Number of failing walks whose failure radii are computed.
-
-    The value is chosen because the error of a derivative is then a few percent."""
-    max_sampling_rounds: int = 20
-    """Largest number of rounds in which failing walks are drawn."""
-    relative_parameter_step: float = 3e-4
-    """Relative change of a parameter in a difference quotient of failure radii.
-
-    The value is chosen because the resulting changes of failure radii are below
-    `bracket_half_width`.
-    """
-    bracket_half_width: float = 0.2
-    """Half the width of the interval that brackets the failure radius for a changed parameter.
-
-    The unit is the standard deviation of a slope.
-    """
-    n_bisections: int = 22
-    """Number of bisections for each failure radius at the original parameters."""
-    n_changed_wheel_bisections: int = 14
-    """Number of bisections for each failure radius at a changed parameter.
-
-    The value is chosen because the error of the radius is then a hundredth of a typical change.
-    """
-
-
-PASSAGE_GRADIENT_OPTIONS = FirstPassageGradientOptions()
 
 
 class FailingWalks(NamedTuple):
@@ -97,6 +63,19 @@ class FailingWalks(NamedTuple):
         return 0.5 * (lower_radii + upper_radii)
 
 
+# Relative change of a parameter in a difference quotient of failure radii. The value is chosen
+# because the resulting changes of failure radii are below `BRACKET_HALF_WIDTH`.
+RELATIVE_PARAMETER_STEP = 3e-4
+# Half the width of the interval that brackets the failure radius for a changed parameter. The unit
+# is the standard deviation of a slope.
+BRACKET_HALF_WIDTH = 0.2
+# Number of bisections for each failure radius at the original parameters.
+N_RADIUS_BISECTIONS = 22
+# Number of bisections for each failure radius at a changed parameter. The value is chosen because
+# the error of the radius is then a hundredth of a typical change.
+N_CHANGED_WHEEL_BISECTIONS = 14
+
+
 def differentiate_log_mean_steps(
     walker_groups: WalkerGroups,
     walk_density: GaussianMixture,
@@ -121,14 +100,13 @@ def differentiate_log_mean_steps(
         params,
         zero_radii,
         failing_walks.slope_deviation_norms,
-        PASSAGE_GRADIENT_OPTIONS.n_bisections,
+        N_RADIUS_BISECTIONS,
     )
     radius_distribution = stats.chi(failing_walks.slope_deviation_directions.shape[1])
     hazard_rates = np.exp(
         radius_distribution.logpdf(failure_radii) - radius_distribution.logsf(failure_radii)
     )
     hazard_rates = np.where(survives_on_mean_slopes, hazard_rates, 0.0)
-    bracket_half_width = PASSAGE_GRADIENT_OPTIONS.bracket_half_width
 
     def differentiate_failure_radii(parameter_name: str) -> np.ndarray:
         """Return the derivatives of all failure radii with respect to one parameter, shape
@@ -137,7 +115,7 @@ def differentiate_log_mean_steps(
         if parameter_name == "slope_sd":
             return -failure_radii / slope_sd
         parameter_value = float(getattr(params, parameter_name))
-        change_size = PASSAGE_GRADIENT_OPTIONS.relative_parameter_step * abs(parameter_value)
+        change_size = RELATIVE_PARAMETER_STEP * abs(parameter_value)
         changed_failure_radii = []
         for parameter_change in (change_size, -change_size):
             _, changed_params = walker_groups.model.with_parameter(
@@ -159,9 +137,9 @@ def differentiate_log_mean_steps(
                 walks_of_changed_wheel.bisect_failure_radii(
                     walker_groups,
                     changed_params,
-                    np.maximum(failure_radii - bracket_half_width, 0.0),
-                    failure_radii + bracket_half_width,
-                    PASSAGE_GRADIENT_OPTIONS.n_changed_wheel_bisections,
+                    np.maximum(failure_radii - BRACKET_HALF_WIDTH, 0.0),
+                    failure_radii + BRACKET_HALF_WIDTH,
+                    N_CHANGED_WHEEL_BISECTIONS,
                 )
             )
         return (changed_failure_radii[0] - changed_failure_radii[1]) / (2.0 * change_size)
@@ -176,20 +154,24 @@ def differentiate_log_mean_steps(
     }
 
 
+# Number of failing walks whose failure radii are computed. The value is chosen because the error of
+# a derivative is then a few percent.
+N_FAILING_WALKS = 1024
+# Largest number of rounds in which failing walks are drawn.
+MAX_SAMPLING_ROUNDS = 20
+
+
 def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixture) -> FailingWalks:
     """Return failing walks with equal weights, resampled from many walks.
 
     The slopes of the many walks are drawn from `walk_density`. Raise ValueError if no walk fails in
     its last step.
     """
-    n_walks, n_effective_walks = PASSAGE_GRADIENT_OPTIONS.n_failing_walks, 0.0
+    n_effective_walks = 0.0
     n_walkers = walker_groups.n_walkers
     deviations_by_round: list[np.ndarray] = []
     weights_by_round: list[np.ndarray] = []
-    while (
-        n_effective_walks < n_walks
-        and len(weights_by_round) < PASSAGE_GRADIENT_OPTIONS.max_sampling_rounds
-    ):
+    while n_effective_walks < N_FAILING_WALKS and len(weights_by_round) < MAX_SAMPLING_ROUNDS:
         drawn_deviations = walk_density.draw_samples(n_walkers, walker_groups.random)
         deviations_by_round.append(drawn_deviations)
         weights_by_round.append(walker_groups.run_biased_walks(walk_density, drawn_deviations))
@@ -202,7 +184,7 @@ def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixtu
             "mean number of steps has no derivative: give a larger slope_sd or n_walkers."
         )
     walk_indices = walker_groups.random.choice(
-        len(walk_weights), n_walks, p=walk_weights / np.sum(walk_weights)
+        len(walk_weights), N_FAILING_WALKS, p=walk_weights / np.sum(walk_weights)
     )
     slope_deviations = np.concatenate(deviations_by_round)[walk_indices]
     slope_deviation_norms = np.linalg.norm(slope_deviations, axis=1)

@@ -1,7 +1,6 @@
 """Smallest disturbance within a step after which a wheel leaves the basin of its gait."""
 
 import functools
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -31,49 +30,6 @@ DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
 DISTURBED_PHASE_NAMES = ("DLS", "SLS-I", "SLS-II")
 ANGULAR_VELOCITY_INDEX = 3
 """Index of the angular velocity dtheta in a state (theta, L1, L2, dtheta, dL1, dL2)."""
-
-
-@dataclass(frozen=True)
-class DisturbanceSearchOptions:
-    """Numerical options of the search for the smallest disturbance.
-
-    The search considers instants of a gait step and sizes of the disturbance.
-    """
-
-    sample_strides: tuple[int, ...] = (512, 64, 8, 1)
-    """Distances between neighboring instants, in samples of a phase, one for each pass of the
-    search.
-
-    The values are chosen because each pass then covers two intervals of the previous pass. The last
-    pass resolves a ten-thousandth of a phase.
-    """
-    n_intervals_per_pass: int = 16
-    """Number of intervals between the instants that one pass considers in a phase."""
-    n_disturbance_grid_sizes: int = 24
-    """Number of disturbance sizes in the first grid.
-
-    An interval of sufficient sizes may be missed if the grid spacing exceeds its width.
-    """
-    n_sizes_per_bisection: int = 8
-    """Number of sizes that divide a bracket, chosen because each batch then gains one digit."""
-    final_disturbance_tolerance: float = 1e-8
-    """Width of a bracket of sizes in the last pass, relative to the size.
-
-    The value is chosen as the relative error of a gait step.
-    """
-    early_disturbance_tolerance: float = 1e-5
-    """Width of a bracket of sizes in all earlier passes, relative to the size.
-
-    The value is chosen because sizes at neighboring instants differ by more than this width.
-    """
-
-    @property
-    def n_phase_samples(self) -> int:
-        """Return the number of samples per phase, both ends included."""
-        return self.n_intervals_per_pass * self.sample_strides[0] + 1
-
-
-DISTURBANCE_SEARCH_OPTIONS = DisturbanceSearchOptions()
 
 
 class SmallestDisturbance(AbstractPrintable):
@@ -235,6 +191,20 @@ class _ExitSizeBrackets(NamedTuple):
         return 0.5 * (self.lower_disturbance_sizes + self.upper_disturbance_sizes)
 
 
+# Distances between neighboring instants, in samples of a phase, one for each pass of the search.
+# The values are chosen because each pass then covers two intervals of the previous pass. The last
+# pass resolves a ten-thousandth of a phase.
+SAMPLE_STRIDES = (512, 64, 8, 1)
+# Number of intervals between the instants that one pass considers in a phase.
+N_INTERVALS_PER_PASS = 16
+# Width of a bracket of sizes in the last pass, relative to the size. The value is chosen as the
+# relative error of a gait step.
+FINAL_DISTURBANCE_TOLERANCE = 1e-8
+# Width of a bracket of sizes in all earlier passes, relative to the size. The value is chosen
+# because sizes at neighboring instants differ by more than this width.
+EARLY_DISTURBANCE_TOLERANCE = 1e-5
+
+
 def compute_smallest_disturbance(
     stable_gait: StableGait, max_size: float | None, max_steps: int
 ) -> SmallestDisturbance:
@@ -244,8 +214,7 @@ def compute_smallest_disturbance(
     before.
     """
     params, model, step_options, section_states = stable_gait
-    options = DISTURBANCE_SEARCH_OPTIONS
-    n_phase_samples = options.n_phase_samples
+    n_phase_samples = N_INTERVALS_PER_PASS * SAMPLE_STRIDES[0] + 1  # both ends included
     start_state = jnp.asarray(section_states[0])
     trajectory = model.sample_step(params, start_state, step_options, n_phase_samples)
     sampled_states = np.asarray(trajectory.state)
@@ -263,9 +232,9 @@ def compute_smallest_disturbance(
     # Each pass considers a window of samples for each phase and direction.
     n_windows = len(occurring_phases) * len(DISTURBANCE_SIGNS)
     window_centers = np.full(n_windows, n_phase_samples // 2)
-    half_intervals = options.n_intervals_per_pass // 2
+    half_intervals = N_INTERVALS_PER_PASS // 2
     first_pass_result = None
-    for sample_stride in options.sample_strides:
+    for sample_stride in SAMPLE_STRIDES:
         sample_offsets = sample_stride * np.arange(-half_intervals, half_intervals + 1)
         n_instants = len(sample_offsets)
         window_samples = np.clip(window_centers[:, None] + sample_offsets, 0, n_phase_samples - 1)
@@ -274,13 +243,11 @@ def compute_smallest_disturbance(
             window_samples.ravel(),
             np.tile(np.repeat(DISTURBANCE_SIGNS, n_instants), len(occurring_phases)),
         )
-        is_last_pass = sample_stride == options.sample_strides[-1]
+        is_last_pass = sample_stride == SAMPLE_STRIDES[-1]
         brackets = _bracket_exit_sizes(
             gait,
             instants,
-            options.final_disturbance_tolerance
-            if is_last_pass
-            else options.early_disturbance_tolerance,
+            FINAL_DISTURBANCE_TOLERANCE if is_last_pass else EARLY_DISTURBANCE_TOLERANCE,
         )
         exit_sizes = brackets.middle_disturbance_sizes.reshape(n_windows, n_instants)
         window_centers = window_samples[np.arange(n_windows), exit_sizes.argmin(1)]
@@ -323,6 +290,13 @@ def compute_smallest_disturbance(
     )
 
 
+# Number of disturbance sizes in the first grid. An interval of sufficient sizes may be missed if
+# the grid spacing exceeds its width.
+N_DISTURBANCE_GRID_SIZES = 24
+# Number of sizes that divide a bracket, chosen because each batch then gains one digit.
+N_SIZES_PER_BISECTION = 8
+
+
 def _bracket_exit_sizes(
     gait: _DisturbedGait, instants: _DirectedInstants, size_tolerance: float
 ) -> _ExitSizeBrackets:
@@ -332,13 +306,11 @@ def _bracket_exit_sizes(
     - `size_tolerance`: width of the final brackets, relative to the size.
     """
     n_instants = len(instants.disturbance_signs)
-    n_grid_sizes = DISTURBANCE_SEARCH_OPTIONS.n_disturbance_grid_sizes
-    n_sizes_per_bisection = DISTURBANCE_SEARCH_OPTIONS.n_sizes_per_bisection
     lower_sizes, upper_sizes = np.zeros(n_instants), np.full(n_instants, np.inf)
     exit_outcomes = np.full(n_instants, int(Outcome.STEPPED))
     unresolved = np.arange(n_instants)
-    grid_fractions = np.arange(1, n_grid_sizes + 1) / n_grid_sizes
-    bisection_fractions = np.arange(1, n_sizes_per_bisection + 1) / (n_sizes_per_bisection + 1.0)
+    grid_fractions = np.arange(1, N_DISTURBANCE_GRID_SIZES + 1) / N_DISTURBANCE_GRID_SIZES
+    bisection_fractions = np.arange(1, N_SIZES_PER_BISECTION + 1) / (N_SIZES_PER_BISECTION + 1.0)
     tried_sizes = np.tile(gait.max_size * grid_fractions, (n_instants, 1))
     while len(unresolved):
         leaves_basin, walk_outcomes = _walk_after_disturbance(

@@ -6,7 +6,6 @@ Only walks that are neither periodic nor failed continue, so that long transient
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -25,28 +24,6 @@ from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import StepOptions, batch_sizes, map_in_batches, select_tree_rows
 from vrw_jax.simulation.stepping import walk
 from vrw_jax.wheel import Outcome, WheelParams
-
-
-@dataclass(frozen=True)
-class AttractorOptions:
-    """Options of the tests for periodic walks. All distances are between section states."""
-
-    n_steps_per_round: int = 10
-    """Number of walking steps between two tests for periodic motion."""
-    periodicity_tolerance: float = 1e-7
-    """Largest change of a section state from one period to the next for which motion counts as
-    periodic.
-    """
-    max_distance_on_arrival: float = 1e-3
-    """Largest distance between a walk and its orbit at which the walk has arrived at the orbit."""
-    same_orbit_distance: float = 1e-4
-    """Largest distance between two orbits that are treated as the same orbit.
-
-    The value is chosen because it is far above the periodicity tolerance.
-    """
-
-
-ATTRACTOR_OPTIONS = AttractorOptions()
 
 
 class PeriodicWalkEnds(NamedTuple):
@@ -99,6 +76,13 @@ def _stack_contact_parameters(model: Any, params: WheelParams) -> np.ndarray:
     return np.asarray(jax.vmap(model.collect_parameter_values)(params)).T
 
 
+# Number of walking steps between two tests for periodic motion.
+N_STEPS_PER_ROUND = 10
+# Largest distance between the section states of a walk and of its orbit at which the walk has
+# arrived at the orbit.
+MAX_DISTANCE_ON_ARRIVAL = 1e-3
+
+
 def walk_until_periodic(
     params: WheelParams,
     start_states: np.ndarray,
@@ -115,26 +99,25 @@ def walk_until_periodic(
     """
     n_starts = len(start_states)
     repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_starts), params)
-    n_steps_of_round = ATTRACTOR_OPTIONS.n_steps_per_round
-    n_rounds = -(-max_steps // n_steps_of_round)
+    n_rounds = -(-max_steps // N_STEPS_PER_ROUND)
     state_history = np.full(
-        (n_starts, 1 + n_rounds * n_steps_of_round, start_states.shape[1]), np.nan
+        (n_starts, 1 + n_rounds * N_STEPS_PER_ROUND, start_states.shape[1]), np.nan
     )
     state_history[:, 0] = start_states
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
     unsettled_walk_indices = np.arange(n_starts)
     simulate_round: Callable[..., tuple] = functools.partial(
-        _simulate_starts_with_contact, model, options, n_steps_of_round
+        _simulate_starts_with_contact, model, options, N_STEPS_PER_ROUND
     )
     if model.batch_kernel != "legs":
         simulate_round = functools.partial(
             map_in_batches,
-            functools.partial(_simulate_block_of_starts, model, options, n_steps_of_round),
+            functools.partial(_simulate_block_of_starts, model, options, N_STEPS_PER_ROUND),
             (batch_sizes.ATTRACTOR_BATCH_SIZE,),
         )
-    for first_step in range(0, n_rounds * n_steps_of_round, n_steps_of_round):
-        last_step = first_step + n_steps_of_round
+    for first_step in range(0, n_rounds * N_STEPS_PER_ROUND, N_STEPS_PER_ROUND):
+        last_step = first_step + N_STEPS_PER_ROUND
         section_states, step_outcomes = map(
             np.asarray,
             simulate_round(
@@ -165,9 +148,13 @@ def walk_until_periodic(
         orbit_distances = np.linalg.norm(states_of_walk[:, None] - last_period_states, axis=-1).min(
             1
         )
-        distant_states = np.flatnonzero(orbit_distances > ATTRACTOR_OPTIONS.max_distance_on_arrival)
+        distant_states = np.flatnonzero(orbit_distances > MAX_DISTANCE_ON_ARRIVAL)
         n_steps_to_orbit[i] = distant_states[-1] + 1 if len(distant_states) else 0
     return PeriodicWalkEnds(walk_outcomes, orbit_periods, n_steps_to_orbit, orbit_states)
+
+
+# Largest change of a section state from one period to the next for which motion counts as periodic.
+PERIODICITY_TOLERANCE = 1e-7
 
 
 def _detect_walk_periods(state_history: np.ndarray, max_period: int) -> np.ndarray:
@@ -182,7 +169,7 @@ def _detect_walk_periods(state_history: np.ndarray, max_period: int) -> np.ndarr
             state_history[:, n_states - 2 * period :]
             - state_history[:, n_states - 3 * period : n_states - period]
         )
-        is_periodic = state_changes.max((1, 2)) < ATTRACTOR_OPTIONS.periodicity_tolerance
+        is_periodic = state_changes.max((1, 2)) < PERIODICITY_TOLERANCE
         detected_periods[is_periodic] = period
     return detected_periods
 
@@ -197,6 +184,11 @@ class DistinctOrbits(NamedTuple):
     orbit_states: list[np.ndarray]  # section states of each orbit, (period, m)
 
 
+# Largest distance between section states of two orbits that are treated as the same orbit. The
+# value is chosen because it is far above the periodicity tolerance.
+SAME_ORBIT_DISTANCE = 1e-4
+
+
 def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> DistinctOrbits:
     """Return the distinct orbits that the walks reach.
 
@@ -209,8 +201,7 @@ def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> DistinctOrbits:
         for j, distinct_orbit_states in enumerate(distinct_orbits):
             if (
                 len(distinct_orbit_states) == len(orbit_states)
-                and np.abs(distinct_orbit_states - orbit_states).max()
-                < ATTRACTOR_OPTIONS.same_orbit_distance
+                and np.abs(distinct_orbit_states - orbit_states).max() < SAME_ORBIT_DISTANCE
             ):
                 orbit_indices[i] = j
                 break

@@ -19,33 +19,6 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.wheel import PARAMETER_NAMES, WheelParams
 
 
-@dataclasses.dataclass(frozen=True)
-class StepTolerances:
-    """Solver tolerances for walking steps with unilateral contact.
-
-    - `tight_tolerance`: tolerance for most steps, chosen because steps at a looser tolerance save a
-      seventh of the time but miss events;
-    - `very_tight_tolerance`: tolerance for measures with a small allowed error. A step at this
-      tolerance costs a third more than a step at `tight_tolerance`;
-    - `walk_tolerance`: tolerance for walks with the solver Tsit5. A step at this tolerance costs a
-      quarter of a step at `tight_tolerance`. The value is chosen because walks at 1e-5 miss three
-      of 118 gaits;
-    - `tight_comparison_tolerances`, `very_tight_comparison_tolerances`: further tolerances at which
-      steps are repeated if feet may graze the ground. The numerical error is estimated from the
-      differences between these steps.
-    """
-
-    tight_tolerance: float = 1e-10
-    very_tight_tolerance: float = 1e-12
-    walk_tolerance: float = 3e-6
-    tight_comparison_tolerances: tuple[float, ...] = (1e-12, 1e-11, 3e-11)
-    very_tight_comparison_tolerances: tuple[float, ...] = (1e-13, 3e-12, 1e-11)
-
-
-STEP_TOLERANCES = StepTolerances()
-"""Solver tolerances for all measures."""
-
-
 def replace_rows(
     arrays: Iterable[np.ndarray], row_indices: np.ndarray, new_arrays: Iterable[np.ndarray]
 ) -> None:
@@ -61,6 +34,22 @@ class StepQuantities(NamedTuple):
     section_states: np.ndarray
     step_quantities: np.ndarray  # (wheels, 7), in the order of `QUANTITY_NAMES`
     step_outcomes: np.ndarray
+
+
+# Tolerance for most steps, chosen because steps at a looser tolerance save a seventh of the time
+# but miss events.
+TIGHT_TOLERANCE = 1e-10
+# Tolerance for measures with a small allowed error. A step at this tolerance costs a third more
+# than a step at `TIGHT_TOLERANCE`.
+VERY_TIGHT_TOLERANCE = 1e-12
+# Tolerance for walks with the solver Tsit5. A step at this tolerance costs a quarter of a step at
+# `TIGHT_TOLERANCE`. The value is chosen because walks at 1e-5 miss three of 118 gaits.
+WALK_TOLERANCE = 3e-6
+# Further tolerances at which steps are repeated if feet may graze the ground. The numerical error
+# is estimated from the differences between these steps.
+TIGHT_COMPARISON_TOLERANCES = (1e-12, 1e-11, 3e-11)
+# Such tolerances for steps at `VERY_TIGHT_TOLERANCE`.
+VERY_TIGHT_COMPARISON_TOLERANCES = (1e-13, 3e-12, 1e-11)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,18 +150,17 @@ class ContactWheelBatch:
 
     def make_walk_batch(self) -> "ContactWheelBatch":
         """Return a copy of the batch with the looser solver tolerance for walks."""
-        solver_tolerance = STEP_TOLERANCES.walk_tolerance
         return dataclasses.replace(
             self,
-            step_options=StepOptions(solver="Tsit5", rtol=solver_tolerance, atol=solver_tolerance),
+            step_options=StepOptions(solver="Tsit5", rtol=WALK_TOLERANCE, atol=WALK_TOLERANCE),
         )
 
     def make_comparison_batches(self) -> list["ContactWheelBatch"]:
         """Return a copy of the batch for each solver tolerance at which steps are compared."""
         comparison_tolerances = (
-            STEP_TOLERANCES.very_tight_comparison_tolerances
-            if float(self.step_options.rtol) < 0.5 * STEP_TOLERANCES.tight_tolerance
-            else STEP_TOLERANCES.tight_comparison_tolerances
+            VERY_TIGHT_COMPARISON_TOLERANCES
+            if float(self.step_options.rtol) < 0.5 * TIGHT_TOLERANCE
+            else TIGHT_COMPARISON_TOLERANCES
         )
         return [
             dataclasses.replace(

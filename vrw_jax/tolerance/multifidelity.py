@@ -12,7 +12,6 @@ Its bias is then inversely proportional to the number of sampled wheels.
 """
 
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -36,29 +35,6 @@ from vrw_jax.validation import (
     require_untraced_arguments,
 )
 from vrw_jax.wheel import WheelParams
-
-
-@dataclass(frozen=True)
-class SamplingOptions:
-    """Options of the sampling for a mean.
-
-    - `n_standard_errors`: number of standard errors in the reported error of a mean;
-    - `gait_error_fraction`: allowed error of each gait's measure, as a fraction of the mean's
-      allowed error;
-    - `min_pilot_gaits`: smallest number of wheels with a gait in the pilot sample, from which the
-      variance is estimated;
-    - `singular_value_tolerance`: fraction of the largest singular value below which a singular
-      value of the control columns is treated as zero.
-    """
-
-    n_standard_errors: float = 2.0
-    gait_error_fraction: float = 0.1
-    min_pilot_gaits: int = 8
-    singular_value_tolerance: float = 1e-12
-
-
-SAMPLING_OPTIONS = SamplingOptions()
-"""Options of `vrw.multifidelity_mean`."""
 
 
 class _ControlVariate(NamedTuple):
@@ -142,6 +118,14 @@ class _SamplingPlan(NamedTuple):
     control_index: int  # index in `CONTROL_VARIATES`
 
 
+# Number of standard errors in the reported error of a mean.
+N_STANDARD_ERRORS = 2.0
+# Allowed error of each gait's measure, as a fraction of the mean's allowed error.
+GAIT_ERROR_FRACTION = 0.1
+# Smallest number of wheels with a gait in the pilot sample, from which the variance is estimated.
+MIN_PILOT_GAITS = 8
+
+
 @with_default_jax_settings
 def multifidelity_mean(
     measure: str,
@@ -186,9 +170,8 @@ def multifidelity_mean(
     check_type("measure", measure, str, "give the name of one, 'speed', say")
     require_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    min_pilot_gaits = SAMPLING_OPTIONS.min_pilot_gaits
     tol = check_positive("tol", tol)
-    pilot = check_int("pilot", pilot, min_pilot_gaits, ", to estimate a variance")
+    pilot = check_int("pilot", pilot, MIN_PILOT_GAITS, ", to estimate a variance")
     seed = check_int("seed", seed, 0)
     params, friction_by_wheel, batch_shape = broadcast_params_and_friction(params, friction)
     n_wheels = len(friction_by_wheel)
@@ -200,15 +183,15 @@ def multifidelity_mean(
     measured_wheels = _MeasuredWheels(measure, params, friction_by_wheel, stoppers)
     wheel_permutation = np.random.default_rng(seed).permutation(n_wheels)
     pilot_wheel_indices, remaining_wheel_indices = np.split(wheel_permutation, [pilot])
-    gait_measure_tolerance = SAMPLING_OPTIONS.gait_error_fraction * tol
+    gait_measure_tolerance = GAIT_ERROR_FRACTION * tol
     pilot_measure_results = measured_wheels.measure_selected_wheels(
         pilot_wheel_indices, gait_measure_tolerance
     )
     has_pilot_gait = pilot_measure_results.found
-    if np.sum(has_pilot_gait) < min_pilot_gaits:
+    if np.sum(has_pilot_gait) < MIN_PILOT_GAITS:
         raise ValueError(
             f"{np.sum(has_pilot_gait)} of the pilot's {pilot} wheels have a gait with contact, but "
-            f"a mean needs {min_pilot_gaits}: give other wheels, or a larger pilot."
+            f"a mean needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
         )
     pilot_sample = _SampledMeasures.from_results(pilot_measure_results)
     sampling_plans = [
@@ -243,8 +226,7 @@ def multifidelity_mean(
     )
     return MultifidelityMean(
         value=estimated_mean,
-        error=SAMPLING_OPTIONS.n_standard_errors * standard_error
-        + float(np.mean(gait_error_bounds)),
+        error=N_STANDARD_ERRORS * standard_error + float(np.mean(gait_error_bounds)),
         n_gaits=float(len(gait_error_bounds)),
         n_high_fidelity=float(pilot + sampling_plan.n_drawn_wheels),
         weight=float(sampling_plan.control_weights[0]),
@@ -334,6 +316,11 @@ class _MeasuredWheels(NamedTuple):
         )
 
 
+# Fraction of the largest singular value below which a singular value of the control columns is
+# treated as zero.
+SINGULAR_VALUE_TOLERANCE = 1e-12
+
+
 def _plan_sampling(
     control_index: int,
     pilot_sample: _SampledMeasures,
@@ -359,7 +346,7 @@ def _plan_sampling(
     control_weights, _, matrix_rank, _ = np.linalg.lstsq(
         centered_control_regressors,
         centered_measure_values,
-        rcond=SAMPLING_OPTIONS.singular_value_tolerance,
+        rcond=SINGULAR_VALUE_TOLERANCE,
     )
     residual_sum_of_squares = float(
         np.sum((centered_measure_values - centered_control_regressors @ control_weights) ** 2)
@@ -367,16 +354,15 @@ def _plan_sampling(
     residual_variance = residual_sum_of_squares / (
         len(centered_measure_values) - 1 - int(matrix_rank)
     )
-    sampling_tolerance = (1.0 - SAMPLING_OPTIONS.gait_error_fraction) * mean_tolerance
+    sampling_tolerance = (1.0 - GAIT_ERROR_FRACTION) * mean_tolerance
     n_required_wheels = (
         residual_variance
-        * (SAMPLING_OPTIONS.n_standard_errors / (sampling_tolerance * fraction_of_wheels_with_gait))
-        ** 2
+        * (N_STANDARD_ERRORS / (sampling_tolerance * fraction_of_wheels_with_gait)) ** 2
     )
     n_drawn_wheels = min(
         n_remaining_wheels,
         max(
-            SAMPLING_OPTIONS.min_pilot_gaits,
+            MIN_PILOT_GAITS,
             math.ceil(n_required_wheels / (1.0 + n_required_wheels / n_remaining_wheels)),
         ),
     )

@@ -7,7 +7,6 @@ several corrections (chord iteration). It is computed again if corrections contr
 contact codes of the legs change.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -24,49 +23,6 @@ from vrw_jax.tolerance.step_quantities import (
     evaluate_measures,
 )
 from vrw_jax.wheel import Outcome
-
-
-@dataclasses.dataclass(frozen=True)
-class RefinementOptions:
-    """Options of the refinement of gaits. Entries of section states are in rad, rad/s, m and m/s.
-
-    - `max_jacobians_per_gait`: largest number of Jacobians computed for one gait;
-    - `max_corrections_per_jacobian`: largest number of Newton corrections with one Jacobian, chosen
-      because this number of corrections reaches round-off at `max_contraction_rate`;
-    - `max_contraction_rate`: largest ratio of successive correction lengths. If it is exceeded, the
-      Jacobian is computed again;
-    - `max_correction_length`: largest length of an accepted correction, chosen because the
-      linearization may be invalid beyond this length;
-    - `stall_length_in_tolerances`: ratio of a correction's length to the solver tolerance. Below
-      this ratio, corrections that contract slowly are at the level of the integrator's errors;
-    - `error_safety_factor`: ratio of the bound for the remaining error to the effect of the last
-      correction. It is also the ratio of the bound for the numerical error to the difference
-      between steps at two tolerances. The value is chosen because a factor of four was too small
-      for 4 of 10,365 results;
-    - `step_error_in_tolerances`: ratio of the bound for a walking step's error to the solver
-      tolerance, chosen because 99 of 100 errors are within a third of this bound;
-    - `n_presumed_missed_contacts`: presumed number of contacts of shortest duration that a walking
-      step misses or adds;
-    - `max_presumed_error_fraction`: largest fraction of the allowed error that may be presumed for
-      missed contacts. If it is exceeded, the error is estimated from steps at other tolerances;
-    - `jacobian_cost_in_steps`: cost of a walking step with its Jacobian, in steps without
-      derivatives, chosen because the measured ratio of CPU times is 3.7.
-    """
-
-    max_jacobians_per_gait: int = 4
-    max_corrections_per_jacobian: int = 20
-    max_contraction_rate: float = 0.3
-    max_correction_length: float = 1.0
-    stall_length_in_tolerances: float = 1e4
-    error_safety_factor: float = 6.0
-    step_error_in_tolerances: float = 30.0
-    n_presumed_missed_contacts: float = 3.0
-    max_presumed_error_fraction: float = 0.1
-    jacobian_cost_in_steps: int = 4
-
-
-REFINEMENT_OPTIONS = RefinementOptions()
-"""Options of the refinement for all measures."""
 
 
 class MeasureEstimates(NamedTuple):
@@ -93,6 +49,13 @@ class MeasureEstimates(NamedTuple):
     measure_jacobian: np.ndarray
     numerical_error_bound: np.ndarray
     missed_contact_error_bound: np.ndarray
+
+
+# Ratio of the bound for a walking step's error to the solver tolerance, chosen because 99 of 100
+# errors are within a third of this bound.
+STEP_ERROR_IN_TOLERANCES = 30.0
+# Presumed number of contacts of shortest duration that a walking step misses or adds.
+N_PRESUMED_MISSED_CONTACTS = 3.0
 
 
 def estimate_measures(
@@ -138,17 +101,14 @@ def estimate_measures(
         correction_effect_on_measures = np.einsum(
             "ijk,ik->ij", section_state_sensitivity, np.abs(newton_correction)
         )
-        step_error_bound = REFINEMENT_OPTIONS.step_error_in_tolerances * float(
-            wheel_batch.step_options.rtol
-        )
+        step_error_bound = STEP_ERROR_IN_TOLERANCES * float(wheel_batch.step_options.rtol)
         total_quantity_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
             section_state_sensitivity @ np.abs(inverse_newton_matrix), axis=-1
         )
         # An unresolved contact adds its time to one duration and takes the time from another.
         duration_sensitivity_range = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
         missed_contact_duration = (
-            REFINEMENT_OPTIONS.n_presumed_missed_contacts
-            * wheel_batch.compute_min_contact_duration(wheel_indices)
+            N_PRESUMED_MISSED_CONTACTS * wheel_batch.compute_min_contact_duration(wheel_indices)
         )
         return MeasureEstimates(
             has_same_leg_codes,
@@ -220,6 +180,31 @@ class RefinedGaits(NamedTuple):
         return sorted(distinct_indices, key=lambda gait_index: self.walking_speed[gait_index])
 
 
+# Largest number of Jacobians computed for one gait.
+MAX_JACOBIANS_PER_GAIT = 4
+# Largest number of Newton corrections with one Jacobian, chosen because this number of corrections
+# reaches round-off at `MAX_CONTRACTION_RATE`.
+MAX_CORRECTIONS_PER_JACOBIAN = 20
+# Largest ratio of successive correction lengths. If it is exceeded, the Jacobian is computed again.
+MAX_CONTRACTION_RATE = 0.3
+# Largest length of an accepted correction, in rad, rad/s, m and m/s, chosen because the
+# linearization may be invalid beyond this length.
+MAX_CORRECTION_LENGTH = 1.0
+# Ratio of a correction's length to the solver tolerance. Below this ratio, corrections that
+# contract slowly are at the level of the integrator's errors.
+STALL_LENGTH_IN_TOLERANCES = 1e4
+# Ratio of the bound for the remaining error to the effect of the last correction. It is also the
+# ratio of the bound for the numerical error to the difference between steps at two tolerances. The
+# value is chosen because a factor of four was too small for 4 of 10,365 results.
+REFINEMENT_SAFETY_FACTOR = 6.0
+# Largest fraction of the allowed error that may be presumed for missed contacts. If it is exceeded,
+# the error is estimated from steps at other tolerances.
+MAX_PRESUMED_ERROR_FRACTION = 0.1
+# Cost of a walking step with its Jacobian, in steps without derivatives, chosen because the
+# measured ratio of CPU times is 3.7.
+JACOBIAN_COST_IN_STEPS = 4
+
+
 def refine_gaits(
     wheel_batch: ContactWheelBatch,
     wheel_indices: np.ndarray,
@@ -269,7 +254,7 @@ def refine_gaits(
         )
 
     next_gait_indices = np.arange(n_gaits)
-    for _ in range(REFINEMENT_OPTIONS.max_jacobians_per_gait):
+    for _ in range(MAX_JACOBIANS_PER_GAIT):
         if not len(next_gait_indices):
             break
         gait_indices, next_gait_indices = next_gait_indices, next_gait_indices[:0]
@@ -282,19 +267,16 @@ def refine_gaits(
             np.eye(n_coordinates) - return_map_jacobian,
             np.broadcast_to(np.eye(n_coordinates), return_map_jacobian.shape),
         )
-        gaits.n_steps[gait_indices] += REFINEMENT_OPTIONS.jacobian_cost_in_steps
+        gaits.n_steps[gait_indices] += JACOBIAN_COST_IN_STEPS
         previous_correction_length = np.full(len(gait_indices), np.inf)
-        for n_corrections in range(REFINEMENT_OPTIONS.max_corrections_per_jacobian):
+        for n_corrections in range(MAX_CORRECTIONS_PER_JACOBIAN):
             measure_estimates = estimate_gait_measures(wheel_batch, gait_indices, contact_step)
             correction_length = np.linalg.norm(measure_estimates.newton_correction, axis=1)
             contraction_rate = correction_length / np.maximum(
                 previous_correction_length, np.finfo(float).tiny
             )
-            is_contraction_slow = contraction_rate > REFINEMENT_OPTIONS.max_contraction_rate
-            error_bound = (
-                REFINEMENT_OPTIONS.error_safety_factor
-                * measure_estimates.correction_effect_on_measures
-            )
+            is_contraction_slow = contraction_rate > MAX_CONTRACTION_RATE
+            error_bound = REFINEMENT_SAFETY_FACTOR * measure_estimates.correction_effect_on_measures
             error_bound_goal = compute_error_goal(measure_estimates.measure_values)
             is_error_within_goal = (n_corrections > 0) & np.all(
                 error_bound
@@ -304,10 +286,8 @@ def refine_gaits(
                 ),
                 axis=1,
             )
-            is_correction_at_stall_length = (
-                correction_length
-                <= REFINEMENT_OPTIONS.stall_length_in_tolerances
-                * float(wheel_batch.step_options.rtol)
+            is_correction_at_stall_length = correction_length <= STALL_LENGTH_IN_TOLERANCES * float(
+                wheel_batch.step_options.rtol
             )
             is_refinement_finished = measure_estimates.has_same_leg_codes & np.where(
                 is_contraction_slow, is_correction_at_stall_length, is_error_within_goal
@@ -316,7 +296,7 @@ def refine_gaits(
             gaits.is_found[finished_gait_indices] = True
             has_large_presumed_error = np.any(
                 measure_estimates.missed_contact_error_bound
-                > REFINEMENT_OPTIONS.max_presumed_error_fraction * error_bound_goal,
+                > MAX_PRESUMED_ERROR_FRACTION * error_bound_goal,
                 axis=1,
             )
             for gait_results, new_results in (
@@ -337,7 +317,7 @@ def refine_gaits(
             is_refinement_continued = (
                 ~is_refinement_finished
                 & (contact_step.step_outcomes == Outcome.STEPPED)
-                & (correction_length <= REFINEMENT_OPTIONS.max_correction_length)
+                & (correction_length <= MAX_CORRECTION_LENGTH)
                 & (contraction_rate < 1.0)
             )
             gaits.section_states[gait_indices[is_refinement_continued]] = np.where(
@@ -368,7 +348,7 @@ def refine_gaits(
         measure_estimates = estimate_gait_measures(
             comparison_batch, compared_gait_indices, contact_step
         )
-        error_bound = REFINEMENT_OPTIONS.error_safety_factor * np.abs(
+        error_bound = REFINEMENT_SAFETY_FACTOR * np.abs(
             measure_estimates.measure_values - gaits.measure_values[compared_gait_indices]
         )
         error_bound += np.minimum(

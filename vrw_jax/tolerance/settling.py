@@ -8,47 +8,12 @@ limit of the drift. The state at the end of a walk is not the gait but the initi
 refinement.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch, StepQuantities, replace_rows
 from vrw_jax.wheel import Outcome
-
-
-@dataclass(frozen=True)
-class LeapOptions:
-    """Options of walks with leaps. Entries of section states are in rad, rad/s, m and m/s.
-
-    - `n_warmup_steps`: number of walking steps before the first leap;
-    - `max_leaps`: largest number of leaps;
-    - `steps_per_leap`: number of walking steps after a leap. The value is chosen because five steps
-      miss three of 118 gaits, among 451 wheels for which the paper's model has no gait;
-    - `max_leap_distance`: largest length of a leap, chosen because longer leaps skip pairs of close
-      gaits;
-    - `max_fade_distance_ratio`: largest ratio of the fade distance to the length of all remaining
-      leaps together. A walk with a larger ratio ends. The fade distance is the distance to the
-      predicted limit of the drift;
-    - `max_leaps_left_to_give_up`: largest number of remaining leaps at which
-      `max_fade_distance_ratio` is tested, chosen because a drift may first grow and then decay;
-    - `max_settled_drift`: largest drift per walking step, and largest fade distance, in a settled
-      walk;
-    - `drift_noise_level`: drift per walking step below which errors of the steps dominate.
-    """
-
-    n_warmup_steps: int = 20
-    max_leaps: int = 10
-    steps_per_leap: int = 7
-    max_leap_distance: float = 0.15
-    max_fade_distance_ratio: float = 2.0
-    max_leaps_left_to_give_up: int = 3
-    max_settled_drift: float = 5e-4
-    drift_noise_level: float = 1e-5
-
-
-LEAP_OPTIONS = LeapOptions()
-"""Options of all walks with leaps."""
 
 
 class WalkEnds(NamedTuple):
@@ -58,6 +23,24 @@ class WalkEnds(NamedTuple):
     section_states: np.ndarray  # (walks, 4 + 3 n)
     walk_outcomes: np.ndarray  # STEPPED, or the failure that ended the walk
     n_steps: np.ndarray  # number of walking steps
+
+
+# Number of walking steps before the first leap.
+N_WARMUP_STEPS = 20
+# Largest number of leaps.
+MAX_LEAPS = 10
+# Number of walking steps after a leap. The value is chosen because five steps miss three of 118
+# gaits, among 451 wheels for which the paper's model has no gait.
+N_STEPS_PER_LEAP = 7
+# Largest length of a leap, in rad, rad/s, m and m/s, chosen because longer leaps skip pairs of
+# close gaits.
+MAX_LEAP_DISTANCE = 0.15
+# Largest ratio of the fade distance to the length of all remaining leaps together. A walk with a
+# larger ratio ends. The fade distance is the distance to the predicted limit of the drift.
+MAX_FADE_DISTANCE_RATIO = 2.0
+# Largest number of remaining leaps at which `MAX_FADE_DISTANCE_RATIO` is tested, chosen because a
+# drift may first grow and then decay.
+MAX_LEAPS_LEFT_TO_GIVE_UP = 3
 
 
 def walk_until_settled(
@@ -79,8 +62,8 @@ def walk_until_settled(
     )
     active_walk_indices, start_states = np.arange(n_walks), section_states
     n_steps_before_leaps = (
-        LEAP_OPTIONS.n_warmup_steps,
-        *LEAP_OPTIONS.max_leaps * (LEAP_OPTIONS.steps_per_leap,),
+        N_WARMUP_STEPS,
+        *MAX_LEAPS * (N_STEPS_PER_LEAP,),
     )
     for leap_index, n_steps_before_leap in enumerate(n_steps_before_leaps):
         if not len(active_walk_indices):
@@ -117,21 +100,22 @@ def walk_until_settled(
         walk_ends.has_settled[active_walk_indices], leap_vectors, fade_distance = (
             _extrapolate_drift(last_states, n_continuous_entries)
         )
-        n_remaining_leaps = LEAP_OPTIONS.max_leaps - leap_index
+        n_remaining_leaps = MAX_LEAPS - leap_index
         is_walk_continued = ~walk_ends.has_settled[active_walk_indices] & (
-            (n_remaining_leaps > LEAP_OPTIONS.max_leaps_left_to_give_up)
-            | (
-                fade_distance
-                <= LEAP_OPTIONS.max_fade_distance_ratio
-                * LEAP_OPTIONS.max_leap_distance
-                * n_remaining_leaps
-            )
+            (n_remaining_leaps > MAX_LEAPS_LEFT_TO_GIVE_UP)
+            | (fade_distance <= MAX_FADE_DISTANCE_RATIO * MAX_LEAP_DISTANCE * n_remaining_leaps)
         )
         active_walk_indices = active_walk_indices[is_walk_continued]
         start_states = walk_ends.section_states[active_walk_indices]
         # Each walking step first places loaded feet on the slope, so a leap ends at a valid start.
         start_states[:, :n_continuous_entries] += leap_vectors[is_walk_continued]
     return walk_ends
+
+
+# Largest drift per walking step, and largest fade distance, in a settled walk.
+MAX_SETTLED_DRIFT = 5e-4
+# Drift per walking step below which errors of the steps dominate.
+DRIFT_NOISE_LEVEL = 1e-5
 
 
 def _extrapolate_drift(
@@ -158,20 +142,20 @@ def _extrapolate_drift(
         )
         n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
         fade_distance = np.where(
-            drift_per_step < LEAP_OPTIONS.drift_noise_level,
+            drift_per_step < DRIFT_NOISE_LEVEL,
             0.0,
             np.abs(n_steps_to_fade) * drift_per_step,
         )
         n_leap_steps = np.where(
             drift_per_step > 0.0,
-            np.minimum(n_steps_to_fade, LEAP_OPTIONS.max_leap_distance / drift_per_step),
+            np.minimum(n_steps_to_fade, MAX_LEAP_DISTANCE / drift_per_step),
             0.0,
         )
     # A drift that changes sign at each step leads to a gait of two steps.
     has_settled = (
         has_same_leg_codes
-        & (fade_distance < LEAP_OPTIONS.max_settled_drift)
-        & (drift_per_step < LEAP_OPTIONS.max_settled_drift)
+        & (fade_distance < MAX_SETTLED_DRIFT)
+        & (drift_per_step < MAX_SETTLED_DRIFT)
     )
     has_leap_vector = has_same_leg_codes & ~has_settled & (decay_rate > 0.0)
     return (

@@ -19,7 +19,12 @@ import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
-from vrw_jax.tolerance.contact_steps import STEP_TOLERANCES, ContactWheelBatch, replace_rows
+from vrw_jax.tolerance.contact_steps import (
+    TIGHT_TOLERANCE,
+    VERY_TIGHT_TOLERANCE,
+    ContactWheelBatch,
+    replace_rows,
+)
 from vrw_jax.tolerance.lower_fidelity import (
     LowerFidelityGaits,
     ModelIndex,
@@ -48,33 +53,9 @@ from vrw_jax.validation import (
 )
 from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 
-
-@dataclass(frozen=True)
-class MeasureRequestOptions:
-    """Options of the search for the model and the gait that yield measures to within a tolerance.
-
-    - `error_safety_factor`: ratio of the error bound to the error estimated from one walking step.
-      It is chosen because the bound holds if each Newton correction is at most 3/4 as long as the
-      previous correction;
-    - `min_tol_for_tight_steps`: smallest tolerance of a measure for which walking steps are
-      computed at `StepTolerances.tight_tolerance`. Below this value, they are computed at
-      `very_tight_tolerance`;
-    - `n_cold_starts`: number of starts of walks, slow starts first, for wheels for which the lower
-      model has no gait. It is chosen because walks from the first two starts reach a gait for 100
-      of 232 wheels. Walks from further starts reach a gait for no other wheel;
-    - `max_gait_distance_ratio`: largest accepted distance between the lower model's gait and the
-      gait with unilateral contact, in lengths of the first correction. It is chosen because the sum
-      of corrections that are halved each time is twice the first correction.
-    """
-
-    error_safety_factor: float = 4.0
-    min_tol_for_tight_steps: float = 1e-7
-    n_cold_starts: int = 2
-    max_gait_distance_ratio: float = 2.0
-
-
-REQUEST_OPTIONS = MeasureRequestOptions()
-"""Options of `vrw.measure_to_tolerance`."""
+# Smallest tolerance of a measure for which walking steps are computed at `TIGHT_TOLERANCE`. Below
+# this value, they are computed at `VERY_TIGHT_TOLERANCE`.
+MIN_TOL_FOR_TIGHT_STEPS = 1e-7
 
 
 @with_default_jax_settings
@@ -136,11 +117,7 @@ def measure_to_tolerance(
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
     params, friction_by_wheel, batch_shape = broadcast_params_and_friction(params, friction)
     gait_rank = None if which is None else parse_gait_choice(which)
-    solver_tolerance = (
-        STEP_TOLERANCES.tight_tolerance
-        if tol >= REQUEST_OPTIONS.min_tol_for_tight_steps
-        else STEP_TOLERANCES.very_tight_tolerance
-    )
+    solver_tolerance = TIGHT_TOLERANCE if tol >= MIN_TOL_FOR_TIGHT_STEPS else VERY_TIGHT_TOLERANCE
     step_options = StepOptions(rtol=solver_tolerance, atol=solver_tolerance)
     step_options.check_tolerances(np.dtype(float))
     wheel_batch = ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options)
@@ -194,6 +171,19 @@ def broadcast_params_and_friction(
     )
 
 
+# Ratio of the error bound to the error estimated from one walking step. It is chosen because the
+# bound holds if each Newton correction is at most 3/4 as long as the previous correction.
+REQUEST_SAFETY_FACTOR = 4.0
+# Number of starts of walks, slow starts first, for wheels for which the lower model has no gait. It
+# is chosen because walks from the first two starts reach a gait for 100 of 232 wheels. Walks from
+# further starts reach a gait for no other wheel.
+N_COLD_STARTS = 2
+# Largest accepted distance between the lower model's gait and the gait with unilateral contact, in
+# lengths of the first correction. It is chosen because the sum of corrections that are halved each
+# time is twice the first correction.
+MAX_GAIT_DISTANCE_RATIO = 2.0
+
+
 @dataclass
 class _MeasureRequest:
     """State of the computation of measures for a batch of wheels, with the results so far."""
@@ -239,8 +229,7 @@ class _MeasureRequest:
         """Compute rigid gaits of wheels with stiff legs, and store measures to within `tol`."""
         with np.errstate(all="ignore"):
             wheel_indices = np.flatnonzero(
-                REQUEST_OPTIONS.error_safety_factor * compute_static_leg_contraction(self.params)
-                <= self.tol
+                REQUEST_SAFETY_FACTOR * compute_static_leg_contraction(self.params) <= self.tol
             )
         if len(wheel_indices):
             rigid_gaits = find_rigid_gaits(select_wheels(self.params, wheel_indices))
@@ -270,7 +259,7 @@ class _MeasureRequest:
         )
         wheel_indices = wheel_indices[~has_lower_gait]
         walk_starts = compute_walk_starts(select_wheels(self.params, wheel_indices))
-        for walk_start in walk_starts[: REQUEST_OPTIONS.n_cold_starts]:
+        for walk_start in walk_starts[:N_COLD_STARTS]:
             is_gait_missing = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
             self._walk_and_record_gaits(
                 wheel_indices[is_gait_missing],
@@ -344,7 +333,7 @@ class _MeasureRequest:
             )
             error_bound = (
                 np.abs(model_error)
-                + (REQUEST_OPTIONS.error_safety_factor - 1.0) * total_measure_change
+                + (REQUEST_SAFETY_FACTOR - 1.0) * total_measure_change
                 + numerical_error
             )
             is_estimate_accepted = measure_estimates.has_same_leg_codes & np.all(
@@ -383,7 +372,7 @@ class _MeasureRequest:
         gait_distance = np.linalg.norm(
             state_differences[:, self.wheel_batch.list_paper_state_indices()], axis=1
         )
-        max_gait_distance = REQUEST_OPTIONS.max_gait_distance_ratio * np.linalg.norm(
+        max_gait_distance = MAX_GAIT_DISTANCE_RATIO * np.linalg.norm(
             measure_estimates.newton_correction[is_gait_refined], axis=1
         )
         self._record_gaits(

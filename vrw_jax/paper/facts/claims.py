@@ -17,7 +17,7 @@ from vrw_jax.paper.facts.base import (
     make_agreement_test,
     split_trajectory_by_phase,
 )
-from vrw_jax.paper.gaits import DEFAULT_SETTLING_OPTIONS
+from vrw_jax.paper.gaits import MAX_SETTLED_STATE_CHANGE
 from vrw_jax.wheel import Outcome
 
 
@@ -106,7 +106,7 @@ TYPICAL_GAIT_CLAIMS = PaperClaimGroup(
     PaperClaim("the gait is stable and of period 1", "§4, Fig. 6", "stable, period 1",
           "changes shrink by {shrink:.3f} a step, to {change:.0e}",
           lambda n: n.settled,
-          f"settled: below {DEFAULT_SETTLING_OPTIONS.max_state_change:g}, ten times a step's "
+          f"settled: below {MAX_SETTLED_STATE_CHANGE:g}, ten times a step's "
           "error"),
     PaperClaim("angle just after landing", INDEPENDENT_CODE_LABEL, "θ⁺ = −0.68267 rad",
           "{theta:.5f} rad", make_agreement_test(theta=(-0.68267, 5e-6))),
@@ -239,7 +239,7 @@ INDICATOR_CLAIMS = PaperClaimGroup("DLS indicators over c, slope 0.30 rad",
     PaperClaim("a period-1 gait exists at every whole c up to 219", "§5.2, Fig. 10",
           "1 … 219 (from 5 on with λ2⁺ ≥ 0)", "{n_settled} of {n} settled",
           lambda n: n.n_settled == n.n,
-          f"change per step below {DEFAULT_SETTLING_OPTIONS.max_state_change:g}"),
+          f"change per step below {MAX_SETTLED_STATE_CHANGE:g}"),
     PaperClaim("λ4⁺ falls monotonically with c", "§5.2, Fig. 10(b)", "monotone",
           "{rear[0]:.1f} … {rear[1]:.2f} N", lambda n: n.rear_falls, SIGN_TOLERANCE_REASON),
     PaperClaim("λ4⁺ is not positive at c = 220", "§5.2, Fig. 10(b)", "0 at 220",
