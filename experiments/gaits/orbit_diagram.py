@@ -143,8 +143,8 @@ def compute() -> pd.DataFrame:
     for damping in DAMPINGS:
         walk_ends = PeriodicWalkEnds(*(part[dampings == damping] for part in walk_result))
         failures = [vrw.Outcome(int(c)).name for c in walk_ends.outcome if c != vrw.Outcome.STEPPED]
-        orbits = find_distinct_orbits(walk_ends)
-        for index, orbit in enumerate(orbits.orbit_states):
+        orbit_indices, orbits = find_distinct_orbits(walk_ends)
+        for index, orbit in enumerate(orbits):
             measured_orbit = measure_orbit_steps(
                 vrw.WheelParams(damping=damping), orbit, model, options
             )
@@ -164,12 +164,12 @@ def compute() -> pd.DataFrame:
                         "lambda_4_plus": measured_orbit["lambda_4_plus"][k],
                         "clearance": min(measured_orbit[name][k] for name in MARGIN_NAMES[:2]),
                         "broken": " ".join(negative_margins),
-                        "share_of_starts": np.mean(orbits.orbit_indices == index),
+                        "share_of_starts": np.mean(orbit_indices == index),
                     }
                 )
         print(
             damping,
-            sorted({len(o) for o in orbits.orbit_states}),
+            sorted({len(o) for o in orbits}),
             {n: failures.count(n) for n in failures},
         )
     return pd.DataFrame(rows)

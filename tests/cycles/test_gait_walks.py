@@ -34,14 +34,14 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
 
 
 def test_a_walk_stops_after_the_round_in_which_it_settles(monkeypatch):
-    walk_ends = walk_by_linear_map(monkeypatch, 0.5)
+    _, section_states, period_defects = walk_by_linear_map(monkeypatch, 0.5)
     first_round = gait_walks.N_WALK_STEPS_BY_ROUND[0]
-    np.testing.assert_allclose(walk_ends.section_states[0], FIXED_POINT + 0.5**first_round * 0.01)
-    assert walk_ends.period_defects[0] < gait_walks.MAX_SETTLED_DEFECT
+    np.testing.assert_allclose(section_states[0], FIXED_POINT + 0.5**first_round * 0.01)
+    assert period_defects[0] < gait_walks.MAX_SETTLED_DEFECT
 
 
 def test_a_walk_that_ends_keeps_its_last_state_near_a_repelling_gait(monkeypatch):
     """The multiplier is 1.2. The state after the first round is usable, and the walk ends later."""
-    walk_ends = walk_by_linear_map(monkeypatch, 1.2, last_step=10)
-    np.testing.assert_allclose(walk_ends.section_states[0], FIXED_POINT + 1.2**8 * 0.01)
-    assert 0.0 < walk_ends.period_defects[0] < gait_walks.MAX_NEWTON_START_DEFECT
+    _, section_states, period_defects = walk_by_linear_map(monkeypatch, 1.2, last_step=10)
+    np.testing.assert_allclose(section_states[0], FIXED_POINT + 1.2**8 * 0.01)
+    assert 0.0 < period_defects[0] < gait_walks.MAX_NEWTON_START_DEFECT

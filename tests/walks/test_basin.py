@@ -81,9 +81,9 @@ def test_orbits_do_not_depend_on_their_first_step():
     orbit[1, :2] = orbit[0, :2] + 1e-6
     orbit[2, :1] = [[0.1, 1.2, 0.0]]
     settled = PeriodicWalkEnds(np.zeros(3, int), np.array([2, 2, 1]), np.zeros(3, int), orbit)
-    solution = find_distinct_orbits(settled)
-    assert solution.orbit_indices.tolist() == [0, 0, 1]
-    assert [len(o) for o in solution.orbit_states] == [2, 1]
+    orbit_indices, orbit_states = find_distinct_orbits(settled)
+    assert orbit_indices.tolist() == [0, 0, 1]
+    assert [len(o) for o in orbit_states] == [2, 1]
 
 
 def test_an_incomplete_grid_is_refused_with_the_missing_names():

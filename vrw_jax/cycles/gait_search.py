@@ -430,11 +430,11 @@ def _find_walk_end_states(
     for start_state_function in (compute_walk_starts, compute_fallback_walk_starts):
         if not len(unsettled_wheel_indices):
             break
-        walk_ends = walk_to_gaits(
+        wheel_indices, *walk_ends = walk_to_gaits(
             gait_finder, parameter_values[unsettled_wheel_indices], start_state_function
         )
         for wheel_index, walk_end_state, period_defect in zip(
-            unsettled_wheel_indices[walk_ends.wheel_indices], *walk_ends[1:], strict=True
+            unsettled_wheel_indices[wheel_indices], *walk_ends, strict=True
         ):
             if period_defect < smallest_period_defects[wheel_index]:
                 smallest_period_defects[wheel_index] = period_defect

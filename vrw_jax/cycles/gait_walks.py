@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -116,17 +116,6 @@ def scale_section_states(
     return (section_states / section_units)[..., :n_coordinates]
 
 
-class DistinctWalkEnds(NamedTuple):
-    """Distinct end states of walks, sorted by wheel.
-
-    The result contains at least one end state for each wheel.
-    """
-
-    wheel_indices: np.ndarray  # (ends,)
-    section_states: np.ndarray  # (ends, section)
-    period_defects: np.ndarray  # (ends,), in units of the wheel; see `measure_period_defects`
-
-
 # Number of gait steps in each round. After a round, settled walks stop, and walks to the same gait
 # are merged.
 N_WALK_STEPS_BY_ROUND = (8, 12, 30, 50, 100)
@@ -142,12 +131,14 @@ def walk_to_gaits(
     gait_finder: Any,
     parameter_values: np.ndarray,
     start_state_function: Callable[[WheelParams], np.ndarray],
-) -> DistinctWalkEnds:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Simulate walks of each wheel, and return the distinct states at their ends.
 
-    If several walks reach the same state, only the walk with the smallest period defect is
-    returned. For a walk that fails, the returned state is that of its last round, which may be near
-    a repelling gait. If no walk of a wheel nearly repeats, the end of its first walk is returned.
+    The result contains the index of the wheel, the section state and the period defect (see
+    `measure_period_defects`) of each end, sorted by wheel, with at least one end per wheel. If
+    several walks reach the same state, only the walk with the smallest period defect is returned.
+    For a walk that fails, the returned state is that of its last round, which may be near a
+    repelling gait. If no walk of a wheel nearly repeats, the end of its first walk is returned.
 
     Args:
         gait_finder: finder of gaits, whose model computes the gait steps.
@@ -207,7 +198,7 @@ def walk_to_gaits(
     selected_walk_indices = selected_walk_indices[
         np.argsort(walk_wheel_indices[selected_walk_indices], kind="stable")
     ]
-    return DistinctWalkEnds(
+    return (
         walk_wheel_indices[selected_walk_indices],
         section_states[selected_walk_indices],
         period_defects[selected_walk_indices],

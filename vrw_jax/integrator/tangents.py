@@ -199,16 +199,6 @@ def stack_directions(directions: Vector) -> Array:
     return jnp.stack(jnp.broadcast_arrays(*directions), 1)
 
 
-class StageJacobians(NamedTuple):
-    """Derivatives of the accelerations at the stages of a Runge-Kutta step."""
-
-    # (stages, coordinates, components, batch): with respect to positions, rates, then held
-    # constants
-    state_jacobians: Array
-    # tangents due to the constants, (stages, directions, coordinates, batch)
-    phase_constants_tangents: Array
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def _compute_stage_jacobians(
     make_phase: MakeBatchPhase,
@@ -216,8 +206,13 @@ def _compute_stage_jacobians(
     phase_constants_directions: Any,
     held_constants: Vector,
     stage_states: list[StageState],
-) -> StageJacobians:
-    """Return derivatives of the accelerations at all stages of a solver step except the last."""
+) -> tuple[Array, Array]:
+    """Return derivatives of the accelerations at all stages of a solver step except the last.
+
+    The first array contains the Jacobians with respect to positions, rates and held constants,
+    shape (stages, coordinates, components, batch). The second array contains the tangents due to
+    the constants of the phase, shape (stages, directions, coordinates, batch).
+    """
 
     def linearize_stage(packed_state: Array) -> tuple[Array, Array]:
         # inverse of `_pack_stage_state`
@@ -269,10 +264,8 @@ def _compute_stage_jacobians(
             differentiate_by_phase_constants, phase_constants_directions, is_unrolled=True
         )
 
-    return StageJacobians(
-        *lax.map(
-            linearize_stage, jnp.stack([_pack_stage_state(state) for state in stage_states[:-1]])
-        )
+    return lax.map(
+        linearize_stage, jnp.stack([_pack_stage_state(state) for state in stage_states[:-1]])
     )
 
 
@@ -305,13 +298,17 @@ def _solve_acceleration(
 
 @functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all its calls.
 def _propagate_tangents(
-    tableau: ButcherTableau, stage_jacobians: StageJacobians, start_tangents: Array, h: Array
+    tableau: ButcherTableau,
+    state_jacobians: Array,
+    phase_constants_tangents: Array,
+    start_tangents: Array,
+    h: Array,
 ) -> Array:
     """Return the tangents at the end of a solver step, given the tangents at its start.
 
     The tangents are those of positions, rates and held constants. `h` is the length of the step, s.
     """
-    state_jacobian, n = stage_jacobians.state_jacobians, stage_jacobians.state_jacobians.shape[1]
+    n = state_jacobians.shape[1]
 
     def propagate_tangent_direction(tangent_direction: tuple[Array, Array]) -> Array:
         phase_constants_tangent, start_tangent = tangent_direction
@@ -325,7 +322,7 @@ def _propagate_tangents(
             acceleration_tangents = [
                 functools.reduce(
                     lax.add,
-                    map(lax.mul, state_jacobian[i, coordinate_index], state_tangents),
+                    map(lax.mul, state_jacobians[i, coordinate_index], state_tangents),
                     phase_constants_tangent[i, coordinate_index],
                 )
                 for coordinate_index in range(n)
@@ -338,7 +335,7 @@ def _propagate_tangents(
 
     return _map_directions(
         propagate_tangent_direction,
-        (jnp.moveaxis(stage_jacobians.phase_constants_tangents, 1, 0), start_tangents),
+        (jnp.moveaxis(phase_constants_tangents, 1, 0), start_tangents),
     )
 
 
@@ -413,7 +410,7 @@ class PhaseTangents(NamedTuple):
             self.held_constants,
             stage_states,
         )
-        return _propagate_tangents(tableau, stage_jacobians, start_tangents, h)
+        return _propagate_tangents(tableau, *stage_jacobians, start_tangents, h)
 
     def propagate_if_accepted(
         self,

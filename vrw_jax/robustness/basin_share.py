@@ -1,7 +1,7 @@
 """Share of the start states in a box from which a wheel reaches its gait."""
 
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import numpy as np
@@ -135,12 +135,8 @@ def basin_share(
     return compute_basin_share(stable_gait, box_bounds, n_starts, max_steps, sampling, seed)
 
 
-class StartBoxBounds(NamedTuple):
-    """Names and bounds of the components of start states, in rad, rad/s and m/s."""
-
-    start_component_names: tuple[str, ...]
-    lower_bounds: np.ndarray
-    upper_bounds: np.ndarray
+StartBoxBounds = tuple[tuple[str, ...], np.ndarray, np.ndarray]
+"""Names, lower bounds and upper bounds of the components of start states, rad, rad/s and m/s."""
 
 
 def compute_basin_share(
@@ -152,7 +148,8 @@ def compute_basin_share(
     seed: int = 0,
 ) -> BasinShare:
     """Return the `BasinShare` for a stable gait and for valid arguments of `basin_share`."""
-    n_start_components = len(box_bounds.start_component_names)
+    start_component_names, lower_bounds, upper_bounds = box_bounds
+    n_start_components = len(start_component_names)
     random_generator = np.random.default_rng(seed)
     if sampling_name == "random":
         unit_cube_points = random_generator.random((n_starts, n_start_components))
@@ -161,12 +158,9 @@ def compute_basin_share(
 
         sobol_sampler = qmc.Sobol(n_start_components, rng=random_generator)
         unit_cube_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
-    starts = (
-        box_bounds.lower_bounds
-        + (box_bounds.upper_bounds - box_bounds.lower_bounds) * unit_cube_points
-    )
+    starts = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
     start_states = compute_section_states_of_starts(
-        stable_gait.params, box_bounds.start_component_names, starts
+        stable_gait.params, start_component_names, starts
     )
     is_on_gait, walk_outcomes, n_steps_walked = walk_until_on_gait(
         stable_gait, start_states, max_steps
@@ -216,4 +210,4 @@ def parse_start_box(box: StartBox) -> StartBoxBounds:
         for component_name in start_component_names
     ]
     lower_bounds, upper_bounds = np.array(bounds_of_start_component).T
-    return StartBoxBounds(start_component_names, lower_bounds, upper_bounds)
+    return start_component_names, lower_bounds, upper_bounds

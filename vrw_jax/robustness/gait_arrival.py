@@ -102,14 +102,6 @@ class StableGait(NamedTuple):
         return np.abs(scaled_differences).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
 
 
-class ArrivalWalkResult(NamedTuple):
-    """Results of walks toward a gait. The first axis of each array is that of the starts."""
-
-    is_on_gait: np.ndarray
-    walk_outcomes: np.ndarray  # `Outcome` of each walk, STEPPED if the walk continues
-    n_steps_walked: np.ndarray  # to the arrival at the gait, the failure or the limit
-
-
 # Number of gait steps between two tests, chosen because more frequent tests need many calls.
 N_STEPS_PER_ARRIVAL_TEST = 10
 
@@ -118,17 +110,18 @@ def walk_until_on_gait(
     stable_gait: StableGait,
     start_states: np.ndarray,
     max_steps: int,
-) -> ArrivalWalkResult:
-    """Return the results of walks of at most `max_steps` gait steps from `start_states`.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Walk at most `max_steps` gait steps from `start_states`, until the walks are on the gait.
+
+    Return whether each walk arrives, its `Outcome` (STEPPED if it continues), and its number of
+    gait steps up to arrival, failure or `max_steps`.
 
     - `start_states`: section states before the first landing, shape (starts, components).
     """
     n_starts = len(start_states)
-    result = ArrivalWalkResult(
-        np.zeros(n_starts, bool),
-        np.full(n_starts, int(Outcome.STEPPED)),
-        np.zeros(n_starts, int),
-    )
+    has_arrived = np.zeros(n_starts, bool)
+    walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
+    n_steps_walked = np.zeros(n_starts, int)
     embed_section_states: Any = jax.vmap(
         functools.partial(stable_gait.model.complete_section_state, stable_gait.params)
     )
@@ -146,10 +139,10 @@ def walk_until_on_gait(
         )
         has_stepped = walk_results.outcome == Outcome.STEPPED
         is_on_gait = has_stepped & stable_gait.is_on_gait(walk_results.section_state)
-        result.is_on_gait[walking_indices] = is_on_gait
-        result.walk_outcomes[walking_indices] = walk_results.outcome
-        result.n_steps_walked[walking_indices] += walk_results.n_stepped
+        has_arrived[walking_indices] = is_on_gait
+        walk_outcomes[walking_indices] = walk_results.outcome
+        n_steps_walked[walking_indices] += walk_results.n_stepped
         is_walking = has_stepped & ~is_on_gait
         walking_indices = walking_indices[is_walking]
         section_states = walk_results.section_state[is_walking]
-    return result
+    return has_arrived, walk_outcomes, n_steps_walked

@@ -365,9 +365,10 @@ def _walk_after_disturbance(
     leaves_basin = np.ones(len(phase_indices), bool)
     has_stepped = np.flatnonzero(walk_outcomes == Outcome.STEPPED)
     if len(has_stepped):
-        arrival = walk_until_on_gait(stable_gait, section_states[has_stepped], gait.max_steps)
-        walk_outcomes[has_stepped] = arrival.walk_outcomes
-        leaves_basin[has_stepped] = ~arrival.is_on_gait
+        has_arrived, walk_outcomes[has_stepped], _ = walk_until_on_gait(
+            stable_gait, section_states[has_stepped], gait.max_steps
+        )
+        leaves_basin[has_stepped] = ~has_arrived
     shape = disturbance_sizes.shape
     return leaves_basin.reshape(shape), walk_outcomes.reshape(shape)
 

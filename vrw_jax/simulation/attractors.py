@@ -174,25 +174,17 @@ def _detect_walk_periods(state_history: np.ndarray, max_period: int) -> np.ndarr
     return detected_periods
 
 
-class DistinctOrbits(NamedTuple):
-    """Distinct orbits that walks from many starts reach.
-
-    The orbits are sorted by the number of starts whose walks reach them, largest first.
-    """
-
-    orbit_indices: np.ndarray  # index of the orbit of each start; -1 without an orbit
-    orbit_states: list[np.ndarray]  # section states of each orbit, (period, m)
-
-
 # Largest distance between section states of two orbits that are treated as the same orbit. The
 # value is chosen because it is far above the periodicity tolerance.
 SAME_ORBIT_DISTANCE = 1e-4
 
 
-def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> DistinctOrbits:
-    """Return the distinct orbits that the walks reach.
+def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the index of the orbit that each walk reaches, and the states of the distinct orbits.
 
-    Two orbits are compared state by state, beginning with the state that has the lowest dtheta-.
+    The index is -1 without an orbit. The states have the shape (period, components). The orbit that
+    the most walks reach is the first. Two orbits are compared state by state, beginning with the
+    state that has the lowest dtheta-.
     """
     orbit_indices = np.full(len(walk_ends.period), -1)
     distinct_orbits: list[np.ndarray] = []
@@ -212,9 +204,7 @@ def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> DistinctOrbits:
     orbit_sort_order = np.argsort(n_starts_by_orbit)[::-1]
     rank_by_orbit = np.full(len(distinct_orbits) + 1, -1)
     rank_by_orbit[orbit_sort_order] = np.arange(len(distinct_orbits))
-    return DistinctOrbits(
-        rank_by_orbit[orbit_indices], [distinct_orbits[j] for j in orbit_sort_order]
-    )
+    return rank_by_orbit[orbit_indices], [distinct_orbits[j] for j in orbit_sort_order]
 
 
 @eqx.filter_jit

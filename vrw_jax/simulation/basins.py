@@ -124,14 +124,14 @@ def basin(
     start_embedder = functools.partial(model.complete_section_state, params)
     start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
-    distinct_orbits = find_distinct_orbits(walk_ends)
+    orbit_indices, orbit_states = find_distinct_orbits(walk_ends)
 
     make_walk_variable = lambda values, attributes: xr.Variable(
         axis_names, values.reshape(grid_shape), attributes
     )
     walk_variables = {
         "attractor": make_walk_variable(
-            distinct_orbits.orbit_indices,
+            orbit_indices,
             {"long_name": "orbit that the walk settles on", "flag_none": -1},
         ),
         "outcome": make_walk_variable(walk_ends.outcome, make_measure_attributes("outcome")),
@@ -146,9 +146,7 @@ def basin(
         )
         for component_name, values in start_component_values.items()
     }
-    orbit_variables = _make_orbit_variables(
-        params, distinct_orbits.orbit_states, max_period, model, options
-    )
+    orbit_variables = _make_orbit_variables(params, orbit_states, max_period, model, options)
     basin_attributes = {
         "title": "Basins of attraction",
         "most_steps": max_steps,
