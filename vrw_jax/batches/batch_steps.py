@@ -237,7 +237,6 @@ def _step_batch_without_contact(
     n_legs: int,
     derivative_names: Sequence[str],
 ) -> StepBatchResult:
-    """Return the result of `step_batch` for a model without unilateral contact."""
     n_wheels = len(section_states)
     element_slopes = values_by_parameter[SLOPE_INPUT_INDEX]
     ground_slopes: Any = [element_slopes]

@@ -434,10 +434,6 @@ def _make_labeled_gait_branch(
     step_options: StepOptions,
     start_outcome: int,
 ) -> Branch:
-    """Build the labeled branch of one wheel.
-
-    `start_outcome` is the outcome of the start of the branch.
-    """
     start_provenance = collect_provenance_attributes(params, model, step_options)
     start_provenance.pop(f"parameter_{parameter_name}", None)
     branch_attrs = {"title": f"Branch of limit cycles along {parameter_name}"} | start_provenance

@@ -369,7 +369,6 @@ class CurveTracer(NamedTuple):
 
     @staticmethod
     def _transfer_seed(curve_seed: CurveSeed, collocation_system: CollocationSystem) -> CurveSeed:
-        """Transfer a seed to the mesh of `collocation_system`."""
         if curve_seed.collocation_system == collocation_system:
             return curve_seed
         return curve_seed._replace(
@@ -571,7 +570,6 @@ class CurveTracer(NamedTuple):
     def _make_labeled_curve(
         self, curve_seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
     ) -> SpecialPointCurve:
-        """Build a labeled curve from the data of its continuation."""
         spectral_radius = np.abs(
             np.linalg.eigvals(np.asarray(branch_data.points.return_map_jacobian))
         ).max(-1)

@@ -403,7 +403,6 @@ def _compute_point_velocities(
     distances_from_hub: Array,
     distance_rates: Array,
 ) -> PlaneVelocities:
-    """Return the velocities of points on the legs, at given distances from the hub."""
     sin, cos = leg_directions
     transverse_velocity = distances_from_hub * motion.dtheta
     return PlaneVelocities(

@@ -760,7 +760,6 @@ def search_all_attempts(
 def _can_attempt_change_result(
     attempt_index: Int[Array, ""], search_result: CycleSearchResult
 ) -> Bool[Array, " lanes"]:
-    """Return for each wheel (lane) whether an attempt can still change its search result."""
     failed_check = search_result.collocation_state.failed_check
     is_lane_decided = (failed_check > 0.0) | (failed_check == HomotopyFailure.BOTH_TRIES_FAILED)
     return (search_result.collocation_state.has_cycle < 0.5) & (

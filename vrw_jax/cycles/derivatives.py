@@ -156,7 +156,6 @@ def _compute_monodromy_tangents(
 
 
 def _zero_without_cycle(collocation_state: CollocationState, tree_over_lanes: Any) -> Any:
-    """Return `tree_over_lanes` with zeros for the wheels (lanes) without a cycle."""
     return jax.tree.map(
         lambda x: jnp.where(collocation_state.has_cycle > 0.5, x, 0.0), tree_over_lanes
     )

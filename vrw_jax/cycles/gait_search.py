@@ -253,7 +253,6 @@ def parse_gait_choice(which: GaitChoice) -> int:
 
 
 def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitChoice) -> Any:
-    """Find for each wheel the attracting gait that `gait_choice` selects."""
     n_wheels = len(params.damping)
     gait_rank = parse_gait_choice(gait_choice)
     gait_wheel_indices, attracting_gaits = find_attracting_gaits(
@@ -369,7 +368,6 @@ def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) 
 def _search_without_fallbacks(
     gait_finder: AbstractGaitFinder, params: WheelParams, cycle_guess: Any
 ) -> Any:
-    """Find the cycle of one wheel or of each wheel in a batch, without fallbacks."""
     if not params.damping.ndim:
         return gait_finder.find_cycle(params, cycle_guess)
     if cycle_guess is not None or has_traced_leaf(params):
@@ -388,7 +386,6 @@ def _take_wheels_on_device(tree_over_wheels: Any, wheel_indices: Any) -> Any:
 def _replace_wheels(
     tree_over_wheels: Any, wheel_indices: np.ndarray, tree_of_new_wheels: Any
 ) -> Any:
-    """Return a tree of arrays in which `tree_of_new_wheels` replaces the selected wheels."""
 
     def replace_wheel_rows(array_over_wheels: Any, array_of_new_wheels: Any) -> np.ndarray:
         array_over_wheels = np.array(array_over_wheels)

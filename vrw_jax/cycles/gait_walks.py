@@ -233,7 +233,6 @@ def _simulate_wheel_walks(
     section_states: np.ndarray,
     n_steps: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the section state after `n_steps` gait steps for each wheel, and the outcomes."""
     model, params = _split_parameter_values(gait_finder, parameter_values)
     step_options = StepOptions(
         solver="Tsit5",

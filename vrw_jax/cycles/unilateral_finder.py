@@ -502,7 +502,6 @@ def _make_contact_cycle(
     fixed_point: FixedPointResult,
     period_evaluation: PeriodEvaluation,
 ) -> ReturnMapCycle:
-    """Build the cycle that belongs to a fixed point."""
     wheel_model, params = model.from_parameter_values(parameter_values, n_legs)
     return make_return_map_cycle(
         params, wheel_model, fixed_point, period_evaluation.gait_steps_of_period

@@ -279,7 +279,6 @@ def _pack_stage_state(state: StageState) -> Array:
 
 
 def _make_unit_vectors(template_state: Vector) -> list[Vector]:
-    """Return the unit vectors for the coordinates of `template_state`, as tuples of arrays."""
     n = len(template_state)
     return [
         tuple(jnp.full_like(template_state[j], float(i == j)) for j in range(n)) for i in range(n)

@@ -88,7 +88,6 @@ class AbstractWheel(eqx.Module):
         )
 
     def _list_parameter_values(self, params: WheelParams) -> list[Any]:
-        """Return the value of each parameter in `parameter_names`."""
         return [
             getattr(self if parameter_name == FRICTION_NAME else params, parameter_name)
             for parameter_name in self.parameter_names

@@ -192,7 +192,6 @@ class MeasureResult(AbstractPrintable):
         ]
 
     def _format_measure_value(self, measure_index: int) -> str:
-        """Return a text with one measure, its unit and its errors."""
         measure_definition = MEASURES[self.names[measure_index]]
         if not self.found:
             return f"no {measure_definition.name}"

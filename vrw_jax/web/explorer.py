@@ -206,7 +206,6 @@ def _make_widget_class() -> type:
 def _make_page_values(
     params: WheelParams, friction: float, model_name: str
 ) -> dict[str, float | str]:
-    """Return the input values of the page, by name: parameters, friction and model."""
     parameter_values = {
         parameter_name: float(getattr(params, parameter_name))
         for parameter_name in PARAMETER_DOMAINS

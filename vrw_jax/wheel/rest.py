@@ -68,7 +68,6 @@ def _are_quantities_small(
     quantity_units: Iterable[Elementwise],
     max_value_in_units: Elementwise,
 ) -> Bool[Array, "..."]:
-    """Return whether the absolute value of every quantity is at most `max_value_in_units` units."""
     is_quantity_small = [
         jnp.abs(x) <= max_value_in_units * quantity_unit
         for x, quantity_unit in zip(quantities, quantity_units, strict=True)

@@ -22,7 +22,6 @@ from vrw_jax.wheel import Outcome
 
 
 def _compute_typical_gait_values(paper_evidence: PaperEvidence) -> ClaimValues:
-    """Compute the values that the claims on the gait of Table 1 of the paper need, by name."""
     first_step_trajectory = paper_evidence.first_step_trajectory
     phase_trajectories = double_support, single_support_1, single_support_2 = (
         split_trajectory_by_phase(first_step_trajectory)
