@@ -556,6 +556,47 @@ def test_section_newton_returns_a_start_from_which_it_does_not_converge():
     assert float(slope[0]) == 0.0
 
 
+@pytest.mark.parametrize("u", [1e-13, 1.0, 1e6])
+def test_section_newton_is_accurate_in_all_units(u):
+    """x/u = cos(x/u) is solved by Dottie's number, from a start 35 % off it."""
+    cycle = vrw.solve_fixed_point(lambda x: u * jnp.cos(x / u), jnp.array([u]))
+    assert cycle.converged
+    np.testing.assert_allclose(cycle.x / u, 0.7390851332151607, rtol=1e-15)
+    far = vrw.solve_fixed_point(lambda x: u * jnp.cos(x / u), jnp.zeros(1), max_iterations=2)
+    assert not far.converged
+
+
+def test_section_newton_measures_each_component_in_its_own_unit():
+    units = jnp.array([1e-13, 1e6])
+    step = lambda x: units * jnp.stack([jnp.cos(x[1] / 1e6), 0.5 * jnp.sin(x[0] / 1e-13)])
+    cycle = vrw.solve_fixed_point(step, 0.5 * units)
+    assert cycle.converged
+    np.testing.assert_allclose(step(cycle.x), cycle.x, rtol=1e-15)
+
+
+def test_section_newton_accepts_a_component_that_is_only_round_off():
+    step = lambda x: jnp.stack(
+        [jnp.cos(x[0]), 0.5 * x[1] + jnp.cos(x[0]) ** 2 + jnp.sin(x[0]) ** 2 - 1.0]
+    )
+    cycle = vrw.solve_fixed_point(step, jnp.array([0.7, 1e-17]))
+    assert cycle.converged
+    assert abs(cycle.x[1]) < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("function", "start"),
+    [
+        (lambda x: jnp.stack([x[0], 0.5 * x[1]]), [0.7, 0.0]),  # x[0] is conserved
+        (lambda x: jnp.stack([x[0], 0.5 * x[1]]), [0.7, 0.1]),
+        (lambda x: x + x**2, [0.0]),  # a fold
+    ],
+)
+def test_section_newton_names_a_multiplier_of_1(function, start):
+    cycle = vrw.solve_fixed_point(function, jnp.array(start))
+    assert "multiplier is 1, which a conserved quantity or a fold causes" in cycle.ending
+    assert "start nearer" not in cycle.ending
+
+
 @pytest.mark.slow
 def test_section_newton_agrees_with_the_collocation():
     params = vrw.WheelParams()

@@ -555,6 +555,12 @@ def register_wrong_calls() -> None:
         "period_n",
     )
     add_wrong_call(
+        "solve_fixed_point in negative units",
+        lambda: vrw.solve_fixed_point(lambda x: x, start, units=-1.0),
+        "ValueError",
+        "units are",
+    )
+    add_wrong_call(
         "solve_fixed_point from text",
         lambda: vrw.solve_fixed_point(lambda x: x, "abc"),
         "TypeError",

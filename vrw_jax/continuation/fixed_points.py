@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.continuation.floquet import MULTIPLIER_TOLERANCES
 from vrw_jax.hybrid import ReturnMap, Termination, get_compiled_program
 from vrw_jax.numerics import (
     Scalar,
@@ -29,6 +30,19 @@ from vrw_jax.validation import (
     check_positive,
     check_reals,
 )
+
+UNIT_MULTIPLIER_ADVICE = (
+    "A multiplier is 1, which a conserved quantity or a fold causes: take the conserved quantity "
+    "out of the state, or move the parameter away from the fold."
+)
+"""Advice for a state at which the equations of the fixed point are singular."""
+
+
+def has_unit_multiplier(jacobian: Float[np.ndarray, "... n n"]) -> Bool[np.ndarray, "..."]:
+    """Return whether a multiplier is 1, up to the round-off of two equal multipliers."""
+    multipliers = np.linalg.eigvals(np.where(np.isfinite(jacobian), jacobian, 0.0))
+    is_unit_multiplier = np.abs(multipliers - 1.0) < MULTIPLIER_TOLERANCES.unit_circle_distance
+    return np.asarray(is_unit_multiplier.any(-1))
 
 
 class FixedPointResult(NamedTuple):
@@ -59,18 +73,23 @@ class FixedPointResult(NamedTuple):
     def ending(self) -> Any:
         """Return a sentence that describes whether Newton's method converged.
 
-        For a batch the result is an array of such sentences.
+        A second sentence gives the reason if a multiplier is 1. For a batch the result is an array
+        of such texts.
         """
 
-        def describe_convergence(converged: bool, n_iterations: int) -> str:
-            if converged:
-                return f"Newton's method converged after {n_iterations} iterations."
-            return (
-                f"Newton's method did not converge after {n_iterations} iterations: start nearer "
-                "to the fixed point."
-            )
+        def describe_convergence(converged: bool, n_iterations: int, is_singular: bool) -> str:
+            converged_text = "converged" if converged else "did not converge"
+            convergence = f"Newton's method {converged_text} after {n_iterations} iterations"
+            if is_singular:
+                return f"{convergence}. {UNIT_MULTIPLIER_ADVICE}"
+            return convergence + ("." if converged else ": start nearer to the fixed point.")
 
-        return format_each_batch_element(describe_convergence, self.converged, self.n_iterations)
+        return format_each_batch_element(
+            describe_convergence,
+            self.converged,
+            self.n_iterations,
+            has_unit_multiplier(np.asarray(self.jacobian)),
+        )
 
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
@@ -101,6 +120,7 @@ def solve_fixed_point(
     *,
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
+    units: Any = None,
     max_iterations: int = MAX_NEWTON_ITERATIONS,
 ) -> FixedPointResult:
     """Find a fixed point of `function` applied `period_n` times, by Newton's method.
@@ -116,7 +136,9 @@ def solve_fixed_point(
             ends early.
         start: initial guess of Newton's method, shape (n,).
         period_n: number of times that the map is applied.
-        tolerance: largest norm of Newton's last correction, in units of `start`.
+        tolerance: largest component of Newton's last correction, in `units`.
+        units: units of the components of `start`, a number or shape (n,). By default, the unit of a
+            component is its size at the start or at the fixed point, whichever is larger.
         max_iterations: largest number of Newton iterations.
 
     Returns:
@@ -132,7 +154,7 @@ def solve_fixed_point(
     """
 
     fixed_point = _solve_checked_fixed_point(
-        _run_newton_loop, function, start, period_n, tolerance, max_iterations
+        _run_newton_loop, function, start, period_n, tolerance, units, max_iterations
     )
     if isinstance(function, ReturnMap):
         fixed_point = fixed_point._replace(
@@ -147,6 +169,7 @@ def solve_fixed_point_implicit(
     *,
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
+    units: Any = None,
 ) -> FixedPointResult:
     """Find a fixed point of a map whose second derivatives are expensive.
 
@@ -154,8 +177,37 @@ def solve_fixed_point_implicit(
     require only derivatives of order n of `function`. Derivatives of the Jacobian are NaN.
     """
     return _solve_checked_fixed_point(
-        _run_newton_implicit, function, start, period_n, tolerance, MAX_NEWTON_ITERATIONS
+        _run_newton_implicit, function, start, period_n, tolerance, units, MAX_NEWTON_ITERATIONS
     )
+
+
+def check_vector_map(function: Callable, state_name: str, state: Array) -> None:
+    """Raise an error unless the map maps the state, a vector, to a vector of the same shape."""
+    if state.ndim != 1 or not state.size:
+        raise ValueError(
+            f"{state_name} has shape {state.shape}, but it is a vector: give an array of shape "
+            "(n,)."
+        )
+    map_output = jax.eval_shape(function, state)
+    if getattr(map_output, "shape", None) != state.shape:
+        map_output_description = getattr(map_output, "shape", type(map_output).__name__)
+        raise ValueError(
+            f"the map gives {map_output_description} for a {state_name} of shape {state.shape}, "
+            "but it must give an array of that shape: take a map of a state to the next state."
+        )
+
+
+def check_state_units(units: Any, state: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return one positive unit for each component of a state, or raise an error."""
+    units = check_reals("units", units)
+    if units.shape not in ((), state.shape) or (
+        not isinstance(units, jax.core.Tracer) and not np.all((units > 0.0) & np.isfinite(units))
+    ):
+        raise ValueError(
+            f"units are {units}, but each component of the state has one positive unit: give a "
+            f"number above 0, or an array of shape {state.shape}."
+        )
+    return jnp.broadcast_to(lax.stop_gradient(units).astype(state.dtype), state.shape)
 
 
 def _solve_checked_fixed_point(
@@ -164,42 +216,35 @@ def _solve_checked_fixed_point(
     start: Any,
     period_n: int,
     tolerance: float | Scalar,
+    units: Any,
     max_iterations: int,
 ) -> FixedPointResult:
     """Check the arguments, and find the fixed point by `newton_method`."""
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     max_iterations = check_int("max_iterations", max_iterations)
-    if start.ndim != 1 or not start.size:
-        raise ValueError(
-            f"start has shape {start.shape}, but it is a vector: give an array of shape (n,)."
-        )
+    start = lax.stop_gradient(start)
+    check_vector_map(function, "start", start)
     if isinstance(tolerance, jax.Array):
         tolerance = check_reals("tolerance", tolerance)
     else:
         check_positive("tolerance", tolerance)
 
-    start = lax.stop_gradient(start)
-    map_output = jax.eval_shape(function, start)
-    if getattr(map_output, "shape", None) != start.shape:
-        map_output_description = getattr(map_output, "shape", type(map_output).__name__)
-        raise ValueError(
-            f"the map gives {map_output_description} for a start of shape {start.shape}, but it "
-            "must give an array of that shape: take a map of a state to the next state."
-        )
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
+    # A unit of 0 is replaced by the size of the component.
+    units = jnp.zeros_like(start) if units is None else check_state_units(units, start)
     newton_configuration = (newton_method, function, period_n, max_iterations)
     find_fixed_point = functools.partial(_find_fixed_point_of_iterate, newton_configuration)
     compiled_program = None
     if isinstance(function, ReturnMap):
         compiled_program = get_compiled_program(
-            _find_fixed_point_of_iterate, newton_configuration, start, tolerance
+            _find_fixed_point_of_iterate, newton_configuration, start, tolerance, units
         )
-    return (compiled_program or find_fixed_point)(start, tolerance)
+    return (compiled_program or find_fixed_point)(start, tolerance, units)
 
 
 def _find_fixed_point_of_iterate(
-    newton_configuration: tuple, start: Array, tolerance: Array
+    newton_configuration: tuple, start: Array, tolerance: Array, units: Array
 ) -> FixedPointResult:
     newton_method, function, period_n, max_iterations = newton_configuration
 
@@ -210,7 +255,7 @@ def _find_fixed_point_of_iterate(
 
     closure_converted_map, closed_over_values = jax.closure_convert(apply_map_repeatedly, start)
     return newton_method(
-        closure_converted_map, max_iterations, start, tolerance, *closed_over_values
+        closure_converted_map, max_iterations, start, tolerance, units, *closed_over_values
     )
 
 
@@ -237,12 +282,19 @@ provides only first derivatives of the fixed point.
 """
 
 
+MAX_STALLED_ITERATIONS = 3
+"""Number of iterations in which the correction does not halve, after which it is compared with the
+largest component. The value is chosen because far from a solution few corrections grow in turn.
+"""
+
+
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _run_newton_loop(
     closure_converted_map: ClosureConvertedMap,
     max_iterations: int,
     start: Array,
     tolerance: Array,
+    units: Array,
     *closed_over_values: Any,
 ) -> FixedPointResult:
     """Find the fixed point by Newton's method in a single loop.
@@ -264,22 +316,36 @@ def _run_newton_loop(
         )
 
     def iterate_newton(loop_state: tuple) -> tuple:
-        x, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
-        is_searching_iteration = is_newton_searching(correction_norm, n_iterations).astype(
+        x, last_norm, n_iterations, n_derivative_iterations, n_stalled, *_ = loop_state
+        is_searching_iteration = is_newton_searching(last_norm, n_iterations).astype(
             n_iterations.dtype
         )
         newton_correction, jacobian, residual = _compute_newton_correction(
             closure_converted_map, x, closed_over_values
         )
+        # The sum of the terms of a component is no more accurate than its largest term.
+        component_sizes = jnp.max(
+            jnp.abs(jnp.stack([start, x, x + newton_correction, jnp.abs(jacobian) @ jnp.abs(x)])), 0
+        )
+        component_units = jnp.where(units > 0.0, units, component_sizes)
+        component_units = jnp.where(component_units > 0.0, component_units, 1.0)
         # The correction is also checked in the last iterations, because the map may jump near the
         # point.
-        correction_norm = jnp.max(jnp.abs(newton_correction))
+        correction_norm = jnp.max(jnp.abs(newton_correction) / component_units)
+        n_stalled = jnp.where(correction_norm >= 0.5 * last_norm, n_stalled + 1, 0)
+        # The round-off of the other components may be all that is left of a component.
+        correction_norm = jnp.where(
+            n_stalled < MAX_STALLED_ITERATIONS,
+            correction_norm,
+            jnp.max(jnp.abs(newton_correction)) / jnp.max(component_units),
+        )
         next_x = jnp.where(jnp.all(jnp.isfinite(newton_correction)), x + newton_correction, x)
         return (
             next_x,
             correction_norm,
             n_iterations + is_searching_iteration,
             n_derivative_iterations + 1 - is_searching_iteration,
+            n_stalled,
             jacobian,
             residual,
         )
@@ -290,10 +356,11 @@ def _run_newton_loop(
         initial_norm,
         initial_count,
         initial_count,
+        initial_count,
         jnp.zeros((start.size,) * 2, start.dtype),
         initial_norm,
     )
-    x, correction_norm, n_iterations, _, jacobian, residual = lax.while_loop(
+    x, correction_norm, n_iterations, *_, jacobian, residual = lax.while_loop(
         needs_newton_iteration, iterate_newton, initial_loop_state
     )
     has_newton_converged = correction_norm <= tolerance
@@ -315,7 +382,7 @@ def _run_newton_jvp(
 
     The iterations start at the fixed point.
     """
-    start, _, *closed_over_values = primals
+    start, _, _, *closed_over_values = primals
     newton_result = _run_newton_loop(
         closure_converted_map, max_iterations, *lax.stop_gradient(primals)
     )
@@ -336,7 +403,7 @@ def _run_newton_jvp(
             x, jacobians[-1], residuals[-1], newton_result.converged, newton_result.n_iterations
         )
 
-    return jax.jvp(solve_from_fixed_point, tuple(closed_over_values), tuple(tangents[2:]))
+    return jax.jvp(solve_from_fixed_point, tuple(closed_over_values), tuple(tangents[3:]))
 
 
 # The same loop, with derivatives by the implicit function theorem.
@@ -353,7 +420,7 @@ def _run_newton_implicit_jvp(
     The tangent depends on the fixed point. Derivatives of the tangent therefore use the same rule.
     """
     newton_result = _run_newton_implicit(closure_converted_map, max_iterations, *primals)
-    closed_over_values, closed_over_tangents = tuple(primals[2:]), tuple(tangents[2:])
+    closed_over_values, closed_over_tangents = tuple(primals[3:]), tuple(tangents[3:])
     _, map_output_tangent = jax.jvp(
         lambda *arguments: closure_converted_map(newton_result.x, *arguments),
         closed_over_values,

@@ -159,6 +159,7 @@ def find_return_map_cycle(
         section_state / section_units,
         period_n=period_n,
         tolerance=compute_newton_tolerance(options),
+        units=1.0,
     )
     fixed_point = fixed_point._replace(
         x=fixed_point.x * section_units,
