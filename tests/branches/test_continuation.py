@@ -251,6 +251,81 @@ def test_beside_a_pitchfork_that_nearly_is_one_the_branch_is_not_left(offset):
     assert (below.dataset.x > 0.0).all()
 
 
+# Units --------------------------------------------------------------------------------------------
+
+
+def circle(units, x, p):
+    """x -> x + 0.3 u (1 - (x/u)^2 - (p/v)^2): a circle with folds at p = -v and p = v."""
+    u, v = units
+    return x + 0.3 * u * (1.0 - (x / u) ** 2 - (p / v) ** 2)
+
+
+@pytest.mark.parametrize(("u", "v"), [(1.0, 1.0), (1e-9, 1e6), (1e-3, 1e-9), (1e3, 1.0)])
+@pytest.mark.parametrize("start", [(1.0, 0.0), (0.0, 1.0)], ids=["regular", "fold"])
+def test_a_circle_with_two_folds_is_the_same_in_all_units(u, v, start):
+    x, p = [u * start[0]], v * start[1]
+    branch = vrw.continue_map(circle, x, p, (-2.0 * v, 2.0 * v), constants=(u, v))
+    folds = [point.value / v for point in branch.special_points]
+    assert {point.kind for point in branch.special_points} == {"fold"}
+    np.testing.assert_allclose(sorted(folds), [-1.0, 1.0], atol=LOCATION_TOLERANCE)
+    assert branch.ends == ("The curve returned to its start.",) * 2
+    points = branch.dataset.x.values[:, 0] / u, branch.values / v
+    np.testing.assert_allclose(np.hypot(*points), 1.0, atol=LOCATION_TOLERANCE)
+    for fold in branch.special_points:
+        np.testing.assert_allclose(fold.point.section_state / u, 0.0, atol=1e-4)  # root of 1e-9
+
+
+def test_components_of_different_size_have_their_own_units():
+    """Henon's map in units of 1e-9 and 1e6, from its fold."""
+    units, b = np.array([1e-9, 1e6]), 0.3
+    in_units = lambda _, x, a: units * evaluate_henon(b, x / units, a)
+    fold = -((1.0 - b) ** 2) / 4.0
+    x = -(1.0 - b) / (2.0 * fold)
+    branch = vrw.continue_map(in_units, units * np.array([x, b * x]), fold, (-1.0, 2.0))
+    solution = special_points_by_kind(branch)
+    assert set(solution) == {"fold", "period_doubling"}
+    assert abs(solution["fold"] - fold) < LOCATION_TOLERANCE
+    assert abs(solution["period_doubling"] + 3.0 * fold) < LOCATION_TOLERANCE
+    doubling = next(point for point in branch.special_points if point.kind == "period_doubling")
+    multipliers = np.sort(doubling.point.multipliers.real)  # -1 and, by the determinant -b, b
+    np.testing.assert_allclose(multipliers, [-1.0, b], atol=1e-5)
+
+
+@pytest.mark.parametrize("u", [1.0, 1e-9])
+def test_a_branch_starts_where_two_branches_cross(u):
+    """x = -u p and x = u p cross at 0, where the map has no first derivative but that of x."""
+    cross = lambda u, x, p: x + 0.1 * u * ((x / u) ** 2 - p**2)
+    branch = vrw.continue_map(cross, [0.0], 0.0, (-1.0, 1.2), constants=u)
+    (border,) = branch.special_points
+    assert border.kind == "branch_point"
+    assert abs(border.value) < LOCATION_TOLERANCE
+    assert branch.values[[0, -1]].tolist() == [-1.0, 1.2]
+    side = np.sign(branch.dataset.x.values[-1, 0])
+    np.testing.assert_allclose(branch.dataset.x.values[:, 0] / u, side * branch.values, atol=1e-9)
+
+
+def test_a_branch_starts_at_a_pitchfork():
+    branch = vrw.continue_map(pitchfork, [0.0], 0.0, (-1.0, 1.2), constants=0.0)
+    (border,) = branch.special_points
+    assert border.kind == "branch_point"
+    assert abs(border.value) < LOCATION_TOLERANCE
+
+
+def test_a_component_that_is_only_round_off_does_not_set_its_unit():
+    noisy = lambda _, x, r: jnp.stack(
+        [evaluate_logistic(_, x[0], r), 0.5 * x[1] + jnp.cos(x[0]) ** 2 + jnp.sin(x[0]) ** 2 - 1.0]
+    )
+    branch = vrw.continue_map(noisy, [0.6, 1e-17], 2.5, (2.0, 3.5))
+    assert abs(special_points_by_kind(branch)["period_doubling"] - 3.0) < LOCATION_TOLERANCE
+
+
+def test_a_branch_along_a_conserved_quantity_names_the_multiplier_1():
+    conserved = lambda _, x, p: jnp.stack([x[0], 0.5 * x[1] + p])
+    branch = vrw.continue_map(conserved, [0.3, 0.2], 0.1, (0.0, 1.0))
+    assert not branch.values.size
+    assert "multiplier is 1, which a conserved quantity or a fold causes" in str(branch)
+
+
 def test_a_fold_of_a_map_of_three_numbers_is_found():
     branch = vrw.continue_map(evaluate_stretched_map, [0.5, 1.0, 0.0], 0.25, (-1.0, 1.0))
     assert abs(special_points_by_kind(branch)["fold"]) < LOCATION_TOLERANCE

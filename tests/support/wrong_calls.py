@@ -694,6 +694,18 @@ def register_wrong_calls() -> None:
         "x is",
     )
     add_wrong_call(
+        "continue_map of a number",
+        lambda: vrw.continue_map(a_map, 0.1, 0.5, (0.0, 1.0)),
+        "ValueError",
+        "x has shape",
+    )
+    add_wrong_call(
+        "continue_map in other units",
+        lambda: vrw.continue_map(a_map, [0.1], 0.5, (0.0, 1.0), units=[1.0, 1.0]),
+        "ValueError",
+        "units are",
+    )
+    add_wrong_call(
         "continue_map of no map",
         lambda: vrw.continue_map(2.0, [0.1], 0.5, (0.0, 1.0)),
         "TypeError",

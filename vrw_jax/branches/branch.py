@@ -110,7 +110,8 @@ class Branch:
     - `dataset`: measures over the dimension `point`, with the parameter as a coordinate. The
       parameter changes its direction at folds;
     - `special_points`: bifurcations, border collisions and ends;
-    - `ends`: reasons for which the branch ends at its first and at its last point;
+    - `ends`: reasons for which the branch ends at its first and at its last point, or for which it
+      has no point;
     - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait from which a branch starts.
 
     Examples:
@@ -150,13 +151,13 @@ class Branch:
         point.
         """
         if not self.values.size:
-            return self.outcome.meaning
+            return self.ends[0] or self.outcome.meaning
         return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
 
     def __str__(self) -> str:
         values = self.values
         if not values.size:
-            return f"Branch along {self.parameter}: none. {self.outcome.meaning}"
+            return f"Branch along {self.parameter}: none. {self.ending}"
         has_parameter_unit = self.parameter in MEASURES
         parameter_unit = (
             f" {MEASURES[self.parameter].display_unit}".rstrip() if has_parameter_unit else ""

@@ -98,6 +98,17 @@ class AbstractContinuation(abc.ABC):
     quantity that vanishes linearly at the same point.
     """
 
+    @property
+    def parameter_unit(self) -> float:
+        """Return the unit of the parameter in which special points are located."""
+        return 1.0
+
+    def make_fixed_point(self, point: ContinuationPoint) -> FixedPoint:
+        """Return the fixed point of the return map at one point of a branch."""
+        section_state = self.continuation_problem.section_state(jax.device_put(point.z))
+        jacobian = np.asarray(point.return_map_jacobian)
+        return FixedPoint(np.asarray(section_state), float(point.p), jacobian)
+
     @abc.abstractmethod
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
         """Return quantities at each point by name, except those computed from the Jacobian.
@@ -506,10 +517,10 @@ class _SpecialPointLocator(NamedTuple):
                 ]
             )
 
+        parameter_accuracy = LOCATION_PARAMETER_ACCURACY * self.branch_continuation.parameter_unit
         parameter_distances = np.abs(right_table.points.p - left_table.points.p)
         bracket_tolerances = np.minimum(
-            LOCATION_PARAMETER_ACCURACY
-            / np.maximum(parameter_distances, LOCATION_PARAMETER_ACCURACY),
+            parameter_accuracy / np.maximum(parameter_distances, parameter_accuracy),
             MIN_BRACKET_FRACTION,
         )
         root_locations = locate_function_roots(
@@ -818,11 +829,6 @@ def continue_and_locate_special_points(
     def make_special_point(located_root: LocatedRoot, ends_branch: bool) -> SpecialPoint:
         points, wheel_indices, _ = located_root.table_beside_root
         point_beside_root = select_tree_rows(points, 0)
-        section_state = np.asarray(
-            branch_continuation.continuation_problem.section_state(
-                jax.device_put(point_beside_root.z)
-            )
-        )
         special_point_name = located_root.special_point_name
         if special_point_name == ADMISSIBILITY_COLUMN:
             special_point_name = branch_continuation.name_branch_end(
@@ -841,9 +847,7 @@ def continue_and_locate_special_points(
             special_point_kind,
             special_point_name,
             located_root.parameter_value,
-            FixedPoint(
-                section_state, float(point_beside_root.p), point_beside_root.return_map_jacobian
-            ),
+            branch_continuation.make_fixed_point(point_beside_root),
             ends_branch,
             make_cycle_finder(int(wheel_indices[0]), point_beside_root)
             if make_cycle_finder

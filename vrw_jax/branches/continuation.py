@@ -7,6 +7,7 @@ Special points are therefore as accurate as the gaits.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.branches.branch import Branch
+from vrw_jax.branches.branch import Branch, FixedPoint
 from vrw_jax.branches.branch_location import (
     AbstractContinuation,
     BranchData,
@@ -27,10 +28,19 @@ from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
 from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
 from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
 from vrw_jax.continuation import (
+    UNIT_MULTIPLIER_ADVICE,
     ArclengthOptions,
     ContinuationPoint,
+    ContinuationResult,
+    ContinuationSetup,
+    CorrectorPlane,
     FixedPointProblem,
+    check_state_units,
+    check_vector_map,
+    estimate_state_units,
     floquet_multipliers,
+    has_unit_multiplier,
+    solve_on_planes,
 )
 from vrw_jax.cycles import (
     AbstractCycle,
@@ -509,17 +519,111 @@ def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.
     )
 
 
+MAX_START_DISTANCE_FACTOR = 10.0
+"""Largest distance of a regular start from a singular start, as a multiple of the first
+continuation step. The value is chosen because branches may cross at small angles.
+"""
+
+MIN_SINGULAR_VALUE = 1e-9
+"""Relative singular value of the equations below which a tangent has few accurate digits."""
+
+
+def are_equations_regular(return_map_jacobian: np.ndarray) -> bool:
+    """Return whether the tangent of a branch is determined at a fixed point."""
+    if not np.isfinite(return_map_jacobian).all():
+        return False
+    equations = np.eye(len(return_map_jacobian)) - return_map_jacobian
+    singular_values = np.linalg.svd(equations, compute_uv=False)
+    return bool(singular_values[-1] > MIN_SINGULAR_VALUE * max(1.0, singular_values[0]))
+
+
+@dataclass(frozen=True)
 class MapContinuation(AbstractContinuation):
-    """Continuation of the fixed points of any map. All finite fixed points are admissible."""
+    """Continuation of the fixed points of any map. All finite fixed points are admissible.
+
+    - `state_units`: units of the components of the state in which points are stored.
+    """
+
+    state_units: Any = 1.0
+
+    @property
+    def parameter_unit(self) -> float:
+        return float(np.ptp(self.parameter_bounds))
+
+    def make_fixed_point(self, point: ContinuationPoint) -> FixedPoint:
+        section_state, p, jacobian = super().make_fixed_point(point)
+        units = np.broadcast_to(self.state_units, section_state.shape)
+        return FixedPoint(units * section_state, p, units[:, None] * jacobian / units)
 
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
-        return {
-            "x": self.map_over_points(
-                jax.vmap(self.continuation_problem.section_state),
-                batch_sizes.POINT_BATCH_SIZE,
-                points.z,
-            )
-        }
+        section_states = self.map_over_points(
+            jax.vmap(self.continuation_problem.section_state),
+            batch_sizes.POINT_BATCH_SIZE,
+            points.z,
+        )
+        return {"x": self.state_units * section_states}
+
+    def continue_in_both_directions(
+        self, z: Array, parameter_values: Array, is_branch_requested: np.ndarray
+    ) -> ContinuationResult:
+        """Continue the branch of one map in both directions, and return all points.
+
+        If the equations are singular at the start, the branch starts at a fixed point next to it.
+        """
+        results = super().continue_in_both_directions(z, parameter_values, is_branch_requested)
+        is_start_found = results.n_points.any()
+        if is_start_found and are_equations_regular(
+            np.asarray(results.points.return_map_jacobian)[0, 0, 0]
+        ):
+            return results
+        regular_start = self._find_regular_start(z, parameter_values)
+        if regular_start is None:
+            return jax.tree.map(np.zeros_like, results)
+        return super().continue_in_both_directions(*regular_start, is_branch_requested)
+
+    def _find_regular_start(self, z: Array, parameter_values: Array) -> tuple[Array, Array] | None:
+        """Find a fixed point next to a start at which the equations are singular.
+
+        Each search is in a plane whose distance from the start is about that of the first
+        continuation step. A branch that turns at the start does not cross all planes. Return None
+        if no plane contains a fixed point near the start.
+        """
+        problem, distance = self.continuation_problem, self.arclength_options.initial_ds
+        setup = ContinuationSetup(
+            problem, self.arclength_options, jnp.asarray(self.parameter_bounds)
+        )
+        jacobian = jax.vmap(problem.linearize)(self.wheels, z, parameter_values).return_map_jacobian
+        singular_direction = np.linalg.svd(np.eye(z.shape[-1]) - np.nan_to_num(jacobian[0]))[2][-1]
+        # Along one branch through a crossing, the state may be constant.
+        state_parts, parameter_parts = (
+            distance * np.array(list(itertools.product((0.0, 0.5, -0.5), (1.0, -1.0)))).T
+        )
+        normals = state_parts[:, None] * singular_direction
+        start_states, start_fractions = (
+            z + normals,
+            parameter_parts + np.asarray(setup.compute_parameter_fraction(parameter_values)),
+        )
+        points, has_converged = jax.tree.map(
+            np.asarray,
+            solve_on_planes(
+                setup,
+                select_tree_rows(self.wheels, np.zeros(len(normals), int)),
+                start_states,
+                CorrectorPlane(start_states, start_fractions, normals, parameter_parts),
+            ),
+        )
+        lower_bound, upper_bound = self.parameter_bounds
+        is_usable = (
+            has_converged
+            & np.isfinite(points.z).all(-1)
+            & (np.abs(points.z - np.asarray(z)).max(-1) <= MAX_START_DISTANCE_FACTOR * distance)
+            & (lower_bound <= points.p)
+            & (points.p <= upper_bound)
+            & [are_equations_regular(jacobian) for jacobian in points.return_map_jacobian]
+        )
+        if not is_usable.any():
+            return None
+        return jax.device_put(select_tree_rows((points.z, points.p), np.flatnonzero(is_usable)[:1]))
 
 
 @with_default_jax_settings
@@ -531,13 +635,15 @@ def continue_map(
     *,
     constants: Any = (),
     name: str = "parameter",
+    units: Any = None,
     options: ArclengthOptions | None = None,
 ) -> Branch:
     """Continue the branch of fixed points through (x, p) for a map x -> `function(constants, x,
     p)`.
 
     The map must be differentiable in forward mode, and return NaN where it is undefined.
-    Bifurcations are located as in `continue_branch`.
+    Bifurcations are located as in `continue_branch`, to 1e-9 of the range between the bounds. The
+    start may be a fold or a crossing of branches.
 
     Args:
         function: `function(constants, x, p)`, which returns an array of the shape of `x`.
@@ -546,10 +652,13 @@ def continue_map(
         bounds: lower and upper bound of the parameter.
         constants: any pytree, passed to the function.
         name: name of the parameter in the result.
+        units: units of the components of `x`, a number or shape (n,), in which continuation steps
+            are measured. By default, the unit of a component is its size at the start, or the size
+            of its change within the bounds if it is larger.
         options: `ArclengthOptions` of the branch.
 
     Returns:
-        A `Branch`: the gaits, their stability, the special points, and why the branch ends.
+        A `Branch`: the fixed points, their stability, the special points, and why the branch ends.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -572,21 +681,32 @@ def continue_map(
     add_batch_axis = lambda tree: jax.tree.map(
         lambda constant_leaf: jnp.asarray(constant_leaf, float)[None], tree
     )
+    constants = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), constants)
+    check_vector_map(lambda x: function(constants, x, jnp.asarray(p, float)), "x", x)
+    state_units = (
+        estimate_state_units(function, constants, np.asarray(x), p, (lower_bound, upper_bound))
+        if units is None
+        else np.asarray(check_state_units(units, x))
+    )
     branch_continuation = MapContinuation(
-        FixedPointProblem(function),
+        FixedPointProblem(function, jnp.asarray(state_units)),
         options,
         add_batch_axis(constants),
         np.array([lower_bound, upper_bound]),
+        state_units,
     )
     (branch_data,) = continue_and_locate_special_points(
         branch_continuation,
-        add_batch_axis(x),
+        add_batch_axis(x / state_units),
         add_batch_axis(p),
         np.array([True]),
     )
     if branch_data is None:
         empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))})
-        return Branch(name, empty_dataset, (), ("", ""), Outcome.NO_CYCLE_FOUND)
+        start_jacobian = jax.jacfwd(function, 1)(constants, x, jnp.asarray(p, float))
+        is_singular = has_unit_multiplier(np.asarray(start_jacobian))
+        reasons = (UNIT_MULTIPLIER_ADVICE if is_singular else "",) * 2
+        return Branch(name, empty_dataset, (), reasons, Outcome.NO_CYCLE_FOUND)
     dataset = xr.Dataset(
         {"x": (("point", "component"), branch_data.quantity_table["x"])}
         | _make_stability_variables(np.asarray(branch_data.points.return_map_jacobian)),

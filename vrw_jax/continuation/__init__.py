@@ -21,7 +21,12 @@ from vrw_jax.continuation.batched_continuation import (
     solve_on_planes,
 )
 from vrw_jax.continuation.fixed_points import (
+    UNIT_MULTIPLIER_ADVICE,
     FixedPointResult,
+    check_state_units,
+    check_vector_map,
+    estimate_state_units,
+    has_unit_multiplier,
     solve_fixed_point,
     solve_fixed_point_implicit,
 )

@@ -41,7 +41,8 @@ class ArclengthOptions:
     """Numerical options of a continuation.
 
     JAX compiles the continuation again whenever an option changes. The length of a continuation
-    step is an arc length in the section state and in the parameter as a fraction of its range.
+    step is an arc length in the section state and in the parameter as a fraction of its range. For
+    `continue_map` the state is in units of its size.
 
     - `initial_ds`, `max_ds`, `min_ds`: length of the first, the longest and the shortest
       continuation step;
@@ -187,16 +188,18 @@ def compute_fixed_point_newton_step(
 class FixedPointProblem(AbstractContinuationProblem):
     """Continuation problem for the fixed points of a map x -> `function(args, x, p)`.
 
-    JAX differentiates the map in forward mode. The map returns NaN where it is undefined.
+    JAX differentiates the map in forward mode. The map returns NaN where it is undefined. The
+    unknowns are x in the given units.
     """
 
     function: Callable[[Any, SectionStateVector, Scalar], SectionStateVector] = eqx.field(
         static=True
     )
+    units: Any = 1.0  # one unit for each component of x, or one number
 
     def linearize(self, args: Any, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
         return compute_fixed_point_newton_step(
-            lambda x, p: self.function(args, x, p), z, p, z.shape[0]
+            lambda z, p: self.function(args, z * self.units, p) / self.units, z, p, z.shape[0]
         )
 
     def section_state(self, z: ProblemUnknowns) -> SectionStateVector:

@@ -437,3 +437,75 @@ def _run_newton_implicit_jvp(
     return newton_result, make_zero_tangent(newton_result)._replace(
         x=fixed_point_tangent, jacobian=nan_jacobian_tangent
     )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _linearize_map(function: Callable, args: Any, x: Array, p: Array) -> tuple[Array, tuple]:
+    """Linearize the map at many points."""
+    linearize = lambda x, p: evaluate_with_jacobian(lambda x, p: function(args, x, p), x, p)
+    return jax.vmap(linearize)(x, p)
+
+
+RELATIVE_PROBE_LENGTH = 1e-3
+"""Distance, relative to the state, over which the change of the map's Jacobian is measured. The
+value is chosen between the round-off of the Jacobian and a change that is not linear.
+"""
+
+NOISE_PROBES = 1e-12 * np.arange(32.0)
+"""Relative changes of state and parameter at which the round-off of a map is measured. The values
+are chosen because the quadratic terms of the map are then far below its round-off.
+"""
+
+MIN_UNIT_PER_NOISE = 1e11
+"""Smallest unit of a component as a multiple of the round-off of its image. The value is chosen
+because ten times the round-off is then the default tolerance of 1e-10.
+"""
+
+
+def estimate_state_units(
+    function: Callable, args: Any, x: np.ndarray, p: float, parameter_bounds: tuple[float, float]
+) -> np.ndarray:
+    """Estimate the size of each component of the fixed points of x -> `function(args, x, p)`.
+
+    The size is that of `x`, or that of the change of the fixed point between the bounds of the
+    parameter if the change is larger. The change solves the quadratic equation of the branch in the
+    direction of its tangent, so that the change is finite at a fold. The size scales with the units
+    of state and parameter. It exceeds the round-off of the map, and is 1 for a component that is
+    zero and remains zero.
+    """
+
+    def linearize(x: np.ndarray, p: Any) -> tuple[np.ndarray, ...]:
+        # Each call has the same shape, so that one program is compiled.
+        x, p = np.resize(x, (len(NOISE_PROBES), x.shape[-1])), np.resize(p, len(NOISE_PROBES))
+        image, (jacobian, rate) = _linearize_map(function, args, jnp.asarray(x), jnp.asarray(p))
+        return np.asarray(image), np.asarray(jacobian), np.asarray(rate)
+
+    with np.errstate(all="ignore"):
+        parameter_range = parameter_bounds[1] - parameter_bounds[0]
+        image, jacobian, rate = (values[0] for values in linearize(x, p))
+        forcing = parameter_range * rate
+        is_size_unknown = (x == 0.0) & (forcing == 0.0)
+        if is_size_unknown.any():
+            # At a crossing the change between the bounds is of second order.
+            changes = np.max(abs(linearize(x, np.array(parameter_bounds))[0] - image), 0)
+            forcing = np.where(is_size_unknown, changes, forcing)
+        sizes = np.where(x == 0.0, np.fmax(abs(image), abs(forcing)), abs(x))
+        x_probes, p_probes = x + np.outer(NOISE_PROBES, sizes), p + NOISE_PROBES * parameter_range
+        linear_changes = (x_probes - x) @ jacobian.T + np.outer(p_probes - p, rate)
+        noise = np.max(abs(linearize(x_probes, p_probes)[0] - image - linear_changes), 0)
+        sizes = np.fmax(sizes, MIN_UNIT_PER_NOISE * noise)
+        units = np.where((sizes > 0.0) & np.isfinite(sizes), sizes, 1.0)
+        in_units = lambda matrix: np.nan_to_num(matrix * units / units[:, None])
+        left, singular_values, right = np.linalg.svd(np.eye(len(x)) - in_units(jacobian))
+        # At a fold, round-off replaces the singular value 0, and the tangent is large.
+        singular_values = np.maximum(singular_values, np.finfo(x.dtype).eps)
+        solve = lambda vector: right.T @ (left.T @ vector / singular_values)
+        tangent = solve(np.nan_to_num(forcing / units))
+        tangent_size = np.max(abs(tangent))
+        if tangent_size == 0.0:
+            return units
+        probe = RELATIVE_PROBE_LENGTH / tangent_size * tangent
+        jacobian_change = in_units(linearize(x + units * probe, p)[1][0] - jacobian)
+        curvature = solve(jacobian_change @ tangent) / RELATIVE_PROBE_LENGTH
+        change = 2.0 * tangent / (1.0 + np.sqrt(1.0 + 2.0 * np.max(abs(curvature))))
+        return units * np.fmax(1.0, abs(change))
