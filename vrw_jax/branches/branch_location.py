@@ -374,7 +374,8 @@ class _AdmissibleRange(NamedTuple):
     point_pairs_at_ends: dict[int, tuple[int, int]]
 
 
-# Width of the bracket, in the parameter, at which the search ends.
+# Width of the bracket, in the parameter, at which the search ends; for maps it is a fraction of the
+# range of the parameter.
 LOCATION_PARAMETER_ACCURACY = 1e-10
 # Smallest width of the bracket as a fraction of its initial width. The value is chosen because near
 # a fold the parameter varies with the square of the distance.
