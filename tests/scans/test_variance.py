@@ -23,7 +23,9 @@ def make_ishigami_scan(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
     }
     outcome = np.full(design.size, int(Outcome.STEPPED))
     attrs = {"scan": {"design": design.describe_design()}}
-    return xr.Dataset(result_by_name | {"outcome": ("sample", outcome)}, attrs=attrs), unit
+    return xr.Dataset(
+        result_by_name | {"outcome": ("sample", outcome)}, design.make_result_coordinates(), attrs
+    ), unit
 
 
 def test_indices_of_the_ishigami_function_equal_the_published_ones() -> None:
@@ -77,6 +79,77 @@ def test_rows_without_a_gait_are_omitted_and_counted() -> None:
     assert result.attrs["left_out"] == pytest.approx(1.0 - 0.9**2, abs=0.01)  # z of A or of B
     assert result.attrs["rows"] == 2048
     np.testing.assert_allclose(result.total[0], [0.8, 0.2, 0.0], atol=0.02)
+
+
+CHANGES_OF_ORDER = {
+    "sorted": lambda scan: scan.sortby("damping"),
+    "reversed": lambda scan: scan.isel(sample=slice(None, None, -1)),
+    "shuffled": lambda scan: scan.isel(sample=np.random.default_rng(0).permutation(20480)),
+    "sorted, without parameters": lambda scan: scan.sortby("slope").drop_vars(ISHIGAMI_RANGES),
+    "without labels": lambda scan: scan.drop_vars("sample"),
+    "without coordinates": lambda scan: scan.reset_coords(drop=True).drop_vars("sample"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES_OF_ORDER)
+def test_the_order_of_the_samples_does_not_matter(change: str) -> None:
+    """Reference: the same samples in the order of the design, whose indices are published ones."""
+    scan, _ = make_ishigami_scan()
+    changed_scan = CHANGES_OF_ORDER[change](scan)
+    xr.testing.assert_identical(
+        vrw.sobol_indices(changed_scan, ["speed"]), vrw.sobol_indices(scan, ["speed"])
+    )
+
+
+def test_a_part_of_the_samples_gives_the_indices_of_its_complete_rows() -> None:
+    """On three quarters of every range, the variances of 2x and y have the same ratio 4 to 1."""
+    scan, _ = make_ishigami_scan(16384)
+    is_selected = (scan.damping < 175.0) & (scan.slope < 0.275) & (scan.stiffness < 475.0)
+    with pytest.warns(UserWarning, match=r"absent: their rows are omitted, .* of 16,384 rows"):
+        part = vrw.sobol_indices(scan.where(is_selected, drop=True), ["period"])
+    np.testing.assert_allclose(part.total[0], [0.8, 0.2, 0.0], atol=0.02)
+    # x, y and z of A and of B
+    assert part.attrs["left_out"] == pytest.approx(1.0 - 0.75**6, abs=0.01)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_sample_without_a_finite_value_costs_its_row_alone(value: float) -> None:
+    scan, _ = make_ishigami_scan()
+    scan.speed.values[[7, 4096 + 9]] = value  # a point A of row 7, and a point B of row 9
+    with pytest.warns(UserWarning, match=r"of 20,480 samples, 2 NaN or infinite in speed: .*2,048"):
+        result = vrw.sobol_indices(scan, ["speed", "period"])
+    assert result.attrs["left_out"] == pytest.approx(2 / 4096)
+    # 2,048 rows of a Sobol' sequence: twice the tolerance of 4,096 rows
+    np.testing.assert_allclose(result.first_order[0], [0.3139, 0.4424, 0.0], atol=0.04)
+    np.testing.assert_allclose(result.total[1], [0.8, 0.2, 0.0], atol=0.02)
+
+
+REFUSED_SELECTIONS = {
+    "samples of another order without labels": (
+        lambda scan: scan.drop_vars("sample").sortby("slope"), "another order"),
+    "new labels": (
+        lambda scan: scan.sortby("slope").assign_coords(sample=np.arange(320)), "another order"),
+    "a part without labels": (
+        lambda scan: scan.drop_vars("sample").isel(sample=slice(64)), "64 of the 320 samples"),
+    "no samples": (lambda scan: scan.isel(sample=slice(0)), "contains 0 of the 320 samples"),
+    "samples twice": (
+        lambda scan: xr.concat([scan, scan], "sample"), "one whole number from 0 to 319"),
+    "labels of something else": (
+        lambda scan: scan.assign_coords(sample=np.arange(320) + 1), "one whole number"),
+    "half of the samples": (
+        lambda scan: scan.isel(sample=slice(160)), r"only 0 of 64 .* \(samples: 160 absent\)"),
+    "no outcomes": (lambda scan: scan[["speed"]], "'outcome' is no measure"),
+    "a measure that is nowhere finite": (
+        lambda scan: scan.assign(speed=np.nan * scan.speed), "320 NaN or infinite in speed"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("selection", REFUSED_SELECTIONS)
+def test_samples_that_cannot_be_assigned_to_rows_are_refused(selection: str) -> None:
+    select, message = REFUSED_SELECTIONS[selection]
+    scan, _ = make_ishigami_scan(64)
+    with pytest.raises(ValueError, match=message):
+        vrw.sobol_indices(select(scan), ["speed"])
 
 
 def test_the_same_scan_gives_the_same_intervals() -> None:

@@ -51,11 +51,15 @@ def sobol_indices(
     all other parameters are fixed. The suffixes `_lower` and `_upper` name the bounds of a 95 %
     bootstrap interval, such as `total_lower`.
 
-    A row is a group of samples in a `saltelli` design. Rows that contain a sample without a gait
-    are omitted. Further rows are omitted until their number, the attribute `rows`, is a power of
-    two. The attribute `left_out` is the fraction of rows that contain a sample without a gait. If
-    `left_out` is not small, the indices are biased: wheels near those without a gait lose more of
-    their rows than other wheels. The indices are then not those of the region with gaits.
+    A row is a group of samples in a `saltelli` design. The coordinate `sample` of the scan states
+    which sample belongs to which row, so the samples may be sorted, shuffled or selected. Rows with
+    a sample that is absent, has no gait, or has a measure that is NaN or infinite are omitted. A
+    warning states how many samples are absent, NaN or infinite. The attribute `left_out` is the
+    fraction of omitted rows. Further rows are omitted until their number, the attribute `rows`, is
+    a power of two.
+
+    If `left_out` is not small, the indices are biased: wheels near those without a gait lose more
+    of their rows than other wheels. The indices are then not those of the region with gaits.
 
     If a measure varies only by round-off, its indices are 0. The variable `is_constant_measure`
     marks such a measure, and a warning names it.
@@ -69,7 +73,8 @@ def sobol_indices(
         `is_constant_measure`.
 
     Raises:
-        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+        TypeError, ValueError: if an argument is invalid, if too few rows remain, or if the samples
+            cannot be assigned to rows; the message names the remedy.
 
     Examples:
         >>> design = vrw.saltelli({"damping": (100.0, 180.0), "slope": (0.27, 0.29)}, 64)
@@ -86,7 +91,7 @@ def sobol_indices(
         )
     swept_parameters = list(design_settings["swept"])
     measure_names = list(check_names("measures", measures))
-    for measure_name in measure_names:
+    for measure_name in ("outcome", *measure_names):
         if measure_name not in scan or scan[measure_name].dims != ("sample",):
             raise ValueError(
                 f"{measure_name!r} is no measure of this "
@@ -94,26 +99,39 @@ def sobol_indices(
                 "scanned."
             )
     sobol_options = SobolOptions()
-    n_samples_per_row = 2 + len(swept_parameters)
-    has_gait = scan.outcome.values == Outcome.STEPPED
-    has_gaits_in_row = has_gait.reshape(n_samples_per_row, -1).all(axis=0)
-    saltelli_rows_with_gaits = np.flatnonzero(has_gaits_in_row)
-    n_rows_with_gaits = len(saltelli_rows_with_gaits)
-    n_saltelli_rows = (1 << n_rows_with_gaits.bit_length()) >> 1  # largest power of 2, or 0
-    if n_saltelli_rows < sobol_options.min_saltelli_rows:
-        raise ValueError(
-            f"only {n_rows_with_gaits} of {len(has_gaits_in_row)} rows walk "
-            f"throughout, but indices need {sobol_options.min_saltelli_rows}: narrow the ranges to "
-            "where there are gaits, or take more rows."
-        )
-    selected_saltelli_rows = saltelli_rows_with_gaits[:n_saltelli_rows]
+    sample_positions = _locate_design_samples(scan, swept_parameters, design_settings["shape"][0])
+    is_present = sample_positions >= 0
+    has_gait = is_present & (scan.outcome.values[sample_positions] == Outcome.STEPPED)
     measure_values = np.stack(
-        [
-            scan[measure_name].values.reshape(n_samples_per_row, -1)[:, selected_saltelli_rows]
-            for measure_name in measure_names
-        ],
-        axis=1,
+        [scan[measure_name].values[sample_positions] for measure_name in measure_names], axis=1
     )
+    is_missing = has_gait[:, None] & ~np.isfinite(measure_values)
+    is_complete_row = has_gait.all(axis=0) & ~is_missing.any(axis=(0, 1))
+    complete_rows = np.flatnonzero(is_complete_row)
+    n_saltelli_rows = (1 << len(complete_rows).bit_length()) >> 1  # largest power of 2, or 0
+    missing_sample_counts = {"absent": is_present.size - is_present.sum()} | {
+        f"NaN or infinite in {measure_name}": n_missing
+        for measure_name, n_missing in zip(measure_names, is_missing.sum(axis=(0, 2)), strict=True)
+    }
+    missing_samples_text = ", ".join(
+        f"{n_missing:,} {reason}"
+        for reason, n_missing in missing_sample_counts.items()
+        if n_missing
+    )
+    if n_saltelli_rows < sobol_options.min_saltelli_rows:
+        samples_note = f" (samples: {missing_samples_text})" if missing_samples_text else ""
+        raise ValueError(
+            f"only {len(complete_rows)} of {len(is_complete_row)} rows walk "
+            f"throughout{samples_note}, but indices need {sobol_options.min_saltelli_rows}: narrow "
+            "the ranges to where there are gaits, or take more rows."
+        )
+    if missing_samples_text:
+        warnings.warn(
+            f"of {is_present.size:,} samples, {missing_samples_text}: their rows are omitted, and "
+            f"the indices are those of {n_saltelli_rows:,} of {len(is_complete_row):,} rows.",
+            stacklevel=2,
+        )
+    measure_values = measure_values[..., complete_rows[:n_saltelli_rows]]
 
     random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
     roundoff_spreads = sobol_options.max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
@@ -160,9 +178,50 @@ def sobol_indices(
         coords={"measure": measure_names, "parameter": swept_parameters},
         attrs={
             "rows": n_saltelli_rows,
-            "left_out": 1.0 - n_rows_with_gaits / len(has_gaits_in_row),
+            "left_out": 1.0 - len(complete_rows) / len(is_complete_row),
         },
     )
+
+
+def _locate_design_samples(
+    scan: xr.Dataset, swept_parameters: list[str], n_design_samples: int
+) -> np.ndarray:
+    """Return the position in a scan of each sample of its `saltelli` design, or -1 if the scan does
+    not contain the sample, shape (2 + parameters, rows).
+
+    Raise a ValueError if the samples are not identified by labels, or differ from their design.
+    """
+    n_samples = scan.sizes["sample"]
+    has_labels = "sample" in scan.coords
+    if not n_samples or (not has_labels and n_samples != n_design_samples):
+        raise ValueError(
+            f"the scan contains {n_samples:,} of the {n_design_samples:,} samples of its design, "
+            "and no coordinate 'sample' identifies them: give the whole scan, with this coordinate."
+        )
+    sample_labels = scan["sample"].values if has_labels else np.arange(n_samples)
+    is_known = np.isin(sample_labels, np.arange(n_design_samples))
+    if not is_known.all() or len(np.unique(sample_labels)) < n_samples:
+        raise ValueError(
+            f"the coordinate 'sample' does not have one whole number from 0 to "
+            f"{n_design_samples - 1:,} for each sample: keep this coordinate of vrw.scan."
+        )
+    n_samples_per_row = 2 + len(swept_parameters)
+    sample_positions = np.full((n_samples_per_row, n_design_samples // n_samples_per_row), -1)
+    sample_positions.flat[sample_labels.astype(int)] = np.arange(n_samples)
+    if all(parameter_name in scan for parameter_name in swept_parameters):
+        points_a, points_b, *points_ab = np.stack(
+            [scan[parameter_name].values[sample_positions] for parameter_name in swept_parameters],
+            axis=1,
+        )
+        is_swapped = np.eye(len(swept_parameters), dtype=bool)[..., None]
+        has_other_values = (points_ab != np.where(is_swapped, points_b, points_a)).any(axis=(0, 1))
+        if (has_other_values & (sample_positions >= 0).all(axis=0)).any():
+            raise ValueError(
+                "the values of the swept parameters are not those of a row of vrw.saltelli, so the "
+                "samples have another order or other labels than in their design: keep the "
+                "coordinate 'sample' and the parameters of vrw.scan."
+            )
+    return sample_positions
 
 
 def _detect_constant_measures(
