@@ -85,6 +85,7 @@ def register_wrong_calls() -> None:
         bad = not_numbers | {
             "nan": (float("nan"), "ValueError"), "negative": (-9.0, "ValueError"),
             "huge": (1e70, "ValueError"), "a list with text": ([1.0, "a"], "TypeError"),
+            "masked": (np.ma.array([0.1, 0.2], mask=[0, 1]), "TypeError"),
         }  # fmt: skip
         add_wrong_calls(
             f"WheelParams {name}", lambda v, n=name: vrw.WheelParams(**{n: v}), bad, name
@@ -284,7 +285,9 @@ def register_wrong_calls() -> None:
     given = {k: v for k, v in states.items() if k != "nothing"}
     add_wrong_calls("simulate state", lambda v: vrw.simulate(table_1, v), given, "section state")
     rows = given | {"three numbers": (np.ones(3), "ValueError"),
-                    "four columns": (np.ones((2, 4)), "ValueError")}  # fmt: skip
+                    "four columns": (np.ones((2, 4)), "ValueError"),
+                    "a masked row": (np.ma.array(np.ones((2, 3)), mask=[[0], [1]] * np.ones(3)),
+                                     "TypeError")}  # fmt: skip
     rows.pop("a row")
     add_wrong_calls("step_batch states", lambda v: vrw.step_batch(table_1, v), rows, "states")
     add_wrong_call(
@@ -883,6 +886,8 @@ def register_wrong_calls() -> None:
         "complex": ([1.0, 2j], "TypeError"), "references": ([True, False], "TypeError"),
         "nothing": (None, "TypeError"), "no values": ([], "ValueError"),
         "a table": (np.ones((2, 2)), "ValueError"),
+        "masked": (np.ma.array([150.0, 1e9], mask=[0, 1]), "TypeError"),
+        "a masked entry in a list": ([150.0, np.ma.masked], "TypeError"),
     }  # fmt: skip
     add_wrong_calls("grid", lambda v: vrw.grid(damping=v), columns, "damping")
     add_wrong_calls("samples", lambda v: vrw.samples({"damping": v}), columns, "damping")
@@ -962,6 +967,16 @@ def register_wrong_calls() -> None:
         "ValueError",
         "friction",
     )
+    masked = np.ma.array([1.0, 2.0], mask=[0, 1])
+    add_wrong_call(
+        "constants of a map that are masked",
+        lambda: vrw.continue_map(lambda c, x, p: x, [0.0], 0.5, (0.0, 1.0), constants=[masked]),
+        "TypeError", "constants has masked entries",
+    )  # fmt: skip
+    add_wrong_call(
+        "a masked gap",
+        lambda: hybrid.enumerate_lcp_solutions(np.eye(2), masked), "TypeError", "masked entries",
+    )  # fmt: skip
     add_wrong_call(
         "indices of what is no saltelli scan",
         lambda: vrw.sobol_indices(vrw.simulate(table_1, n_steps=1)),

@@ -1,9 +1,12 @@
 """Bad input raises one clear sentence: the given value, the allowed values, the remedy."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
@@ -164,6 +167,40 @@ def test_float32_works_if_requested():
 def test_a_symbol_of_the_paper_gets_the_name_of_its_parameter(call, sentence):
     with pytest.raises((TypeError, ValueError), match=sentence):
         call()
+
+
+@pytest.mark.parametrize("dtype", [">f8", ">f4", ">i4"])
+def test_numbers_in_another_byte_order_are_the_same_numbers(dtype):
+    """Reference: the same numbers in the byte order of the machine."""
+    damping = np.array([150.0, 160.0], dtype)
+    native = damping.astype(damping.dtype.newbyteorder("="))
+    for foreign in (damping, list(damping.reshape(2, 1)), xr.DataArray(damping)):
+        values = vrw.WheelParams(damping=foreign).damping
+        np.testing.assert_array_equal(np.ravel(values), native)
+    np.testing.assert_array_equal(vrw.grid(damping=damping).values_by_parameter["damping"], native)
+    start = np.asarray(vrw.paper_start())[None].astype(">f8")
+    batch_result = vrw.step_batch(vrw.WheelParams(), start)
+    assert batch_result.outcome[0] == vrw.Outcome.STEPPED
+
+
+def test_a_masked_array_without_masked_entries_is_an_array():
+    values = np.ma.array([150.0, 160.0], mask=False)
+    np.testing.assert_array_equal(vrw.WheelParams(damping=values).damping, [150.0, 160.0])
+    start = np.ma.array(np.asarray(vrw.paper_start())[None])
+    assert vrw.step_batch(vrw.WheelParams(), start).outcome[0] == vrw.Outcome.STEPPED
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_wheel_in_single_precision_is_printed_without_a_warning():
+    """Parameters may be larger in double precision than single precision has numbers."""
+    with jax.enable_x64(False):
+        assert "damping c: 200 N s/m" in str(vrw.WheelParams())
+        too_large = vrw.WheelParams(damping=np.array([200.0, 1e10, np.inf]))
+        assert too_large.is_in_domain().tolist() == [True, False, False]
+        options = vrw.StepOptions(rtol=1e-3, atol=1e-3)
+        take_step = functools.partial(vrw.step, options=options)
+        step = jax.eval_shape(take_step, vrw.WheelParams(), vrw.paper_start())
+        assert step.durations.dtype == np.float32
 
 
 @pytest.mark.slow

@@ -83,6 +83,7 @@ from vrw_jax.validation import (
     check_real,
     check_reals,
     check_type,
+    require_no_masked_entries,
     require_untraced_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, check_parameter_name
@@ -678,6 +679,7 @@ def continue_map(
             f"[{lower_bound:g}, {upper_bound:g}]."
         )
     options, x = _check_arclength_options(options), check_reals("x", x)
+    require_no_masked_entries("constants", jax.tree.leaves(constants))
     add_batch_axis = lambda tree: jax.tree.map(
         lambda constant_leaf: jnp.asarray(constant_leaf, float)[None], tree
     )

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.numerics import StatusCode
-from vrw_jax.validation import has_traced_leaf
+from vrw_jax.validation import has_traced_leaf, require_no_masked_entries
 
 MAX_LCP_CONTACTS = 10
 """Largest number of contacts in an LCP.
@@ -51,6 +51,7 @@ def enumerate_lcp_solutions(
     with the same forces are counted once. The result is differentiable as long as the same contacts
     are closed. A wrong shape or a value that is not finite raises a ValueError.
     """
+    require_no_masked_entries("matrix or free_gap", (matrix, free_gap))
     free_gap = jnp.asarray(free_gap, float)
     matrix = jnp.asarray(matrix, free_gap.dtype)
     n_contacts = free_gap.size

@@ -46,8 +46,10 @@ def is_valid_start_state(params: WheelParams, x: SectionStateEntries) -> Array:
     is_angle_in_range = (jnp.abs(wheel_angle) < 0.5 * jnp.pi) & (
         jnp.abs(wheel_angle - params.leg_angle) < 0.5 * jnp.pi
     )
+    # In single precision the bound would overflow, with a warning.
+    max_entry = min(MAX_SI_VALUE, float(jnp.finfo(jnp.result_type(angular_rate)).max))
     are_entries_bounded = functools.reduce(
-        operator.and_, [jnp.abs(state_entry) < MAX_SI_VALUE for state_entry in x]
+        operator.and_, [jnp.abs(state_entry) < max_entry for state_entry in x]
     )
     return params.is_in_domain() & are_entries_bounded & is_angle_in_range & (angular_rate > 0.0)
 

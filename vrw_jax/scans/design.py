@@ -19,6 +19,7 @@ from vrw_jax.validation import (
     check_range,
     check_type,
     format_value,
+    require_no_masked_entries,
     require_untraced_arguments,
 )
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES, check_parameter_name
@@ -217,6 +218,7 @@ def _parse_value_columns(
         function_name, parameter_mapping, parameter_keywords
     ).items():
         require_untraced_arguments("a design", "use jax.vmap", parameter_values)
+        require_no_masked_entries(parameter_name, parameter_values)
         try:
             value_column = np.atleast_1d(np.asarray(parameter_values))
         # Lists may differ in length, and the conversion of a foreign object may raise any error.

@@ -17,5 +17,6 @@ from vrw_jax.validation.checks import (
     format_value,
     has_traced_leaf,
     require_known_name,
+    require_no_masked_entries,
     require_untraced_arguments,
 )

@@ -90,7 +90,7 @@ def _is_single_number(given_value: Any) -> bool:
     """
     if isinstance(given_value, int | float) and not isinstance(given_value, bool):
         return True
-    if isinstance(given_value, jax.core.Tracer):
+    if isinstance(given_value, jax.core.Tracer) or np.ma.is_masked(given_value):
         return False
     is_array_type = isinstance(given_value, jax.Array | np.ndarray | np.generic)
     # The dtype of random keys has no kind.
@@ -173,6 +173,35 @@ def check_range(argument_name: str, given_range: Any) -> tuple[float, float]:
     return lower_bound, upper_bound
 
 
+def require_no_masked_entries(argument_name: str, given_value: Any) -> None:
+    """Raise a TypeError if an array, or an array in nested lists, has a masked entry.
+
+    The number below a mask has no meaning.
+    """
+
+    def has_masked_entry(value: Any) -> bool:
+        if isinstance(value, list | tuple):
+            return any(map(has_masked_entry, value))
+        return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
+
+    if has_masked_entry(given_value):
+        raise TypeError(
+            f"{argument_name} has masked entries, which are no numbers: give only the others, as "
+            "array.compressed() returns them, or fill the gaps with array.filled(value)."
+        )
+
+
+def _convert_to_plain_array(given_value: Any) -> Any:
+    """Return an array in native byte order and without a mask. Return other values unchanged.
+
+    JAX accepts neither another byte order nor a mask, even if the mask covers no entry.
+    """
+    dtype = getattr(given_value, "dtype", None)
+    if isinstance(given_value, np.ndarray) or not getattr(dtype, "isnative", True):
+        return np.asarray(given_value, dtype.newbyteorder("="))  # type: ignore[union-attr]
+    return given_value
+
+
 def check_reals(
     argument_name: str, given_value: Any, remedy_text: str = "give a number, or an array of them"
 ) -> Array:
@@ -182,7 +211,9 @@ def check_reals(
     type.
     """
     raise_if_process_forked()
+    require_no_masked_entries(argument_name, given_value)
     try:
+        given_value = jax.tree.map(_convert_to_plain_array, given_value)
         if isinstance(
             given_value, np.ndarray
         ) and given_value.dtype == jax.dtypes.canonicalize_dtype(float):
@@ -220,15 +251,16 @@ def check_reals(
 def check_numpy_reals(
     argument_name: str, given_value: Any, remedy_text: str = "give a number, or an array of them"
 ) -> np.ndarray:
-    """Return real numbers as a NumPy array. A valid NumPy array is returned unchanged.
+    """Return real numbers as a NumPy array. A valid NumPy array is not copied.
 
     Raise an error if the value does not consist of real numbers.
     """
     raise_if_process_forked()
+    require_no_masked_entries(argument_name, given_value)
     if isinstance(given_value, np.ndarray) and given_value.dtype == jax.dtypes.canonicalize_dtype(
         float
     ):
-        return given_value
+        return np.asarray(given_value)
     return np.asarray(check_reals(argument_name, given_value, remedy_text))
 
 

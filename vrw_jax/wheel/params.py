@@ -302,9 +302,10 @@ class WheelParams(AbstractPrintable):
         for parameter_name, parameter_value in value_by_parameter.items():
             max_value_of_dtype = float(jnp.finfo(jnp.result_type(parameter_value)).max) ** 0.25
             parameter_domain = PARAMETER_DOMAINS[parameter_name]
-            is_in_all_domains &= parameter_domain.contains_parameter_value(parameter_value) & (
-                parameter_value < max_value_of_dtype
-            )
+            upper_bound = min(parameter_domain.upper_bound, max_value_of_dtype)
+            is_in_all_domains &= parameter_domain._replace(
+                upper_bound=upper_bound
+            ).contains_parameter_value(parameter_value)
         relative_values = _square_relative_parameters(value_by_parameter, self.n_legs)
         for squared_relative_value in relative_values.values():
             is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
