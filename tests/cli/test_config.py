@@ -25,6 +25,14 @@ def test_a_folder_or_a_binary_file_is_no_config(tmp_path: Path) -> None:
         load_config(binary)
 
 
+def test_a_byte_order_mark_is_no_part_of_a_config(tmp_path: Path) -> None:
+    """Some editors of Windows write this mark before a text in UTF-8."""
+    path, text = tmp_path / "marked.toml", "[wheel]\ndamping = 150.0\n"
+    path.write_text(text, encoding="utf-8-sig")
+    assert path.read_bytes().startswith(b"\xef\xbb\xbf")
+    assert load_config(path) == parse_config(text, "marked.toml")
+
+
 @pytest.mark.parametrize("path", sorted(CONFIG_FOLDER.glob("*.toml")), ids=lambda path: path.name)
 def test_every_config_of_the_library_is_valid(path: Path) -> None:
     config = load_config(path)

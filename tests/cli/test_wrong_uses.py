@@ -373,6 +373,15 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
         TUNE_TABLE.format("speed", BOUNDS_LINE) + "[tune.constraints]\nclearence = 0.0",
         "no measure for a constraint",
     ),
+    "results at a URL": (("scan", "my.toml", "--out", "s3://wheels"), GRID_TABLE, "a URL"),
+    "figures at a URL": (("reproduce", "--out", "gs://wheels"), GRID_TABLE, "a URL"),
+    "examples at a URL": (("init", "file:///wheels"), GRID_TABLE, "a URL"),
+    "a config at a URL": (("gait", "https://wheels.org/my.toml"), GRID_TABLE, "a URL"),
+    "results in nobody's home": (
+        ("tune", "my.toml", "--out", "~nobody_of_this_name/x"),
+        TUNE_TABLE.format("speed", BOUNDS_LINE),
+        "there is no such user",
+    ),
     "a step beyond the range": (
         ("continue", "my.toml"),
         BRANCH_TABLE.format("4.0, 230.0") + "max_ds = 5.0",

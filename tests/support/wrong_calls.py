@@ -994,6 +994,21 @@ def register_wrong_calls() -> None:
     add_wrong_calls(
         "open_scan", lambda v: vrw.open_scan(v), many | {"number": (3, "TypeError")}, "path"
     )
+    urls = {
+        url: (url, "ValueError")
+        for url in ("s3://wheels/scan.zarr", "gs://wheels", "memory://wheels", "file:///wheels",
+                    "simplecache::s3://wheels", Path("s3://wheels/scan.zarr"))
+    }  # fmt: skip
+    for name, call in {
+        "scan into": lambda v: scan(store=v), "open_scan of": vrw.open_scan,
+        "map into": lambda v: vrw.map_special_points(
+            vrw.grid(damping=[100.0, 150.0], slope=[0.28, 0.3]), store=v
+        ),
+        "a figure into": lambda v: vrw.plot.save(None, v, "figure"), "a cache in": vrw.start_jax,
+    }.items():  # fmt: skip
+        add_wrong_calls(name, call, urls, "a URL")
+        nobody = {"nobody's home": ("~nobody_of_this_name/x", "ValueError")}
+        add_wrong_calls(name, call, nobody, "no such user: write './~nobody")
     unencodable = "wheels\ud800"  # half of a surrogate pair, which no file name contains
     add_wrong_calls(
         "open_scan verify",

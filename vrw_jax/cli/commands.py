@@ -39,6 +39,7 @@ from vrw_jax.scans import follow_special_points, forecast_scan, require_map_grid
 from vrw_jax.selection import list_model_config_names
 from vrw_jax.simulation import step
 from vrw_jax.tuning import tune
+from vrw_jax.validation import check_path
 from vrw_jax.web import make_page_address
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -229,6 +230,7 @@ def run_init_command(
     command names the file and writes nothing.
     """
     with report_command_errors():
+        folder = check_path("the folder", folder, "give a folder")
         example_folder = find_example_config_folder()
         example_config_texts = {
             config_path.name: config_path.read_text(encoding="utf-8")
@@ -239,7 +241,7 @@ def run_init_command(
             config_path = folder / config_name
             if not config_path.exists():
                 missing_config_paths.append(config_path)
-            elif config_path.read_text(encoding="utf-8", errors="replace") != config_text:
+            elif config_path.read_text(encoding="utf-8-sig", errors="replace") != config_text:
                 raise ValueError(
                     f"{config_path} is there already and differs: give another folder."
                 )
@@ -298,6 +300,7 @@ def run_reproduce_command(
     """
     with report_command_errors():
         _start_jax_and_load_config(None)
+        folder = check_path("--out", folder, "give a folder")
         _require_writable_folder(folder, draws_figure=True)
     from vrw_jax.paper import reproduce_paper
 
@@ -607,4 +610,5 @@ def _load_config_with_table(
             f"command takes {', '.join(supported_models)}: write "
             f"{'one of these' if len(supported_models) > 1 else 'that'} below [model]."
         )
-    return command_config, result_folder or Path("results") / config_path.stem
+    result_folder = result_folder or Path("results") / config_path.stem
+    return command_config, check_path("--out", result_folder, "give a folder")

@@ -21,7 +21,13 @@ from vrw_jax.numerics import StepOptions
 from vrw_jax.scans import MAX_LISTED_SAMPLES, check_measure_names, select_measure_catalog
 from vrw_jax.scans import design as designs
 from vrw_jax.selection import find_model_class, list_model_config_names
-from vrw_jax.validation import check_range, format_name_suggestion, format_value, require_known_name
+from vrw_jax.validation import (
+    check_path,
+    check_range,
+    format_name_suggestion,
+    format_value,
+    require_known_name,
+)
 from vrw_jax.wheel import (
     FRICTION_NAME,
     PARAMETER_DOMAINS,
@@ -290,7 +296,7 @@ class Config:
 
 def load_config(config_path: str | Path) -> Config:
     """Read and validate a config file. Raise a ValueError if the file is invalid."""
-    config_path = Path(config_path)
+    config_path = check_path("the config", config_path, "give the path of a TOML file")
     if not config_path.exists():
         name_suggestion = format_name_suggestion(
             config_path.name,
@@ -303,7 +309,8 @@ def load_config(config_path: str | Path) -> Config:
     if config_path.is_dir():
         raise ValueError(f"{config_path} is a folder, but a config is a TOML file: give its path.")
     try:
-        config_text = config_path.read_text(encoding="utf-8")
+        # Some editors put a byte-order mark before the text.
+        config_text = config_path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as read_error:
         raise ValueError(
             f"{config_path} can't be read ({read_error}): give a readable text file in UTF-8."

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from vrw_jax.measures import MEASURES, format_mathtext
-from vrw_jax.validation import check_type
+from vrw_jax.validation import check_path, check_type
 from vrw_jax.wheel import Outcome
 
 OKABE_ITO_BLUE = "#0072B2"
@@ -183,8 +183,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
         >>> [path.suffix for path in vrw.plot.save(figure, folder, "sticks")]
         ['.svg', '.png']
     """
-    check_type("folder", folder, (str, Path), 'give a folder, such as "figures"')
-    folder = Path(folder)
+    folder = check_path("folder", folder, 'give a folder, such as "figures"')
     folder.mkdir(parents=True, exist_ok=True)
     figure_paths = [folder / f"{name}.svg", folder / f"{name}.png"]
     with figure_style():

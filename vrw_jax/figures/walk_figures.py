@@ -510,8 +510,7 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str |
         'walk.gif'
     """
     check_type("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
-    check_path("path", path, 'give a file, such as "walk.gif"')
-    path = Path(path)
+    path = check_path("path", path, 'give a file, such as "walk.gif"')
     path.parent.mkdir(parents=True, exist_ok=True)
     shared_palette = frames[0].quantize(32)
     paletted_frames = [

@@ -23,6 +23,7 @@ from vrw_jax.paper.gaits import (
     walk_into_gait,
 )
 from vrw_jax.simulation import paper_start, simulate
+from vrw_jax.validation import check_path
 from vrw_jax.wheel import WheelParams
 
 ReproductionProgressCallback = Callable[[float, str], None]
@@ -175,7 +176,7 @@ def reproduce_paper(
     - `on_progress`: function that is called with the completed fraction and the name of the current
       task.
     """
-    folder = Path(folder)
+    folder = check_path("folder", folder, 'give a folder, such as "results/reproduction"')
     paper_evidence = collect_paper_evidence(on_progress)
     on_progress(0.8, "figures")
     write_paper_figures(paper_evidence, folder)

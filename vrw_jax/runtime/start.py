@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 
 from vrw_jax.runtime import disk_cache as store
-from vrw_jax.validation import check_bool, check_type
+from vrw_jax.validation import check_bool, check_path
 
 
 def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) -> None:
@@ -37,8 +37,7 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
         >>> vrw.start_jax("~/.cache/vrw_jax")  # doctest: +SKIP
     """
     if cache is not None:
-        check_type("cache", cache, (str, Path), "give a folder, or nothing for the user's own")
-        cache = Path(cache).expanduser()
+        cache = check_path("cache", cache, "give a folder, or nothing for the user's own")
         if cache.is_file():
             raise NotADirectoryError(
                 f"cache is {cache}, a file, but compiled code is kept in a folder: give a folder."

@@ -94,7 +94,7 @@ def scan(
         model: model of the wheel; "auto" for the simplest valid model for each sample.
         options: numerical options of the gait steps that check the gaits.
         cycle_options: numerical options of the search for gaits.
-        store: folder to which the result is written.
+        store: local folder to which the result is written, not a URL; may begin with `~`.
         chunk: number of samples that are written at a time; 4,096 by default.
         on_progress: function that is called with the `ScanProgress` after each chunk.
         dask: address of a dask cluster that computes the chunks, or "local" to start one.
@@ -120,7 +120,7 @@ def scan(
         ([1.018, nan], [0, 14])
     """
     if store is not None:
-        check_path("store", store, "give the folder to keep the result in")
+        store = check_path("store", store, "give the folder to keep the result in")
     if on_progress is not None:
         check_callable("on_progress", on_progress, "that takes the progress")
     scan_plan = plan_scan(

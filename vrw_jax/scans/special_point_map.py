@@ -91,7 +91,7 @@ def map_special_points(
         model: a `ViscoelasticWheel`, which is the default.
         options: numerical options of the gait steps that check the gaits of the scan.
         cycle_options: numerical options of the gait search of the scan.
-        store: folder to which the scan is written.
+        store: local folder to which the scan is written.
         on_progress: function that is called with the `ScanProgress` after each chunk.
         on_stage: function that is called with a description of each stage after the scan.
 

@@ -278,7 +278,7 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     store with damaged files causes a ValueError. `verify=False` skips the search for damage.
 
     Args:
-        path: folder of the store.
+        path: local folder of the store; no URL.
         verify: whether the files of each chunk are compared with the digest in the chunk's mark.
 
     Returns:
@@ -286,7 +286,7 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
 
     Raises:
         TypeError: if `path` is not a path.
-        ValueError: if there is no store of a scan at `path`, or if its files are damaged.
+        ValueError: if `path` is a URL, if it contains no store of a scan, or if files are damaged.
 
     Examples:
         >>> design = vrw.grid(damping=[150.0, 300.0])
@@ -295,13 +295,13 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
         ...     gaits = vrw.scan(design, ["speed"], store=path).load()
         ...     xr.testing.assert_identical(vrw.open_scan(path).speed.load(), gaits.speed)
     """
-    check_path("path", path, "give the folder that a scan wrote")
+    path = check_path("path", path, "give the folder that a scan wrote")
     verify = check_bool("verify", verify)
-    stored_metadata = _read_scan_metadata(Path(path))
+    stored_metadata = _read_scan_metadata(path)
     damaged_metadata = stored_metadata.find_damaged_metadata() if verify else []
     try:
-        zarr_group = _open_zarr_group(Path(path), "r", stored_metadata)
-        chunk_checksums = ChunkChecksums(Path(path), zarr_group, stored_metadata)
+        zarr_group = _open_zarr_group(path, "r", stored_metadata)
+        chunk_checksums = ChunkChecksums(path, zarr_group, stored_metadata)
         damage_description = verify and describe_store_damage(
             path,
             chunk_checksums.find_damaged_chunks(),

@@ -7,6 +7,7 @@ number raises a TypeError, and a number out of range raises a ValueError.
 import difflib
 import math
 import os
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -328,8 +329,11 @@ def check_type(
         )
 
 
-def check_path(argument_name: str, given_value: Any, remedy_text: str) -> None:
-    """Raise an error if a value is not a path that the file system can encode."""
+def check_path(argument_name: str, given_value: Any, remedy_text: str) -> Path:
+    """Return a path of the local file system, with a leading `~` replaced by the home folder.
+
+    Raise an error if the value is no path, or if it is a URL.
+    """
     check_type(argument_name, given_value, (str, Path), remedy_text)
     try:
         os.fsencode(given_value)
@@ -338,6 +342,24 @@ def check_path(argument_name: str, given_value: Any, remedy_text: str) -> None:
             f"{argument_name} is {given_value!r}, but the file system cannot encode this name: "
             f"{remedy_text}."
         ) from None
+    if URL_PATTERN.match(str(given_value)):
+        raise ValueError(
+            f"{argument_name} is {str(given_value)!r}, a URL, but files are locked and renamed "
+            "here, which takes a local file system: give a local path, and copy to or from the URL."
+        )
+    try:
+        return Path(given_value).expanduser()
+    except RuntimeError:
+        raise ValueError(
+            f"{argument_name} is {str(given_value)!r}, but there is no such user: write "
+            f"'./{given_value}' for a name that begins with ~."
+        ) from None
+
+
+URL_PATTERN = re.compile(r"([A-Za-z][\w+.-]+:+)+/")
+"""Pattern of the beginning of a URL, such as "s3://", "file:/" or "simplecache::s3://". The scheme
+has at least two characters, because one letter is a drive of Windows.
+"""
 
 
 def check_callable(argument_name: str, given_value: Any, function_description: str) -> None:
