@@ -5,6 +5,7 @@ library.
 """
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -256,6 +257,52 @@ def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> No
     assert "STEPPED" in result.stdout
 
 
+def test_figures_are_drawn_again_only_if_results_or_code_have_changed(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = config.parent / "results" / "small"
+
+    def scan_and_list_drawn_figures() -> list[str]:
+        previous_times = {path: path.stat().st_mtime_ns for path in folder.glob("scan_over_*")}
+        result = run_command("scan", config)
+        assert result.exit_code == 0, result.output
+        drawn = [
+            p for p in folder.glob("scan_over_*") if p.stat().st_mtime_ns != previous_times.get(p)
+        ]
+        assert result.stdout.count("written: ") == len(drawn)
+        assert result.stdout.count("up to date: ") == 2 - len(drawn)
+        return sorted(path.suffix for path in drawn)
+
+    both = [".png", ".svg"]
+    assert scan_and_list_drawn_figures() == both
+    assert scan_and_list_drawn_figures() == []
+    (folder / "scan_over_stiffness.png").unlink()
+    assert scan_and_list_drawn_figures() == both
+    shutil.rmtree(folder / "scan.zarr")
+    config.write_text(SCAN_CONFIG.replace("0.32", "0.33"))
+    assert scan_and_list_drawn_figures() == both
+    monkeypatch.setattr(scanning, "compute_source_digest", lambda: "other code")
+    assert scan_and_list_drawn_figures() == both
+    assert scan_and_list_drawn_figures() == []
+
+
+def test_a_tilde_is_the_home_folder_in_paths_of_configs_and_results(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = config.parent / "home"
+    monkeypatch.setenv("HOME", str(home))
+    assert run_command("init", "~/mine").exit_code == 0
+    (home / "mine" / "small.toml").write_text(SCAN_CONFIG)
+    result = run_command("scan", "~/mine/small.toml", "--out", "~/here", "--no-picture")
+    assert result.exit_code == 0, result.output
+    scanned = open_scan("~/here/scan.zarr")
+    stored = vrw.scan(vrw.grid(damping=[100.0]), ["speed"], store="~/there.zarr")
+    assert dict(stored.sizes) == {"damping": 1, "leg": 6}
+    assert scanned.sizes["damping"] == 4
+    assert sorted(path.name for path in home.iterdir()) == ["here", "mine", "there.zarr"]
+    assert not (config.parent / "~").exists()
+
+
 def test_a_stopped_scan_names_the_command_that_continues_it(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,6 +381,8 @@ def test_init_writes_the_example_configs_and_nothing_twice(config: Path) -> None
     for path in examples.glob("*.toml"):
         assert (config.parent / "mine" / path.name).read_text() == path.read_text()
         assert path.name in result.stdout
+    marked = config.parent / "mine" / "quickstart.toml"  # as an editor may write it
+    marked.write_text(marked.read_text(), encoding="utf-8-sig")
     second_run = run_command("init", "mine")
     assert second_run.exit_code == 0
     assert "nothing to write" in second_run.stdout

@@ -129,7 +129,7 @@ def configure_root_command(
       [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits with special points
 
     [bold]Files[/bold]   init: configs. gait: none. reproduce: figures and tables. scan: scan.zarr
-    (open it with vrw_jax.open_scan or xarray.open_zarr) and pictures, PNG and SVG.
+    (open it with vrw_jax.open_scan or xarray.open_zarr), pictures, PNG and SVG, and figures.json.
     tune: path.zarr, a picture, summary.md, and wheel.toml, a config of vrw gait.
     continue: branch.zarr, borders.csv, a picture and summary.md.
 
@@ -353,8 +353,8 @@ def run_scan_command(
 
     The command writes scan.zarr and figures (PNG and SVG) into the folder. After an interruption,
     the same command continues where it stopped, and the data are bitwise the same. For a finished
-    scan, the command computes only chunks with damaged files again. The exit code is 1 if --verify
-    finds damage.
+    scan, the command computes only chunks with damaged files again, and draws only figures that are
+    missing or out of date. The exit code is 1 if --verify finds damage.
 
     [bold]Examples[/bold]
 
@@ -377,15 +377,14 @@ def run_scan_command(
         if verify:
             scanning.verify_scan_store(scan_plan, store_path)
             return
-        _require_writable_folder(folder, picture)
+        has_figures = (folder / scanning.FIGURE_RECORD_NAME).exists()
+        _require_writable_folder(folder, draws_figure=picture and not has_figures)
     scan_dataset = scanning.compute_scan_with_progress(scan_plan, store_path, dask)
     with report_command_errors(f"stopped; the data are in {store_path}."):
         printing.print_outcome_counts(scan_dataset)
         stdout_console.print(f"data: {store_path}", highlight=False, soft_wrap=True)
         if picture:
-            from vrw_jax.cli.reports import write_scan_figures
-
-            printing.print_written_paths(write_scan_figures(scan_dataset, folder))
+            scanning.draw_scan_figures(scan_dataset, store_path)
 
 
 @app.command("robustness")

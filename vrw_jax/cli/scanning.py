@@ -1,5 +1,6 @@
 """Scans from the command line: planning from a config, verification and computation."""
 
+import json
 from pathlib import Path
 
 import typer
@@ -13,14 +14,20 @@ from vrw_jax.cli.console import (
     stdout_console,
 )
 from vrw_jax.measures import xarray as xr
+from vrw_jax.runtime import compute_source_digest, find_library_version
 from vrw_jax.scans import (
     ScanPlan,
+    compute_store_digest,
     find_matching_store,
     open_or_create_store,
     plan_scan,
+    read_metadata_file,
     resolve_executor,
     run_scan,
 )
+
+FIGURE_RECORD_NAME = "figures.json"
+"""Name of the file that states from which results and with which code figures were drawn."""
 
 
 def plan_config_scan(
@@ -91,3 +98,28 @@ def compute_scan_with_progress(
             return run_scan(
                 scan_plan, zarr_store, on_progress=report_progress, chunk_executor=chunk_executor
             )
+
+
+def draw_scan_figures(scan_dataset: "xr.Dataset", store_path: Path) -> None:
+    """Write the figures of a scan beside its store, and print their paths.
+
+    Figures that were drawn from the same results with the same code are not drawn again.
+    """
+    record_path = store_path.with_name(FIGURE_RECORD_NAME)
+    figure_origin = {
+        "results": compute_store_digest(store_path),
+        "code": compute_source_digest(),
+        "matplotlib": find_library_version("matplotlib"),
+    }
+    figure_record = read_metadata_file(record_path)
+    figure_paths = [store_path.with_name(name) for name in figure_record.pop("files", [])]
+    if figure_record == figure_origin and all(map(Path.is_file, figure_paths)):
+        for figure_path in figure_paths:
+            stdout_console.print(f"up to date: {figure_path}", highlight=False, soft_wrap=True)
+        return
+    from vrw_jax.cli.reports import write_scan_figures
+
+    figure_paths = write_scan_figures(scan_dataset, store_path.parent)
+    figure_record = figure_origin | {"files": [figure_path.name for figure_path in figure_paths]}
+    record_path.write_text(json.dumps(figure_record, indent=2), encoding="utf-8")
+    printing.print_written_paths(figure_paths)

@@ -20,7 +20,7 @@ from vrw_jax.scans.execution import (
     scan,
 )
 from vrw_jax.scans.forecast import forecast_scan, format_duration
-from vrw_jax.scans.integrity import read_scan_manifest
+from vrw_jax.scans.integrity import compute_store_digest, read_metadata_file, read_scan_manifest
 from vrw_jax.scans.measure_catalog import (
     DIFFERENTIABLE_MEASURES,
     check_measure_names,

@@ -255,8 +255,7 @@ def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultSto
     settings_difference_text = describe_settings_difference(
         stored_manifest[PROVENANCE_ATTRIBUTE], describe_computing_environment()
     )
-    n_missing_chunks = len(zarr_store.find_missing_chunks())
-    if settings_difference_text and n_missing_chunks:
+    if settings_difference_text and (n_missing_chunks := len(zarr_store.find_missing_chunks())):
         damaged_chunks_text = (
             f" ({len(zarr_store.damaged_chunks)} of them damaged)"
             if zarr_store.damaged_chunks

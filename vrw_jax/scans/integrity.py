@@ -79,6 +79,15 @@ def add_attribute_seal(chunk_mark_attributes: JsonObject) -> JsonObject:
     }
 
 
+def compute_store_digest(store_path: Path) -> str:
+    """Return a digest of the marks of all chunks of a store in hexadecimal digits.
+
+    It changes with every setting and every result of the scan.
+    """
+    mark_paths = sorted(filter(Path.is_file, (store_path / CHECKSUM_ARRAY_NAME).rglob("*")))
+    return _compute_hex_digest(b"".join(map(Path.read_bytes, mark_paths)))
+
+
 def digest_coordinate_values(coordinate_values: np.ndarray) -> str:
     """Return the digest of a coordinate's type, shape and values, in hexadecimal digits."""
     return _compute_hex_digest(
