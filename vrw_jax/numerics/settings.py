@@ -26,13 +26,19 @@ def with_default_jax_settings(function: FunctionType) -> FunctionType:
             and jax_config.jax_numpy_rank_promotion == "allow"
             and jax_config.jax_numpy_dtype_promotion == "standard"
         )
-        if has_default_jax_settings:
-            return function(*args, **keywords)
-        with (
-            jax.disable_jit(False),
-            jax.numpy_rank_promotion("allow"),
-            jax.numpy_dtype_promotion("standard"),
-        ):
-            return function(*args, **keywords)
+        try:
+            if has_default_jax_settings:
+                return function(*args, **keywords)
+            with (
+                jax.disable_jit(False),
+                jax.numpy_rank_promotion("allow"),
+                jax.numpy_dtype_promotion("standard"),
+            ):
+                return function(*args, **keywords)
+        except KeyboardInterrupt as interruption:
+            if not interruption.args:
+                raise
+            # The frames of the library would hide a message that states what is kept.
+            raise interruption.with_traceback(None) from None
 
     return call_with_default_settings  # type: ignore[return-value]
