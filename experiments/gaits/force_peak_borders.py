@@ -101,7 +101,7 @@ def bisect_borders() -> None:
         one_peak_slope = np.where(has_two_peaks, one_peak_slope, slope)
     params = make_wheels(number, LIGHT_DAMPING, two_peak_slope, natural_length)
     gaits = vrw.limit_cycles(params, options=GAIT_OPTIONS)
-    measures = gaits.measures(["force_trough_depth", "peak_force", "dls_fraction"])
+    measures = gaits.measures(["force_trough_depth", "smooth_peak_force", "dls_fraction"])
     depth, peak_force, dls_fraction = (np.asarray(x) for x in measures.values())
     lines = []
     for i in np.flatnonzero(is_found & np.asarray(gaits.found)):

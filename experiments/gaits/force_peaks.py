@@ -80,7 +80,7 @@ SLOPES = np.geomspace(0.03, 0.4, N_PER_AXIS)
 LEAST_RELATIVE_TROUGH = 1e-3
 """Depth of a trough over the peak force, chosen because bisection leaves less if both vanish."""
 
-MEASURE_NAMES = ("n_force_peaks", "peak_force", "force_trough_depth", "dls_fraction",
+MEASURE_NAMES = ("n_force_peaks", "smooth_peak_force", "force_trough_depth", "dls_fraction",
                  "spectral_radius", "period")  # fmt: skip
 BOUNCE_COLUMNS = ("bounces", "step_bounces", "first_peak_to_touchdown", "peak_distance")
 """Durations in periods of the bounce: of single support, of the step, from the first peak to the
@@ -138,7 +138,10 @@ def summarize_maps(rows: list[Row]) -> str:
         for n_peaks in sorted({row["n_force_peaks"] for row in gaits}):
             group = [row for row in gaits if row["n_force_peaks"] == n_peaks]
             depth = (
-                max(read_column(group, "force_trough_depth") / read_column(group, "peak_force"))
+                max(
+                    read_column(group, "force_trough_depth")
+                    / read_column(group, "smooth_peak_force")
+                )
                 if int(n_peaks) > 1
                 else None
             )

@@ -23,6 +23,7 @@ class Extrema(NamedTuple):
     forces: np.ndarray  # N
     is_maximum: np.ndarray
     rate_maxima_after_peak: np.ndarray  # maxima of the force's rate after the first maximum, N/s
+    largest_force: float  # in the step, at an extremum or at an end of an interval, N
 
     def compute_trough_depth(self) -> float:
         """Return the largest depth of a minimum below the lower of two maxima around it, N."""
@@ -86,7 +87,8 @@ def find_extrema(polynomials: list[Chebyshev]) -> Extrema:
         later_rates += force.deriv()(rate_times[rate_times > first_peak]).tolist()
         forces += force(times).tolist()
         maxima += is_maximum.tolist()
-    return Extrema(np.array(forces), np.array(maxima, bool), np.array(later_rates))
+    largest = max(*forces, *(force(np.array(force.domain)).max() for force in polynomials))
+    return Extrema(np.array(forces), np.array(maxima, bool), np.array(later_rates), largest)
 
 
 def find_step_extrema(

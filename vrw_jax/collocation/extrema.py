@@ -79,7 +79,8 @@ class PhaseExtrema(NamedTuple):
 
     All arrays have a fixed length. An element that is no extremum has false flags, and its times
     and values are meaningless. The times carry no derivatives. The values nevertheless have exact
-    first derivatives, because F and R are stationary in time at their extrema.
+    first derivatives, because F and R are stationary in time at their extrema. The values at the
+    ends have first derivatives, too, because the ends move with the motion.
     """
 
     extremum_times: Float[Array, " pieces"]  # since the start of the phase, s
@@ -89,6 +90,7 @@ class PhaseExtrema(NamedTuple):
     rate_extremum_times: Float[Array, " rates"]  # since the start of the phase, s
     rate_extremum_values: Float[Array, " rates"]  # value of R at its extrema
     is_rate_maximum: Bool[Array, " rates"]
+    end_values: Float[Array, "2"]  # value of F at the start and at the end of the phase
 
 
 FunctionOfCoordinatesAndRates = Callable[[Array, Array], Array]
@@ -415,6 +417,10 @@ def find_quantity_extrema(
         rate_extremum_times=rate_extremum_times[1:-1],
         rate_extremum_values=rates[1:-1],
         is_rate_maximum=is_rate_extremum & (second_rate_slopes < 0.0) & (phase_duration > 0.0),
+        end_values=jax.vmap(compute_quantity)(
+            phase_motion.interval_boundary_q[np.array([0, -1])],
+            phase_motion.interval_boundary_v[np.array([0, -1])],
+        ),
     )
 
 

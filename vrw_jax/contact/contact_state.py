@@ -319,9 +319,17 @@ def compute_normal_forces(
     contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
 ) -> NormalForces:
     """Return the normal forces of the ground on the feet, N."""
-    first_force, second_force = solve_contact_forces(
-        contact_mode_dynamics.configure_contacts(motion)
-    ).normal_forces
+    return split_normal_forces(
+        contact_mode_dynamics,
+        solve_contact_forces(contact_mode_dynamics.configure_contacts(motion)).normal_forces,
+    )
+
+
+def split_normal_forces(
+    contact_mode_dynamics: ContactModeDynamics, slot_normal_forces: SlotArray
+) -> NormalForces:
+    """Return the normal forces on the feet, computed from those in the contact slots, N."""
+    first_force, second_force = slot_normal_forces
     # A loaded fore foot is in the first contact slot.
     is_fore_loaded = contact_mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
     return NormalForces(jnp.where(is_fore_loaded, first_force, 0.0), first_force + second_force)

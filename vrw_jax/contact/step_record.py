@@ -21,6 +21,7 @@ from vrw_jax.contact.contact_state import (
     GuardLayout,
     compute_forces,
     compute_normal_force_rates,
+    split_normal_forces,
 )
 from vrw_jax.contact.impacts import (
     ContactEvent,
@@ -190,30 +191,34 @@ def determine_interval_outcome(
 
 
 class ForcePeakRecord(NamedTuple):
-    """Smooth extrema of normal forces between the events of one walking step.
+    """Smooth extrema of normal forces between the events of one walking step, and largest forces.
 
-    The extrema are those of the force on the foot of Leg 1, except for the last two fields.
+    The extrema are those of the force on the foot of Leg 1, except for fields of the total force.
     """
 
     n_force_peaks: Int[Array, "..."]  # number of maxima
-    peak_force: Elementwise  # largest maximum, N; -inf without a maximum
+    smooth_peak_force: Elementwise  # largest maximum, N; -inf without a maximum
     lowest_force_after_peak: Elementwise  # smallest minimum after the largest maximum, N; else inf
     trough_depth: Elementwise  # lower of two maxima minus a minimum between them, largest, N
     second_peak_rate: Elementwise  # largest maximum of the rate after a maximum, N/s; else -inf
     n_total_force_peaks: Int[Array, "..."]  # number of maxima of the sum of the forces on all feet
-    peak_total_force: Elementwise  # largest maximum of this sum, N; -inf without a maximum
+    smooth_peak_total_force: Elementwise  # largest maximum of this sum, N; -inf without a maximum
     n_force_extrema: Int[Array, "..."]  # number of recorded extrema, rates included
+    peak_force: Elementwise  # largest force in the step, ends of its intervals included, N
+    peak_total_force: Elementwise  # largest sum in the step, ends of its intervals included, N
 
     def compute_force_measures(self) -> dict[str, Array]:
         """Return the measures of the peaks, by their names in `measures.FORCE_PEAK_MEASURES`."""
-        has_second_rate = jnp.isfinite(self.second_peak_rate)
+        nan_if_missing = lambda value: jnp.where(jnp.isfinite(value), value, jnp.nan)
         return {
             "n_force_peaks": self.n_force_peaks.astype(self.trough_depth.dtype),
-            "peak_force": jnp.where(self.n_force_peaks > 0, self.peak_force, 0.0),
+            "peak_force": self.peak_force,
+            "smooth_peak_force": nan_if_missing(self.smooth_peak_force),
             "force_trough_depth": self.trough_depth,
-            "second_peak_rate": jnp.where(has_second_rate, self.second_peak_rate, jnp.nan),
+            "second_peak_rate": nan_if_missing(self.second_peak_rate),
             "n_total_force_peaks": self.n_total_force_peaks.astype(self.trough_depth.dtype),
-            "peak_total_force": jnp.where(self.n_total_force_peaks > 0, self.peak_total_force, 0.0),
+            "peak_total_force": self.peak_total_force,
+            "smooth_peak_total_force": nan_if_missing(self.smooth_peak_total_force),
         }
 
 
@@ -222,13 +227,15 @@ def init_force_peak_record(lane_template: Array) -> ForcePeakRecord:
     float_zero, int_zero = jnp.zeros_like(lane_template), jnp.zeros_like(lane_template, jnp.int32)
     return ForcePeakRecord(
         n_force_peaks=int_zero,
-        peak_force=float_zero - jnp.inf,
+        smooth_peak_force=float_zero - jnp.inf,
         lowest_force_after_peak=float_zero + jnp.inf,
         trough_depth=float_zero,
         second_peak_rate=float_zero - jnp.inf,
         n_total_force_peaks=int_zero,
-        peak_total_force=float_zero - jnp.inf,
+        smooth_peak_total_force=float_zero - jnp.inf,
         n_force_extrema=int_zero,
+        peak_force=float_zero,
+        peak_total_force=float_zero,
     )
 
 
@@ -245,13 +252,14 @@ def record_force_extremum(
     """
     (
         n_force_peaks,
-        peak_force,
+        smooth_peak_force,
         lowest_force_after_peak,
         trough_depth,
         second_peak_rate,
         n_total_force_peaks,
-        peak_total_force,
+        smooth_peak_total_force,
         n_force_extrema,
+        *_,
     ) = force_peak_record
     is_fore_extremum, is_total_extremum, is_rate_extremum = is_rate_zero
     assert contact_mode_dynamics.contact_state.force_rate_signs is not None
@@ -264,10 +272,11 @@ def record_force_extremum(
     is_after_trough = jnp.isfinite(lowest_force_after_peak)
     last_trough_depth = jnp.where(
         is_peak & is_after_trough,
-        jnp.minimum(force, peak_force) - jnp.where(is_after_trough, lowest_force_after_peak, 0.0),
+        jnp.minimum(force, smooth_peak_force)
+        - jnp.where(is_after_trough, lowest_force_after_peak, 0.0),
         0.0,
     )
-    is_highest_peak = is_peak & (force > peak_force)
+    is_highest_peak = is_peak & (force > smooth_peak_force)
     lowest_force_after_peak = jnp.where(
         is_trough & (force < lowest_force_after_peak),
         force,
@@ -277,9 +286,9 @@ def record_force_extremum(
     # If only the fore foot is loaded, both forces have the same extrema.
     is_fore_foot_alone = contact_mode_dynamics.slot_modes[1] == ContactMode.OFF
     is_total_peak = (is_total_extremum & is_total_rising) | (is_peak & is_fore_foot_alone)
-    return ForcePeakRecord(
+    return force_peak_record._replace(
         n_force_peaks=n_force_peaks + is_peak,
-        peak_force=jnp.where(is_highest_peak, force, peak_force),
+        smooth_peak_force=jnp.where(is_highest_peak, force, smooth_peak_force),
         lowest_force_after_peak=jnp.where(is_highest_peak, jnp.inf, lowest_force_after_peak),
         trough_depth=jnp.maximum(trough_depth, last_trough_depth),
         second_peak_rate=jnp.where(
@@ -288,10 +297,10 @@ def record_force_extremum(
             second_peak_rate,
         ),
         n_total_force_peaks=n_total_force_peaks + is_total_peak,
-        peak_total_force=jnp.where(
-            is_total_peak & (total_force > peak_total_force),
+        smooth_peak_total_force=jnp.where(
+            is_total_peak & (total_force > smooth_peak_total_force),
             total_force,
-            peak_total_force,
+            smooth_peak_total_force,
         ),
         n_force_extrema=n_force_extrema + jnp.any(is_rate_zero, axis=0),
     )
@@ -356,7 +365,14 @@ def record_event(
     stopper_impulse = jnp.minimum(
         step_details.margins.stopper_impulse, event_result.stopper_impulse
     )
+    force_peaks = step_details.force_peaks
+    if force_peaks is not None:  # The force before the first event belongs to the previous step.
+        force_peaks = force_peaks._replace(
+            peak_force=keep_first(0.0, force_peaks.peak_force),
+            peak_total_force=keep_first(0.0, force_peaks.peak_total_force),
+        )
     return step_details._replace(
+        force_peaks=force_peaks,
         post_impact=keep_first(post_impact, step_details.post_impact),
         landing_normal=keep_first(event_result.normal_impulse, step_details.landing_normal),
         landing_tangential=keep_first(
@@ -379,14 +395,16 @@ def record_contact_interval(
     """Return the step details updated at the start or at the end of an interval.
 
     The minimum of the stopper force on legs in the air is updated. The duration is added to the
-    entry of `mode_durations` for the present contact modes.
+    entry of `mode_durations` for the present contact modes. If force peaks are measured, the
+    largest normal forces are updated; between events the largest force is at an extremum.
 
     - `motion`: motion at this time;
     - `duration`: time to add, s. It is the length of the interval at one of the two times, and 0 at
       the other.
     """
     slot_modes = contact_mode_dynamics.slot_modes
-    stopper_forces = compute_forces(contact_mode_dynamics, motion).airborne_stopper_forces
+    contact_forces = compute_forces(contact_mode_dynamics, motion)
+    stopper_forces = contact_forces.airborne_stopper_forces
     stopper_force = jnp.min(
         jnp.where(contact_mode_dynamics.is_airborne_leg_locked, stopper_forces, jnp.inf), axis=0
     )
@@ -395,7 +413,19 @@ def record_contact_interval(
         (mode_codes == slot_modes[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
     )
     stopper_force = jnp.minimum(step_details.margins.stopper_force, stopper_force)
+    force_peaks = step_details.force_peaks
+    if force_peaks is not None:
+        fore_force, total_force = split_normal_forces(
+            contact_mode_dynamics, contact_forces.force_solution.normal_forces
+        )
+        # Two tied forces give the maximum one-sided derivatives. Selection returns one of them.
+        select_larger = lambda force, largest: jnp.where(force > largest, force, largest)
+        force_peaks = force_peaks._replace(
+            peak_force=select_larger(fore_force, force_peaks.peak_force),
+            peak_total_force=select_larger(total_force, force_peaks.peak_total_force),
+        )
     return step_details._replace(
+        force_peaks=force_peaks,
         mode_durations=step_details.mode_durations
         + is_first_slot_mode[:, None] * is_second_slot_mode[None, :] * duration,
         margins=UnilateralMargins(stopper_force, step_details.margins.stopper_impulse),

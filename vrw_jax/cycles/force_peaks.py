@@ -1,7 +1,7 @@
 """Locate peaks of the ground's normal force in a gait of the paper's model.
 
 The peaks are located on the collocation solution of the gait. A peak is a smooth maximum inside a
-phase. Impacts and changes of phase are no peaks.
+phase. Impacts and changes of phase are no peaks. The largest force may also occur there.
 """
 
 import functools
@@ -78,6 +78,7 @@ def compute_force_peaks(
                 **_summarize_force_extrema(fore_force_extrema, phase_durations),
                 "n_total_force_peaks": total_force_peaks["n_force_peaks"],
                 "peak_total_force": total_force_peaks["peak_force"],
+                "smooth_peak_total_force": total_force_peaks["smooth_peak_force"],
                 "landing_impulse": landing_result.fore_impulse.normal,
             }
         )
@@ -150,12 +151,18 @@ def _summarize_force_extrema(
     is_later_rate_maximum = step_extrema.is_rate_maximum & (
         step_extrema.rate_extremum_times > first_peak_time
     )
+    has_phase_occurred = jnp.repeat(phase_durations > 0.0, 2)
+    candidate_forces = jnp.append(
+        peak_forces, jnp.where(has_phase_occurred, step_extrema.end_values, -jnp.inf)
+    )
     largest_force_rate = jnp.max(
         jnp.where(is_later_rate_maximum, step_extrema.rate_extremum_values, -jnp.inf)
     )
     return {
         "n_force_peaks": jnp.sum(is_peak).astype(phase_durations.dtype),
-        "peak_force": jnp.where(jnp.any(is_peak), jnp.max(peak_forces), 0.0),
+        # The maximum of tied forces has one-sided derivatives. Selection returns one of them.
+        "peak_force": candidate_forces[jnp.argmax(candidate_forces)],
+        "smooth_peak_force": jnp.where(jnp.any(is_peak), jnp.max(peak_forces), jnp.nan),
         "force_trough_depth": jnp.max(force_trough_depths),
         "second_peak_rate": jnp.where(jnp.any(is_later_rate_maximum), largest_force_rate, jnp.nan),
     }

@@ -285,7 +285,10 @@ FORCE_PEAK_MEASURES = _index_measures_by_name(
     Measure("n_force_peaks", "1", "n_F", "number of force peaks",
             "Smooth maxima of the fore foot's normal force inside the phases of a step."),
     Measure("peak_force", "N", "F_max", "peak force",
-            "Largest of these maxima; 0 if there is none."),
+            "Largest normal force on the fore foot during the step, at a maximum or at an event. "
+            "Impulses are not forces."),
+    Measure("smooth_peak_force", "N", "F_peak", "highest force peak",
+            "Largest smooth maximum of the fore foot's normal force; NaN if there is none."),
     Measure("force_trough_depth", "N", "ΔF", "depth of the force's trough",
             "Lower of two force peaks less the smooth minimum between them, largest over the step; "
             "0 if there is none."),
@@ -296,12 +299,14 @@ FORCE_PEAK_MEASURES = _index_measures_by_name(
             "As the number of force peaks, for the sum of both feet's normal forces."),
     Measure("peak_total_force", "N", "F_tot,max", "peak of the total force",
             "As the peak force, for the sum of both feet's normal forces."),
+    Measure("smooth_peak_total_force", "N", "F_tot,peak", "highest peak of the total force",
+            "As the highest force peak, for the sum of both feet's normal forces."),
     Measure("landing_impulse", "N s", "λ_I2", "impulse of the landing",
             "Normal impulse of the ground on the fore foot in the landing.", "(18)"),
 )
-"""Measures of the peaks of the ground's normal force in a step of a gait. Peaks lie inside the
-phases; impacts and changes of phase are not peaks. For a gait of several steps, each measure is the
-largest of its values in these steps.
+"""Measures of the ground's normal force in a step of a gait. Peaks lie inside the phases; impacts
+and changes of phase are not peaks, although the largest force may occur there. For a gait of
+several steps, each measure is the largest of its values in these steps.
 """
 
 PASSAGE_MEASURES = _index_measures_by_name(

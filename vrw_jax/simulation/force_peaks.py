@@ -39,9 +39,10 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     """Return the peaks of the normal force in each step of a walk that `vrw.simulate` returned.
 
     A peak is a smooth maximum of the force on the fore foot, Leg 1, between two events. Impacts and
-    changes of phase or contact are not peaks. Peaks are located on a spline of degree 7 through the
-    samples of each interval. For gaits, the method `measures` of the result of `vrw.limit_cycle`
-    returns the same measures without samples, and with derivatives.
+    changes of phase or contact are not peaks, but the largest force may occur there. Peaks are
+    located on a spline of degree 7 through the samples of each interval. For gaits, the method
+    `measures` of the result of `vrw.limit_cycle` returns the same measures without samples, and
+    with derivatives.
 
     Args:
         walk: a trajectory with at least 9 samples per phase.
@@ -103,7 +104,10 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
             for normal_force in (fore_force, total_force)
         )
         fore_force_extrema.append(fore_extrema)
-        measures_by_step.append(_summarize_force_extrema(fore_extrema, total_extrema))
+        sampled_forces = (force[sample_steps == step_index] for force in (fore_force, total_force))
+        measures_by_step.append(
+            _summarize_force_extrema(fore_extrema, total_extrema, *map(np.max, sampled_forces))
+        )
     dataset_variables = {
         measure_name: (
             "step",
@@ -201,12 +205,15 @@ def _find_force_extrema(
 
 
 def _summarize_force_extrema(
-    fore_force_extrema: _ForceExtrema, total_force_extrema: _ForceExtrema
+    fore_force_extrema: _ForceExtrema,
+    total_force_extrema: _ForceExtrema,
+    largest_sample: float,
+    largest_total_sample: float,
 ) -> dict[str, Any]:
     """Return the force measures of one step.
 
     The measures are computed from the extrema of the normal force on the fore foot and of the total
-    normal force.
+    normal force, and from the largest sample of each force, N.
     """
     forces, is_maximum = fore_force_extrema.force, fore_force_extrema.is_extremum_maximum
     total_peaks = total_force_extrema.force[total_force_extrema.is_extremum_maximum]
@@ -218,9 +225,11 @@ def _summarize_force_extrema(
             force_trough_depth = max(force_trough_depth, lower_peak - forces[i])
     return {
         "n_force_peaks": int(np.sum(is_maximum)),
-        "peak_force": np.max(forces[is_maximum], initial=0.0),
+        "peak_force": np.max(forces, initial=largest_sample),
+        "smooth_peak_force": np.max(forces[is_maximum]) if np.any(is_maximum) else np.nan,
         "force_trough_depth": force_trough_depth,
         "second_peak_rate": fore_force_extrema.max_rate_after_first_peak[0],
         "n_total_force_peaks": len(total_peaks),
-        "peak_total_force": np.max(total_peaks, initial=0.0),
+        "peak_total_force": np.max(total_peaks, initial=largest_total_sample),
+        "smooth_peak_total_force": np.max(total_peaks) if total_peaks.size else np.nan,
     }
