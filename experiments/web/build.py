@@ -24,6 +24,7 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.web.programs import (
     GROUND_TOLD,
     LEGS,
+    PAGE_FRICTION,
     PAGE_MARGINS,
     SAMPLES,
     Program,
@@ -38,7 +39,12 @@ from vrw_jax.measures import (
     STOPPER_MARGIN_MEASURES,
     UNILATERAL_STEP_MEASURES,
 )
-from vrw_jax.models import PAPER_START_STATE, DoubleSupportIndicators, EnergyLoss
+from vrw_jax.models import (
+    PAPER_START_STATE,
+    DoubleSupportIndicators,
+    EnergyLoss,
+    RequiredFriction,
+)
 from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parents[2]
@@ -129,15 +135,16 @@ def list_output_rows(n_legs: int) -> list[str]:
         "step_length",
         *_field_names(DoubleSupportIndicators),
         *(name for names in margins for name in names),
+        *(RequiredFriction.measure_name_by_field[name] for name in PAGE_FRICTION),
         *_field_names(EnergyLoss),
     ]
 
 
 def _field_names(result: Any) -> list[str]:
     return [
-        result.measure_names.get(name, name)
+        result.measure_name_by_field.get(name, name)
         for name in result.__annotations__
-        if name != "measure_names"
+        if name != "measure_name_by_field"
     ]
 
 

@@ -24,6 +24,7 @@ from vrw_jax.integrator import load_explicit_tableau, sample_batch_phase
 from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
 from vrw_jax.models import (
     N_STEP_INPUTS,
+    RequiredFriction,
     RigidWheel,
     StepResult,
     advance_gait_step,
@@ -63,6 +64,9 @@ class Program(NamedTuple):
 
 PAGE_MARGINS = {name: m for name, m in MARGIN_MEASURES.items() if name != "takeoff_acceleration"}
 """Margins on the page: of scuffing the clearances tell there."""
+
+PAGE_FRICTION = tuple(name for name in RequiredFriction.measure_name_by_field if name != "stopper")
+"""Required friction coefficients on the page: that of collision II may be infinite."""
 
 
 class _OfAnyLegs(WheelParams):
@@ -322,6 +326,7 @@ def _numbers_of(step: StepResult) -> Array:
     parts = (
         step.section_state, step.post_impact, step.durations, step.step_length,
         *vars(step.indicators).values(), *(getattr(step.margins, name) for name in PAGE_MARGINS),
+        *(getattr(step.required_friction, name) for name in PAGE_FRICTION),
         *vars(step.energy).values(),
     )  # fmt: skip
     return jnp.concatenate([jnp.atleast_2d(part) for part in parts])

@@ -71,6 +71,39 @@ def test_every_margin_equals_the_reference(index, by_lanes):
     np.testing.assert_allclose(
         1.0 - m.landing_friction_rear, reference["impulse_friction_leg2"], **exact
     )
+    stopper_ratio = reference["impulse_friction_stopper"]
+    expected = {
+        "fore": reference["friction_leg1"],
+        "rear": reference["friction_leg2_landing"],
+        "landing_fore": reference["impulse_friction_leg1"],
+        "landing_rear": reference["impulse_friction_leg2"],
+        "stopper": stopper_ratio if stopper_ratio > 0.0 else np.inf,
+    }
+    needed = {name: getattr(solution.required_friction, name) for name in expected}
+    # The impulses of collision II are 1e-4 of the momenta from whose difference they follow.
+    rounded = {"fore": near, "stopper": {"rtol": 1e-6}}
+    for name, value in expected.items():
+        np.testing.assert_allclose(needed[name], value, **rounded.get(name, exact), err_msg=name)
+    assert solution.required_friction.largest == max(list(needed.values())[:4])
+
+
+def test_the_required_friction_of_table_1_is_that_of_the_rear_foot_just_after_the_landing():
+    """14.2, and 9.7 and 1.10 in the landing: the independent code's numbers."""
+    wheel = vrw.WheelParams()
+    x = vrw.limit_cycle(wheel).section_state
+    step = vrw.step(wheel, x, model=vrw.ViscoelasticWheel(friction=0.4))
+    measures = step.measures()
+    assert abs(measures["required_friction"] - 14.2) < 0.05
+    assert measures["required_friction"] == measures["required_friction_rear"]
+    assert abs(measures["required_friction_fore"] - 0.61) < 0.005
+    assert abs(measures["required_friction_landing_fore"] - 1.10) < 0.005
+    assert abs(measures["required_friction_landing_rear"] - 9.7) < 0.05
+    for margin, part in (("friction_fore", "fore"), ("friction_rear", "rear"),
+                         ("landing_friction_rear", "landing_rear")):  # fmt: skip
+        assert measures[margin] == 0.4 - measures[f"required_friction_{part}"]
+    # In collision II the ground would have to pull, so no friction holds the foot.
+    assert step.margins.hit_planted_impulse < 0.0
+    assert measures["required_friction_stopper"] == np.inf
 
 
 @PARAMETRIZE_BY_ENGINE

@@ -240,6 +240,7 @@ def compute_margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     out["stopper_impulse_stopper"] = _project_jumps(wheel, q, jumps)
     total = np.sum([m * dv for m, dv in zip(_masses(wheel), jumps, strict=True)], axis=0)
     out["normal_impulse_stopper"] = float(total[1])
+    out["impulse_friction_stopper"] = abs(total[0]) / total[1]  # negative if the ground must pull
 
     residual = float(np.max(np.abs(landing - result["lambda_impulse_applied"])))
     residual = max(residual, abs(float(total[1] - result["lambda_stopper"][1])))

@@ -181,13 +181,12 @@ def test_a_walk_that_slides_to_a_halt_is_shown_until_it_stops(page):
 
 def test_insufficient_friction_is_reported(page):
     params = vrw.WheelParams()
-    margins = vrw.step(params, vrw.limit_cycle(params).section_state).margins
-    left_part = [margins.friction_fore, margins.landing_friction_fore]
-    needed = f"{1.0 - float(min(left_part)):.4g}"
+    required = vrw.step(params, vrw.limit_cycle(params).section_state).required_friction
+    needed = f"{float(max(required.fore, required.landing_fore)):.4g}"
     evaluate = lambda mu: (
         page.evaluate("mu => vrw.update({ friction: mu })", mu) or page.inner_text("#verdict")
     )
-    assert f"The fore foot needs a friction of {needed}" in evaluate(1.0)
+    assert f"The fore foot requires a friction coefficient of {needed}" in evaluate(1.0)
     assert "with 1.2, the rear foot would slide" in evaluate(1.2)
     assert page.get_attribute("#verdict", "class") == "good"
     assert "both feet would slide" in evaluate(0.3)

@@ -501,10 +501,10 @@ def measure_gait_period(
 ) -> dict[str, Array]:
     """Return all measures of one period of a gait, which starts at `section_state`.
 
-    Indicators and margins are minima over the gait steps, and durations and energies are sums. The
-    section state is that of the last step, and the post-impact state is that of the first step.
-    `outcome` is the first failure of a step, if any. `closure` is the largest change of the section
-    state over the period.
+    Indicators and margins are minima over the gait steps, required friction coefficients are
+    maxima, and durations and energies are sums. The section state is that of the last step, and the
+    post-impact state is that of the first step. `outcome` is the first failure of a step, if any.
+    `closure` is the largest change of the section state over the period.
     """
 
     def measure_next_step(
@@ -539,6 +539,8 @@ def combine_step_measures(
             ]
         elif MEASURES[measure_name].is_averaged_over_steps:
             period_measures[measure_name] = jnp.mean(values_by_step, 0)
+        elif MEASURES[measure_name].is_largest_over_steps:
+            period_measures[measure_name] = jnp.max(values_by_step, 0)
         else:
             period_measures[measure_name] = jnp.sum(values_by_step, 0)
     positive_period = jnp.where(period_measures["period"] > 0.0, period_measures["period"], 1.0)

@@ -29,8 +29,8 @@ class Measure:
     - `violation_text`: clause that states what a negative margin means, otherwise "";
     - `is_shared`: whether the steps of every model have the measure;
     - `is_integer_code`: whether the measure is an integer code or count without derivatives;
-    - `is_averaged_over_steps`: whether the measure of several steps is their mean instead of their
-      sum.
+    - `is_averaged_over_steps`, `is_largest_over_steps`: whether the measure of several steps is
+      their mean or their maximum instead of their sum.
     """
 
     name: str
@@ -44,6 +44,7 @@ class Measure:
     is_shared: bool = False
     is_integer_code: bool = False
     is_averaged_over_steps: bool = False
+    is_largest_over_steps: bool = False
 
     @property
     def mathtext(self) -> str:
@@ -80,6 +81,7 @@ class Measure:
 
 
 _make_leg_measure = functools.partial(Measure, leg_dimension="leg")
+_make_friction_measure = functools.partial(Measure, is_largest_over_steps=True)
 
 
 def _index_measures_by_name(*measures: Measure) -> dict[str, Measure]:
@@ -139,6 +141,24 @@ STEP_MEASURES = _index_measures_by_name(
     Measure("energy_lost_damping", "J", "ΔE_c", "energy lost in the dampers",
             "Mechanical energy lost in the dampers of the legs during the step.", "(29)",
             is_shared=True),
+    _make_friction_measure("required_friction", "1", "μ_req", "required friction",
+            "Largest ratio of tangential to normal force on either foot, landing impulses "
+            "included: the largest of the next four coefficients."),
+    _make_friction_measure("required_friction_fore", "1", "max |λ1|/λ2",
+            "friction required by the fore foot", "Largest ratio of its forces in the step."),
+    _make_friction_measure("required_friction_rear", "1", "|λ3⁺|/λ4⁺",
+            "friction required by the rear foot after landing",
+            "Ratio of its forces just after landing. Later the ratio grows without bound, because "
+            "only λ4 vanishes at take-off."),
+    _make_friction_measure("required_friction_landing_fore", "1", "|λ_I1|/λ_I2",
+            "friction required by the fore foot in the landing", "Ratio of its impulses."),
+    _make_friction_measure("required_friction_landing_rear", "1", "|λ_I3|/λ_I4",
+            "friction required by the rear foot in the landing",
+            "Ratio of its impulses; 0 if the landing frees the foot."),
+    _make_friction_measure("required_friction_stopper", "1", "|λ_s1|/λ_s2",
+            "friction required in collision II",
+            "Ratio of the small impulses on the planted foot; infinite if the ground would have to "
+            "pull. The required friction excludes it."),
     Measure("outcome", "1", "outcome", "outcome", "Code of the end of the step.",
             is_shared=True, is_integer_code=True),
     Measure("solver_steps", "1", "N", "solver steps",

@@ -29,6 +29,7 @@ from vrw_jax.models.step_results import (
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
+    RequiredFriction,
     StepResult,
 )
 from vrw_jax.models.unit_scaling import complete_jacobian_columns

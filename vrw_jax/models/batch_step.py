@@ -45,6 +45,7 @@ from vrw_jax.models.step_results import (
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
+    RequiredFriction,
     StepResult,
     Trajectory,
 )
@@ -377,6 +378,7 @@ class StepTraceConfig(NamedTuple):
             step_length=x,
             indicators=make_group(DoubleSupportIndicators),
             margins=make_group(Margins),
+            required_friction=make_group(RequiredFriction),
             energy=make_group(EnergyLoss),
             **template,
         )

@@ -25,6 +25,7 @@ from vrw_jax.models.step_results import (
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
+    RequiredFriction,
     StepResult,
     Trajectory,
 )
@@ -323,6 +324,9 @@ def make_step_result(
     )
     fore_force, rear_force = transitions.compute_landing_forces(s, landing_result)
     advance_result = make_advance_result(phase_sequence, engine)
+    margins, required_friction = _make_margins_and_required_friction(
+        phase_sequence, rear_force, liftoff_motion, stopper_collision, friction
+    )
     return StepResult(
         section_state=advance_result.section_state,
         post_impact=zero_unless_begun(
@@ -335,9 +339,8 @@ def make_step_result(
             lambda_2=zero_unless_begun(fore_force.normal),
             lambda_4=zero_unless_begun(rear_force.normal),
         ),
-        margins=_make_step_margins(
-            phase_sequence, rear_force, liftoff_motion, stopper_collision, friction
-        ),
+        margins=margins,
+        required_friction=required_friction,
         energy=EnergyLoss(
             landing=zero_unless_begun(landing_result.energy_loss),
             stopper=jnp.where(has_stopper_collision, stopper_collision.energy_loss, 0.0),
@@ -404,14 +407,14 @@ def evaluate_phase_states(phase: AbstractPhase, phase_states: Array) -> tuple[Ar
     )
 
 
-def _make_step_margins(
+def _make_margins_and_required_friction(
     phase_sequence: PhaseSequenceResult,
     rear_force: dynamics.FootForce,
     liftoff_motion: Motion,
     stopper_collision: transitions.StopperCollision,
     friction: Elementwise | float,
-) -> Margins:
-    """Return the margins for one step.
+) -> tuple[Margins, RequiredFriction]:
+    """Return the margins of one step, and the friction coefficients that its feet need.
 
     - `rear_force`: force on the rear foot just after the landing, N;
     - `liftoff_motion`: motion at the end of double support;
@@ -442,11 +445,26 @@ def _make_step_margins(
             )
         return jnp.where(jnp.isfinite(lowest_margin), lowest_margin, 0.0)
 
-    def compute_friction_margin(foot_force: dynamics.FootForce, is_foot_loaded: Array) -> Array:
-        required_friction = jnp.where(
-            is_foot_loaded, dynamics.compute_required_friction(foot_force), 0.0
-        )
-        return jnp.where(has_step_begun, friction - required_friction, 0.0)
+    def compute_required_friction(foot_force: dynamics.FootForce, is_foot_loaded: Array) -> Array:
+        return jnp.where(is_foot_loaded, dynamics.compute_required_friction(foot_force), 0.0)
+
+    stopper_impulse = stopper_collision.foot_impulse
+    required_friction = RequiredFriction.from_parts(
+        fore=0.0 - find_lowest_margin("friction", 0, 1, 2),
+        rear=compute_required_friction(rear_force, has_phase_occurred[0]),
+        landing_fore=compute_required_friction(landing_result.fore_impulse, has_step_begun),
+        landing_rear=compute_required_friction(
+            landing_result.rear_impulse, has_step_begun & landing_result.is_rear_foot_planted
+        ),
+        stopper=jnp.where(
+            has_stopper_collision & (stopper_impulse.normal <= 0.0),
+            jnp.inf,
+            compute_required_friction(stopper_impulse, has_stopper_collision),
+        ),
+    )
+    subtract_from_friction = lambda required_coefficient: jnp.where(
+        has_step_begun, friction - required_coefficient, 0.0
+    )
 
     def compute_locked_stopper_impulses(
         motion_after: Motion, hub_velocity_jump: tuple, has_impact_occurred: Array
@@ -456,7 +474,7 @@ def _make_step_margins(
         )
         return jnp.where(has_impact_occurred, leg_impulses, 0.0)
 
-    return Margins(
+    margins = Margins(
         fore_foot_force=find_lowest_margin("fore_foot_force", 0, 1, 2),
         takeoff_acceleration=jnp.where(
             has_phase_occurred[1] & landing_result.is_rear_foot_planted,
@@ -468,10 +486,8 @@ def _make_step_margins(
         locked_stopper_force=find_lowest_margin("locked_stopper_force", 0, 1, 2),
         rear_stopper_force=find_lowest_margin("rear_stopper_force", 2),
         contraction=find_lowest_margin("contraction", 0, 1, 2),
-        friction_fore=jnp.where(
-            has_step_begun, friction + find_lowest_margin("friction", 0, 1, 2), 0.0
-        ),
-        friction_rear=compute_friction_margin(rear_force, has_phase_occurred[0]),
+        friction_fore=subtract_from_friction(required_friction.fore),
+        friction_rear=subtract_from_friction(required_friction.rear),
         landing_stopper_impulse=compute_locked_stopper_impulses(
             landing_result.motion_after, landing_result.hub_velocity_jump, has_step_begun
         ),
@@ -483,8 +499,7 @@ def _make_step_margins(
         hit_planted_impulse=jnp.where(
             has_stopper_collision, stopper_collision.foot_impulse.normal, 0.0
         ),
-        landing_friction_fore=compute_friction_margin(landing_result.fore_impulse, has_step_begun),
-        landing_friction_rear=compute_friction_margin(
-            landing_result.rear_impulse, has_step_begun & landing_result.is_rear_foot_planted
-        ),
+        landing_friction_fore=subtract_from_friction(required_friction.landing_fore),
+        landing_friction_rear=subtract_from_friction(required_friction.landing_rear),
     )
+    return margins, required_friction

@@ -23,6 +23,7 @@ from vrw_jax.models.step_results import (
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
+    RequiredFriction,
     StepResult,
     Trajectory,
 )
@@ -173,8 +174,8 @@ class RigidWheel(AbstractWheel):
         zero_like_rate = jnp.zeros_like(rate_before)
         zero_invalid_steps = lambda step_quantity: jnp.where(is_valid_step, step_quantity, 0.0)
         zero_unless_stepped = lambda step_quantity: jnp.where(has_stepped, step_quantity, 0.0)
-        rear_impulse, friction_margins, stopper_impulse = self._compute_landing_impulses(
-            s, x, rolling_motion, friction
+        rear_impulse, impact_friction, stopper_impulse = self._compute_landing_impulses(
+            s, x, rolling_motion
         )
         return StepResult(
             section_state=zero_unless_stepped(
@@ -209,8 +210,15 @@ class RigidWheel(AbstractWheel):
                 landing_stopper_impulse=zero_invalid_steps(stopper_impulse),
                 hit_stopper_impulse=jnp.zeros_like(stopper_impulse),
                 hit_planted_impulse=zero_like_rate,
-                landing_friction_fore=zero_invalid_steps(friction_margins[0]),
-                landing_friction_rear=zero_invalid_steps(friction_margins[1]),
+                landing_friction_fore=zero_invalid_steps(friction - impact_friction[0]),
+                landing_friction_rear=zero_invalid_steps(friction - impact_friction[1]),
+            ),
+            required_friction=RequiredFriction.from_parts(
+                zero_unless_stepped(0.0 - margin_minima[1]),
+                zero_like_rate,
+                zero_invalid_steps(impact_friction[0]),
+                zero_invalid_steps(impact_friction[1]),
+                zero_like_rate,
             ),
             energy=EnergyLoss(
                 landing=zero_invalid_steps(
@@ -276,13 +284,12 @@ class RigidWheel(AbstractWheel):
         s: Symbols,
         x: SectionStateEntries,
         rolling_motion: "RollingMotion",
-        friction: Elementwise,
     ) -> tuple:
-        """Return the impulse on the rear foot, the friction margins of the landing, and the stopper
-        impulses.
+        """Return the impulse on the rear foot, the friction required in the landing, and the
+        stopper impulses.
 
-        The impulses are in N s. The friction margins are those of the fore foot and of the rear
-        foot. The stopper impulses are those of legs 3 to n.
+        The impulses are in N s. The required friction coefficients are those of the fore foot and
+        of the rear foot. The stopper impulses are those of legs 3 to n.
         """
         zero_like_rate = jnp.zeros_like(x[1])
         motion_after = rolling_motion.compute_motion_at_angle(
@@ -302,14 +309,14 @@ class RigidWheel(AbstractWheel):
             s.Mt * hub_velocity_jump[0] - rear_impulse.tangential,
             s.Mt * hub_velocity_jump[1] - rear_impulse.normal,
         )
-        friction_margins = tuple(
-            friction - dynamics.compute_required_friction(foot_impulse)
+        required_friction = tuple(
+            dynamics.compute_required_friction(foot_impulse)
             for foot_impulse in (fore_impulse, rear_impulse)
         )
         stopper_impulses = transitions.compute_locked_leg_impulses(
             s, motion_after, hub_velocity_jump, range(3, s.n + 1)
         )
-        return rear_impulse, friction_margins, stopper_impulses
+        return rear_impulse, required_friction, stopper_impulses
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int

@@ -87,6 +87,59 @@ class EnergyLoss(AbstractMeasureGroup):
     damping: MeasureValue
 
 
+class RequiredFriction(AbstractMeasureGroup):
+    """Friction coefficients that the feet need to stay at rest in one step.
+
+    A coefficient is the ratio of tangential to normal force, or of tangential to normal impulse. A
+    foot slides if the ground's friction coefficient is below this ratio. Phases and impacts that
+    did not occur need no friction. All fields of a step that did not begin are 0.
+
+    - `largest`: largest of the next four coefficients, the smallest friction coefficient for which
+      all friction margins are positive or 0;
+    - `fore`: largest ratio of forces on the fore foot between the impacts;
+    - `rear`: ratio of forces on the rear foot just after the landing. The rest of double support
+      does not count, because the ratio grows without bound until take-off: the normal force
+      vanishes there, and the tangential force does not. At any finite friction coefficient the
+      rear foot therefore slides shortly before it lifts;
+    - `landing_fore`, `landing_rear`: ratios of impulses in the landing;
+    - `stopper`: ratio of impulses on the planted foot in the collision of Leg 2 with its stopper,
+      infinite if the ground would have to pull. It is not part of `largest`, because this impulse
+      is small: for the gait of Table 1 a thousandth of that of the landing.
+
+    Apart from `stopper`, a foot that the ground would have to pull needs no friction. The margin
+    `fore_foot_force` is negative instead.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> need = vrw.step(vrw.WheelParams(), x).required_friction
+        >>> f"{need.largest:.1f} {need.fore:.2f} {need.landing_fore:.2f} {need.landing_rear:.1f}"
+        '14.2 0.61 1.10 9.7'
+    """
+
+    measure_name_by_field: ClassVar = {
+        "largest": "required_friction",
+        **{
+            part: f"required_friction_{part}"
+            for part in ("fore", "rear", "landing_fore", "landing_rear", "stopper")
+        },
+    }
+
+    largest: MeasureValue
+    fore: MeasureValue
+    rear: MeasureValue
+    landing_fore: MeasureValue
+    landing_rear: MeasureValue
+    stopper: MeasureValue
+
+    @classmethod
+    def from_parts(
+        cls, fore: Array, rear: Array, landing_fore: Array, landing_rear: Array, stopper: Array
+    ) -> "RequiredFriction":
+        """Return the coefficients together with their largest."""
+        largest = jnp.maximum(jnp.maximum(fore, rear), jnp.maximum(landing_fore, landing_rear))
+        return cls(largest, fore, rear, landing_fore, landing_rear, stopper)
+
+
 class Margins(AbstractMeasureGroup):
     """Margins of the viscoelastic model's assumptions in one step. A negative margin is a
     violation.
@@ -260,7 +313,8 @@ class StepResult(AbstractStep):
     - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
     - `durations`: durations of DLS, SLS-I and SLS-II, s;
     - `step_length`: distance between the feet at the opening landing, m;
-    - `indicators`, `margins`, `energy`: `DoubleSupportIndicators`, `Margins` and `EnergyLoss`;
+    - `indicators`, `margins`, `required_friction`, `energy`: `DoubleSupportIndicators`, `Margins`,
+      `RequiredFriction` and `EnergyLoss`;
     - `outcome`: code of the `Outcome`;
     - `solver_steps`: number of attempted solver steps;
     - `engine`: name of the engine, see `StepOptions`.
@@ -277,6 +331,7 @@ class StepResult(AbstractStep):
     step_length: MeasureValue
     indicators: DoubleSupportIndicators
     margins: Margins
+    required_friction: RequiredFriction
     energy: EnergyLoss
     outcome: Int[Array, "..."]
     solver_steps: Int[Array, "..."]
@@ -292,6 +347,7 @@ class StepResult(AbstractStep):
             "dL1_touchdown": self.section_state[..., 2],
             **self.indicators.measures(),
             **self.energy.measures(),
+            **self.required_friction.measures(),
             **self.margins.measures(),
         }
 

@@ -5,12 +5,13 @@ const told = (id) => JSON.parse(document.getElementById(id).textContent);
 const $ = (id) => document.getElementById(id);
 const facts = told("facts"), packed = told("code");
 const MEASURED = ["speed", "dls_fraction", "period", "step_length", "duration_dls", "duration_sls1", "duration_sls2",
-  "theta_touchdown", "dtheta_touchdown", "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping"];
+  "theta_touchdown", "dtheta_touchdown", "energy_lost_landing", "energy_lost_stopper", "energy_lost_damping",
+  "required_friction", ...["fore", "rear", "landing_fore", "landing_rear"].map((part) => `required_friction_${part}`)];
 const INDICATORS = ["lambda_I4", "lambda_2_plus", "lambda_4_plus"];
 const ON_GROUND = ["speed", "dls_fraction", "period", "step_length", "duration_dls", "duration_single", "duration_flight",
   "theta_touchdown", "dtheta_touchdown", "slip", "energy_lost_impacts", "energy_lost_damping", "energy_lost_friction"];
 const ALIKE = ["speed", "dls_fraction", "period", "spectral_radius"];
-const MAPPED = [...ALIKE, ...INDICATORS, ...Object.keys(facts.margins)];
+const MAPPED = [...ALIKE, "required_friction", ...INDICATORS, ...Object.keys(facts.margins)];
 const MAPPED_ON_GROUND = [...ALIKE, "slip", "energy_lost_friction", "duration_flight", ...facts.stoppers];
 const PRESETS = {
   "Table 1": {},
@@ -102,8 +103,8 @@ function shownOnGround(ground, { gait, states, outcome }) {
 }
 
 // Feet neither slide nor leave the ground here: the friction that the fore and the rear foot need.
-const frictionNeeded = ({ measures }, { friction }) => ["fore", "rear"].map((foot) =>
-  Math.max(...[`friction_${foot}`, `landing_friction_${foot}`].map((name) => friction - (measures[name] || friction))));
+const frictionNeeded = ({ measures }) => ["fore", "rear"].map((foot) =>
+  Math.max(...["", "landing_"].map((when) => measures[`required_friction_${when}${foot}`])));
 
 const allowed = (values) => values.leg_com < values.locked_length;
 
@@ -236,7 +237,7 @@ function tellVerdict() {
     const broken = Object.keys(facts.margins).filter((name) => leastOf(name)[0] < 0).length;
     const premises = broken ? ` <a href="#margins-title">${broken} of 13 margins are negative.</a>` : " All 13 margins are positive.";
     const both = values.rung === "rigid" ? "." : `, and double support lasts ${(100 * measures.dls_fraction).toFixed(1)} % of the step.`;
-    const needs = frictionNeeded(result, values), slides = needs.map((need) => need > values.friction);
+    const needs = frictionNeeded(result), slides = needs.map((need) => need > values.friction);
     const which = slides[0] ? (slides[1] ? "both feet would" : "the fore foot would") : "the rear foot would";
     const enough = slides.some((foot) => foot) ? `with ${number(values.friction)}, ${which} slide` : `${number(values.friction)} is enough`;
     const ground = ` The fore foot requires a friction coefficient of ${number(needs[0])}${needs[1] ? ` and the rear foot one of ${number(needs[1])}` : ""}; ${enough}.`;
