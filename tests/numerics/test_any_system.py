@@ -1,6 +1,8 @@
 """The documented interface for any field, guards and resets: closed forms and errors."""
 
+import itertools
 import re
+from fractions import Fraction
 from pathlib import Path
 
 import jax
@@ -469,3 +471,62 @@ def test_contact_problems_have_one_solution_several_or_none():
     assert np.isnan(
         jax.jit(enumerate_lcp_solutions)(jnp.full((1, 1), np.nan), jnp.ones(1)).force
     ).all()
+
+
+def solve_lcp_exactly(matrix, free_gap):
+    """Return the forces of all solutions in rational arithmetic, by Gauss-Jordan elimination."""
+    n = len(free_gap)
+    solutions = set()
+    for closed in itertools.chain.from_iterable(
+        itertools.combinations(range(n), k) for k in range(n + 1)
+    ):
+        rows = [[Fraction(matrix[i][j]) for j in closed] + [-Fraction(free_gap[i])] for i in closed]
+        for k in range(len(closed)):
+            rows[k:] = sorted(rows[k:], key=lambda row: row[k] == 0)
+            if rows[k][k] == 0:
+                break
+            rows[k] = [x / rows[k][k] for x in rows[k]]
+            for i in set(range(len(closed))) - {k}:
+                rows[i] = [x - rows[i][k] * y for x, y in zip(rows[i], rows[k], strict=True)]
+        else:
+            force = [Fraction(0)] * n
+            for i, row in zip(closed, rows, strict=True):
+                force[i] = row[-1]
+            gap = [
+                sum(Fraction(matrix[i][j]) * force[j] for j in range(n)) + Fraction(free_gap[i])
+                for i in range(n)
+            ]
+            if min(force + gap) >= 0:
+                solutions.add(tuple(map(float, force)))
+    return sorted(solutions)
+
+
+def test_units_of_forces_and_gaps_do_not_change_the_solutions_of_contact_problems():
+    """All solutions equal those in rational arithmetic, also degenerate ones."""
+    enumerate_solutions = jax.jit(enumerate_lcp_solutions)
+
+    def count_solutions(matrix, free_gap, gap_units, force_units):
+        expected = solve_lcp_exactly(matrix, free_gap)
+        result = enumerate_solutions(
+            gap_units[:, None] * matrix * force_units, gap_units * free_gap
+        )
+        assert int(result.status) == min(len(expected), LCPStatus.MULTIPLE_SOLUTIONS)
+        found = np.asarray(result.candidate_forces)[result.is_solution] * force_units
+        assert len(found) == len(expected)
+        for force in expected:
+            assert np.min(np.max(np.abs(found - force), axis=1)) <= 1e-12 * (1.0 + max(force))
+        return len(expected)
+
+    assert count_solutions(np.eye(5), -np.ones(5), np.ones(5), np.array([1] + 4 * [1 / 1500])) == 1
+    for unit in (1e-12, 1.0, 1e12):
+        matrix, free_gap = np.array([[-1.0, 1.0], [1.0, -2.0]]), np.array([2.0, -1.0])
+        assert count_solutions(matrix, free_gap, np.ones(2), unit * np.ones(2)) == 2
+    random = np.random.default_rng(0)
+    counts = set()
+    for _ in range(150):  # Powers of two from 1e-12 to 1e12 leave degenerate problems degenerate.
+        units = 2.0 ** random.integers(-40, 41, (2, 3))
+        entries = random.integers(-2, 3, (3, 4)).astype(float)
+        counts.add(count_solutions(entries[:, :3], entries[:, 3], *units))
+        entries = random.normal(size=(3, 4))
+        counts.add(count_solutions(entries[:, :3], entries[:, 3], *units))
+    assert counts >= {0, 1, 2, 3, 4}

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
@@ -46,10 +47,14 @@ def enumerate_lcp_solutions(
 
     The unknowns are the forces z and the gaps w.
 
-    `matrix` has the shape (n, n) and need not be symmetric. `free_gap` has the shape (n,). Values
-    are compared with zero to within `tolerance`, relative to the largest force or gap. Solutions
-    with the same forces are counted once. The result is differentiable as long as the same contacts
-    are closed. A wrong shape or a value that is not finite raises a ValueError.
+    `matrix` has the shape (n, n) and need not be symmetric. `free_gap` has the shape (n,). A force,
+    a gap or a determinant counts as zero if relative changes of all entries by `tolerance` may
+    change its sign. The answer therefore does not depend on the units of any force or gap.
+
+    Solutions with the same forces are counted once. Contacts whose matrix is singular are not
+    closed together, so a continuum of solutions counts by its ends. The result is differentiable as
+    long as the same contacts are closed. A wrong shape or a value that is not finite raises a
+    ValueError.
     """
     require_no_masked_entries("matrix or free_gap", (matrix, free_gap))
     free_gap = jnp.asarray(free_gap, float)
@@ -68,55 +73,66 @@ def enumerate_lcp_solutions(
         raise ValueError(
             "matrix or free_gap contains a number that is not finite: give finite numbers."
         )
-    largest_matrix_entry = jnp.max(jnp.abs(matrix))
-    matrix_scale = jnp.where(largest_matrix_entry > 0.0, largest_matrix_entry, 1.0)
-    free_gap, matrix = free_gap / matrix_scale, matrix / matrix_scale
+    # Round-off of sums of n terms changes signs as well.
+    zero_tolerance = jnp.maximum(tolerance, n_contacts * jnp.finfo(free_gap.dtype).eps)
     # Combinations with more closed contacts come first.
     is_closed = np.array(list(itertools.product((True, False), repeat=n_contacts)))
     is_closed = is_closed[np.argsort(-is_closed.sum(1), kind="stable")]
 
-    def solve_combination(is_closed: Array) -> tuple[Array, Array]:
-        is_pair_closed = is_closed[:, None] & is_closed[None]
-        closed_contact_matrix = jnp.where(
-            is_pair_closed, matrix, jnp.eye(n_contacts, dtype=free_gap.dtype)
+    def solve_combination(is_closed: Array) -> tuple[Array, ...]:
+        closed_matrix = jnp.where(
+            is_closed[:, None] & is_closed, matrix, jnp.eye(n_contacts, dtype=matrix.dtype)
         )
-        is_singular = jnp.abs(jnp.linalg.det(closed_contact_matrix)) <= tolerance
-        closed_contact_matrix = jnp.where(
-            is_singular, jnp.eye(n_contacts, dtype=free_gap.dtype), closed_contact_matrix
+        inverse = _invert_scaled(lax.stop_gradient(closed_matrix))
+        # Relative changes of all entries by the tolerance change the determinant by this part.
+        determinant_change = zero_tolerance * jnp.sum(jnp.abs(inverse.T * closed_matrix))
+        is_regular = determinant_change < 1.0
+        inverse = _invert_scaled(
+            jnp.where(is_regular, closed_matrix, jnp.eye(n_contacts, dtype=matrix.dtype))
         )
-        contact_forces = jnp.where(
-            is_closed,
-            jnp.linalg.solve(closed_contact_matrix, jnp.where(is_closed, -free_gap, 0.0)),
-            0.0,
+        forces = -inverse @ jnp.where(is_closed, free_gap, 0.0)
+        # One refinement makes also the smallest force accurate (Skeel 1980).
+        forces = forces - inverse @ jnp.where(is_closed, matrix @ forces + free_gap, 0.0)
+        gaps = jnp.where(is_closed, 0.0, matrix @ forces + free_gap)
+        # Skeel's bounds (1979) of the changes due to relative changes of all entries by one.
+        gap_terms = jnp.abs(matrix) @ jnp.abs(forces) + jnp.abs(free_gap)
+        force_changes = jnp.abs(inverse) @ jnp.where(is_closed, gap_terms, 0.0)
+        gap_changes = gap_terms + jnp.abs(matrix) @ force_changes
+        is_solution = is_regular & jnp.all(
+            (forces >= -zero_tolerance * force_changes) & (gaps >= -zero_tolerance * gap_changes)
         )
-        contact_gaps = jnp.where(is_closed, 0.0, matrix @ contact_forces + free_gap)
-        are_forces_nonnegative = jnp.all(
-            contact_forces >= -tolerance * jnp.max(jnp.abs(contact_forces))
-        )
-        are_gaps_nonnegative = jnp.all(
-            contact_gaps
-            >= -tolerance * (jnp.max(jnp.abs(contact_gaps)) + jnp.max(jnp.abs(free_gap)))
-        )
-        return contact_forces, are_forces_nonnegative & are_gaps_nonnegative & ~is_singular
+        return forces, gaps, zero_tolerance * force_changes, is_solution
 
-    candidate_forces, is_solution = jax.vmap(solve_combination)(jnp.asarray(is_closed))
-    same_solution_tolerance = tolerance * (1.0 + jnp.max(jnp.abs(candidate_forces)))
-    is_same_solution = (
-        jnp.max(jnp.abs(candidate_forces[:, None] - candidate_forces[None]), -1)
-        <= same_solution_tolerance
+    candidate_forces, candidate_gaps, force_errors, is_solution = jax.vmap(solve_combination)(
+        jnp.asarray(is_closed)
     )
-    is_duplicate = jnp.any(jnp.tril(is_same_solution & is_solution[None], -1), 1)
+    is_same_solution = jnp.all(
+        jnp.abs(candidate_forces[:, None] - candidate_forces)
+        <= force_errors[:, None] + force_errors,
+        axis=-1,
+    )
+    is_duplicate = jnp.any(jnp.tril(is_same_solution & is_solution, -1), axis=1)
     is_solution = is_solution & ~is_duplicate
-    contact_forces = jnp.where(
-        jnp.any(is_solution), candidate_forces[jnp.argmax(is_solution)], jnp.nan
+    contact_forces, contact_gaps = (
+        jnp.where(jnp.any(is_solution), candidates[jnp.argmax(is_solution)], jnp.nan)
+        for candidates in (candidate_forces, candidate_gaps)
     )
-    solution_status = jnp.minimum(jnp.sum(is_solution), int(LCPStatus.MULTIPLE_SOLUTIONS)).astype(
-        jnp.int32
-    )
+    status = jnp.minimum(jnp.sum(is_solution), int(LCPStatus.MULTIPLE_SOLUTIONS))
     return LCPSolutions(
-        contact_forces,
-        matrix_scale * (matrix @ contact_forces + free_gap),
-        solution_status,
-        is_solution,
-        candidate_forces,
+        contact_forces, contact_gaps, status.astype(jnp.int32), is_solution, candidate_forces
     )
+
+
+def _invert_scaled(matrix: Array) -> Array:
+    """Return the inverse, computed with the largest entry of each row and column scaled to 1.
+
+    Without the scaling, a row in small units would supply pivots that lose all digits.
+    """
+    largest = lambda entries, axis: jnp.where(
+        jnp.any(entries != 0.0, axis, keepdims=True),
+        lax.stop_gradient(jnp.max(jnp.abs(entries), axis, keepdims=True)),
+        1.0,
+    )
+    row_scale = largest(matrix, 1)
+    column_scale = largest(matrix / row_scale, 0)
+    return jnp.linalg.inv(matrix / row_scale / column_scale) / column_scale.T / row_scale.T
