@@ -149,7 +149,7 @@ def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations
         start_value=0.4,
         cycle=None,
         step=None,
-        active=(ActiveConstraint("damping", 200.0, "N s/m", 0.1),),
+        active=(ActiveConstraint("damping", 200.0, "N s/m", 0.1, (0.1, 0.1)),),
         kkt_residual=0.0,
         violated_margins=(),
         validation=WalkValidation(10, Outcome.STEPPED, 0.0, True),

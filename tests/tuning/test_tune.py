@@ -2,12 +2,15 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.files import assert_netcdf_round_trip
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
+from vrw_jax.cli.reports import format_tuning_summary
 from vrw_jax.cycles import make_finder
 from vrw_jax.cycles.margin_defaults import DEFAULT_MARGIN_NAMES, default_margins
 from vrw_jax.measures.table import MARGIN_MEASURES
@@ -150,6 +153,79 @@ def test_a_lost_gait_shortens_the_step_and_is_reported():
     assert np.all(tuned.path.damping.values[~is_gait_lost] <= float(tuned.params.damping))
     assert 219.0 < float(tuned.params.damping) < 220.0
     assert 0.0 < float(tuned.cycle.indicators.lambda_4) < 1e-3
+
+
+@pytest.mark.parametrize("factor", [1e-18, 1e-200, 1e100])
+def test_an_objective_in_other_units_has_the_same_optimum_and_prices_in_these_units(factor):
+    bounds = {"damping": (20.0, 215.0), "slope": (0.26, 0.34)}
+    results = [
+        tune(vrw.WheelParams(), {"dls_fraction": weight}, list(bounds), bounds, {})
+        for weight in (1.0, factor)
+    ]
+    assert [result.status.name for result in results] == ["CONVERGED"] * 2
+    np.testing.assert_allclose(results[1].value, factor * results[0].value, rtol=1e-9)
+    for first, other in zip(results[0].active, results[1].active, strict=True):
+        assert first.name == other.name
+        np.testing.assert_allclose(other.price, factor * first.price, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "free", [("damping", "stiffness"), *mark_slow((("damping", "stiffness", "slope"),))]
+)
+def test_any_start_finds_the_optimum_at_a_kink_and_the_multiplier_there(free):
+    """The reference is the difference of optima with other limits: their slope is the multiplier.
+
+    The friction margin is least at two instants at once, between which its gradient jumps.
+    """
+    bounds = {name: PARAMETER_BOX[name] for name in free}
+
+    def tune_from(damping: float, limit: float) -> TuneResult:
+        wheel, margin = vrw.WheelParams(damping=damping), {"friction_fore": limit}
+        return tune(wheel, "dls_fraction", free, bounds, margin)
+
+    displaced = [tune_from(120.0, 0.5 + change).value for change in (-1e-3, 1e-3)]
+    results = [tune_from(damping, 0.5) for damping in (200.0, 120.0, 60.0)]
+    for result in results:
+        assert result.status == TuneStatus.CONVERGED
+        assert result.kinks == ("friction_fore",)
+        assert "several instants" in str(result)
+        np.testing.assert_allclose(result.value, results[0].value, rtol=1e-8)
+        assert [active.name for active in result.active] == ["friction_fore", *free[2:]]
+        # The values of optima have curvature, of which a central difference is free.
+        difference = (displaced[0] - displaced[1]) / 2e-3
+        np.testing.assert_allclose(result.active[0].price, difference, rtol=1e-3)
+
+
+def test_an_objective_with_a_kink_is_maximized():
+    """|speed - 1.2| has its least value 0 where the speed is 1.2 m/s."""
+
+    def objective(cycle):
+        return -jnp.abs(cycle.speed - 1.2)
+
+    bounds = {"damping": (20.0, 215.0)}
+    tuned = tune(vrw.WheelParams(), objective, ["damping"], bounds, {})
+    assert tuned.status == TuneStatus.CONVERGED
+    assert tuned.kinks == ("objective",)
+    assert float(tuned.cycle.speed) == pytest.approx(1.2, abs=1e-9)
+
+
+def test_multipliers_that_are_not_unique_are_given_as_ranges():
+    """A bound and a constraint hold the same wheel, so either may have the whole multiplier.
+
+    The objective is the constrained speed. Its multiplier is at most 1, and that of the bound is at
+    most the derivative of the speed with respect to damping.
+    """
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=100.0))
+    given, bounds = {"speed": (None, float(cycle.speed))}, {"damping": (100.0, 150.0)}
+    tuned = tune(vrw.WheelParams(damping=110.0), "speed", ["damping"], bounds, given)
+    derivative = jax.grad(lambda params: vrw.limit_cycle(params).speed)(
+        vrw.WheelParams(damping=100.0)
+    ).damping
+    assert [active.name for active in tuned.active] == ["speed", "damping"]
+    for active, largest in zip(tuned.active, (1.0, -float(derivative)), strict=True):
+        assert np.isnan(active.price)
+        np.testing.assert_allclose(active.price_range, (0.0, largest), rtol=1e-4, atol=1e-9)
+    assert "not unique: 0 to 1" in format_tuning_summary(tuned)
 
 
 def test_no_branch_that_ends_is_called_a_maximum_inside_all_bounds():

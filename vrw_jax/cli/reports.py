@@ -123,7 +123,7 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
         (
             active_constraint.name,
             get_measure(active_constraint.name).format_with_unit(active_constraint.limit),
-            f"{active_constraint.price:.4g}",
+            active_constraint.describe_price(),
         )
         for active_constraint in tune_result.active
     ]

@@ -87,6 +87,7 @@ def explore_starts(
     objective_gradient_norm = np.median(
         np.linalg.norm(current_trials.objective_gradient[has_active_gait], axis=1)
     )
+    objective_gradient_norm = objective_gradient_norm or 1.0  # if the objective is constant
     optimizer_step_lengths = np.full((n_starts, 1), EXPLORATION_OPTIONS.first_optimizer_step_length)
     optimizer = optax.scale_by_adam(
         b1=EXPLORATION_OPTIONS.gradient_decay, b2=EXPLORATION_OPTIONS.squared_gradient_decay

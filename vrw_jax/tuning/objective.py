@@ -212,11 +212,12 @@ def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarr
     """Return the scale of each slack.
 
     The scale is the norm of the slack's gradient with respect to normalized parameters, that is,
-    the change of the slack per width between the bounds.
+    the change of the slack per width between the bounds. A slack that is always 0 has the scale 1.
     """
-    return np.maximum(
-        np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(constraint_slacks) + 1e-12
+    slack_scales = np.maximum(
+        np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(constraint_slacks)
     )
+    return np.where(slack_scales == 0.0, 1.0, slack_scales)
 
 
 def compute_max_violation(constraint_slacks: np.ndarray, slack_scales: np.ndarray) -> Any:

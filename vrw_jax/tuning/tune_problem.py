@@ -430,25 +430,32 @@ class TuneProblem:
         best_trial = maximization_result.best_trial
         best_gait = best_trial.gait_evaluation.gait
         params = self.make_wheel(best_trial.normalized_parameters)
-        constraint_prices, lower_bound_prices, upper_bound_prices, kkt_residual = (
-            compute_optimality_conditions(best_trial)
+        conditions = compute_optimality_conditions(
+            best_trial,
+            [trial for trial in maximization_result.evaluated_trials if trial.is_usable_trial],
         )
         limited_names = (*self.constraint_names, *self.free_parameters * 2)
         limits = [*self.min_constraint_values, *self.lower_bounds, *self.upper_bounds]
-        prices = [
-            *constraint_prices,
-            *(lower_bound_prices / self.bound_widths),
-            *(upper_bound_prices / self.bound_widths),
-        ]
+        limit_widths = np.r_[np.ones(len(self.constraint_names)), np.tile(self.bound_widths, 2)]
+        price_ranges = conditions.price_ranges / limit_widths[:, None]
+        if not conditions.are_satisfied:
+            price_ranges[price_ranges[:, 1] > 0.0] = np.nan
         active_constraints = [
             ActiveConstraint(
                 limited_name.removeprefix(UPPER_BOUND_PREFIX),
                 restore_sign_of_bound(limited_name, limit),
                 get_measure(limited_name).unit,
-                float(price),
+                low if low == high else np.nan,
+                (low, high),
             )
-            for limited_name, limit, price in zip(limited_names, limits, prices, strict=True)
-            if price > 0.0
+            for limited_name, limit, (low, high) in zip(
+                limited_names, limits, price_ranges.tolist(), strict=True
+            )
+            if high != 0.0
+        ]
+        kink_names = [
+            limited_name.removeprefix(UPPER_BOUND_PREFIX)
+            for limited_name in (self.objective_label, *self.constraint_names)
         ]
         end_seconds = time.perf_counter()
         walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
@@ -462,7 +469,8 @@ class TuneProblem:
             cycle=best_gait.cycle,
             step=best_gait.step,
             active=tuple(active_constraints),
-            kkt_residual=kkt_residual,
+            kkt_residual=conditions.kkt_residual,
+            kinks=tuple(np.array(kink_names)[conditions.has_kink].tolist()),
             violated_margins=tuple(
                 measure_name
                 for measure_name in MARGIN_MEASURES
@@ -513,7 +521,7 @@ class TuneProblem:
                     + options.default_margin_tolerance * default_margin
                 )
                 is_gait_feasible &= bool(
-                    np.all(constraint_value >= min_constraint_value - violation_tolerance - 1e-9)
+                    np.all(constraint_value >= min_constraint_value - violation_tolerance)
                 )
         final_state_distance = float(np.max(np.abs(section_state - cycle_section_state)))
         return WalkValidation(

@@ -17,6 +17,7 @@ NO_ACTIVE_CONSTRAINT_TEXTS = {
     TuneStatus.BRANCH_ENDED: "the end of the branch, no constraint and no bound",
     TuneStatus.MAX_EVALUATIONS_REACHED: "nothing so far: the maximization has not ended",
     TuneStatus.NO_FEASIBLE_GAIT: "nothing: a constraint is broken here",
+    TuneStatus.STALLED: "nothing: the first-order condition is not met",
 }
 """Texts that state why no constraint or bound is active, by the status of the maximization."""
 
@@ -27,13 +28,27 @@ class ActiveConstraint(NamedTuple):
     - `name`: name of the parameter, or of the constraint with its leg label if it has one;
     - `limit`: bound on the parameter or on the constrained measure;
     - `unit`: unit of the limit;
-    - `price`: gain of the objective per unit by which the limit is relaxed.
+    - `price`: gain of the objective per unit by which the limit is relaxed, which is the Lagrange
+      multiplier. It is NaN if `price_range` contains more than one number;
+    - `price_range`: smallest and largest price that satisfy the first-order condition. They differ
+      if more limits are active than parameters are free, for example. Both are NaN if the gait does
+      not satisfy the condition.
     """
 
     name: str
     limit: float
     unit: str
     price: float
+    price_range: tuple[float, float]
+
+    def describe_price(self) -> str:
+        """Return the price, or its range, as text."""
+        low, high = self.price_range
+        if low == high:
+            return f"{self.price:.4g}"
+        if low != low:
+            return "undefined, because the first-order condition is not met"
+        return f"not unique: {low:.4g} to {high:.4g}"
 
 
 class WalkValidation(NamedTuple):
@@ -64,7 +79,11 @@ class TuneResult:
     - `validation`: validation by a walk of ten steps of the tuned wheel;
     - `cycle`: the gait as a LimitCycle, or as a ReturnMapCycle with unilateral contact;
     - `step`: step of the gait, as a StepResult or a UnilateralStep;
-    - `kkt_residual`: residual of the first-order condition, relative to the objective's gradient;
+    - `kkt_residual`: residual of the first-order condition, relative to the largest gradient of the
+      objective on the path;
+    - `kinks`: names of the objective and of active constraints that have a kink at the gait. A
+      margin has a kink where its minimum occurs at several instants, or on several legs, at once.
+      The multiplier of such a constraint is the sum over the instants;
     - `violated_margins`: names of violated margins that are not constraints;
     - `path`: every gait that was evaluated, in order;
     - `n_evaluations`: number of evaluated gaits, each with one walking step;
@@ -98,6 +117,7 @@ class TuneResult:
     seconds: float
     compile_seconds: float
     exploration: ExplorationResult | None = None
+    kinks: tuple[str, ...] = ()
 
     @property
     def converged(self) -> bool:
@@ -126,12 +146,16 @@ class TuneResult:
             f"{parameter_name} at {get_measure(parameter_name).format_with_unit(constraint_limit)}"
             for parameter_name, constraint_limit, *_ in self.active
         ]
+        kink_texts = {
+            "kink": f"{', '.join(self.kinks)}: the minimum occurs at several instants at once"
+        }
         return {
             "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
             "wheel": ", ".join(parameter_texts),
             "ending": f"{self.status.name}: {self.status.meaning}",
             "held by": ", ".join(active_constraint_texts)
             or NO_ACTIVE_CONSTRAINT_TEXTS[self.status],
+            **(kink_texts if self.kinks else {}),
             "not asked for, and broken": ", ".join(self.violated_margins) or "none",
             "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
             f"{self.validation.distance:.1e} from the cycle at last; {feasibility_text}",
