@@ -1,6 +1,7 @@
 """Gaits with unilateral contact: sensitivities, branches, scans and tuning."""
 
 import math
+import re
 from typing import NamedTuple
 
 import equinox as eqx
@@ -614,3 +615,47 @@ class _StepOutput(NamedTuple):
 
     section_state: np.ndarray
     outcome: np.ndarray | None
+
+
+def test_the_forces_of_a_gait_balance_gravity_so_that_friction_is_at_least_tan_slope():
+    """Over a gait, the impulses of the ground are M g T sin(slope) along it and M g T cos(slope).
+
+    The trapezoidal rule integrates forces between events, and the impulses of the landing are
+    added. The other impulse of this gait, at the stopper, is below 1e-4 of the sum.
+    """
+    section_state = vrw.limit_cycle(SLOW_WHEEL, model=GROUND_MODEL).section_state
+    step = GROUND_MODEL.sample_step(SLOW_WHEEL, section_state, vrw.StepOptions(), 401)
+    landing = vrw.step(SLOW_WHEEL, section_state, model=GROUND_MODEL)
+    integrate = lambda forces: np.trapezoid(np.sum(forces, -1), step.time, axis=-1).sum()
+    weight_impulse = (
+        (SLOW_WHEEL.hub_mass + 8 * SLOW_WHEEL.leg_mass) * SLOW_WHEEL.gravity * np.sum(step.duration)
+    )
+    for forces, impulses, direction in (
+        (step.tangential, landing.landing_tangential, -math.sin(SLOW_WHEEL.slope)),
+        (step.normal, landing.landing_normal, math.cos(SLOW_WHEEL.slope)),
+    ):
+        ground_impulse = integrate(forces) + np.sum(impulses)
+        np.testing.assert_allclose(ground_impulse, weight_impulse * direction, rtol=1e-4)
+
+
+def test_friction_below_tan_slope_allows_no_gait_alone_and_in_batches():
+    slopes = np.array([0.31, 0.15])  # tan(0.31) is 0.3203
+    cycles = vrw.limit_cycles(
+        vrw.WheelParams(slope=slopes), model=vrw.UnilateralWheel(friction=0.32)
+    )
+    assert cycles.found.tolist() == [False, True]
+    reason = "No steady gait can exist: friction is 0.32, below tan(slope) = 0.3203"
+    assert cycles.why[0].startswith(reason)
+    alone = vrw.limit_cycle(vrw.WheelParams(slope=0.31), model=vrw.UnilateralWheel(friction=0.32))
+    assert alone.why == cycles.why[0]
+    assert alone.why in repr(alone)
+
+
+@pytest.mark.slow
+def test_a_missing_gait_with_contact_names_the_last_wheel_with_a_gait():
+    why = vrw.limit_cycle(vrw.WheelParams(slope=0.05), model=GROUND_MODEL).why
+    last_slope = float(re.search(r"last gait found has slope ([0-9.]+)", why)[1])
+    slopes = np.array([last_slope, last_slope - 0.001])
+    cycles = vrw.limit_cycles(vrw.WheelParams(slope=slopes), model=GROUND_MODEL)
+    assert cycles.found.tolist() == [True, False]
+    assert "step 1 from this gait fails: No touchdown" in why

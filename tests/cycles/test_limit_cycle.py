@@ -265,26 +265,79 @@ def test_a_missing_cycle_is_an_outcome_with_zeros_and_leaves_the_batch_unchanged
 @pytest.mark.parametrize(
     ("changes", "outcome", "words"),
     [
-        ({"damping": 240.0}, Outcome.EVENT_ORDER_MISMATCH, "DLS ends only once"),
+        (
+            {"damping": 240.0},
+            Outcome.EVENT_ORDER_MISMATCH,
+            "in double support, the ground would have to pull on the rear foot",
+        ),
         (
             {"damping": 15.0, "stiffness": 1117.9, "natural_length": 1.0302, "slope": 0.08},
             Outcome.EVENT_ORDER_MISMATCH,
-            "LEG_1_LIFTED_OFF in DLS",
+            "in double support, the ground would have to pull on the fore foot",
         ),
         (
             {"damping": 40.0, "stiffness": 600.0, "natural_length": 1.04, "slope": 0.33},
             Outcome.BRANCH_ENDS_BEFORE_TARGET,
-            "λ4⁺ says whether there is DLS",
+            "just after the landing, the force on the rear foot would contradict the presence",
         ),
-        ({"slope": 0.5}, Outcome.BRANCH_ENDS_BEFORE_TARGET, "DLS ends only once"),
+        (
+            {"slope": 0.5},
+            Outcome.BRANCH_ENDS_BEFORE_TARGET,
+            "in double support, the ground would have to pull on the rear foot",
+        ),
         ({"slope": 0.02}, Outcome.NO_CYCLE_FOUND, "did not converge"),
     ],
 )
 def test_causes_of_a_missing_gait_have_different_outcomes(changes, outcome, words):
     cycle = vrw.limit_cycle(vrw.WheelParams(**changes))
     assert int(cycle.outcome) == outcome
-    assert words in cycle.why
+    assert words in cycle.ending
+    assert cycle.why.startswith(cycle.ending)
     assert cycle.why in repr(cycle)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "borders", "words"),
+    [
+        # The paper finds gaits at 219 and at 5 N s/m, and none at 220 and at 4 N s/m.
+        (
+            "damping",
+            300.0,
+            (219.0, 220.0),
+            ("pull on the rear foot", "λ4", "just after the landing"),
+        ),
+        ("damping", 3.0, (4.0, 5.0), ("pull on the fore foot", "λ2", "just after the landing")),
+        # Near rest a period has no upper bound.
+        *mark_slow(("slope", 0.05, (0.1, 0.11), ("the wheel would stop", "θ̇", "of this phase"))),
+    ],
+)
+def test_a_missing_gait_is_explained_by_the_last_wheel_with_a_gait(name, value, borders, words):
+    """The reference are the borders of the paper, and the library's search on both sides."""
+    why = vrw.limit_cycle(vrw.WheelParams(**{name: value})).why
+    assert all(word in why for word in words)
+    last_value = float(re.search(rf"last gait found has {name} ([0-9.]+)", why)[1])
+    assert borders[0] < last_value < borders[1]
+    assert bool(vrw.limit_cycle(vrw.WheelParams(**{name: last_value})).found)
+
+
+def test_no_gait_can_exist_on_ground_that_does_not_descend():
+    """In a gait, impacts take energy in each step, and only descent supplies energy."""
+    for model in (vrw.ViscoelasticWheel(), vrw.RigidWheel()):
+        for slope in (0.0, -0.1):
+            cycle = vrw.limit_cycle(vrw.WheelParams(slope=slope), model=model)
+            assert "No steady gait can exist: the slope is" in cycle.why
+
+
+@pytest.mark.parametrize(
+    ("slope", "words"), [(0.05, "doesn't pass the vertical"), (0.6, "pull on the foot")]
+)
+def test_the_rigid_wheel_states_why_its_only_rolling_motion_fails(slope, words):
+    params, wheel = vrw.WheelParams(slope=slope), vrw.RigidWheel()
+    assert words in vrw.limit_cycle(params, model=wheel).why
+    # The reference is a walk: it ends in the way that the sentence states.
+    walk = vrw.walk(params, wheel.compute_default_start(params), 5, model=wheel)
+    outcomes = {0.05: Outcome.FELL_BACK, 0.6: Outcome.LEG_1_LIFTED_OFF}
+    assert outcomes[slope] in np.asarray(walk.steps.outcome)
 
 
 def test_a_batch_has_the_ending_of_each_wheel_alone():

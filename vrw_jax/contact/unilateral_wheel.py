@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -112,8 +113,26 @@ def _convert_restitution(restitution_coefficient: Any) -> Array | None:
 class AbstractContactWheel(AbstractWheel):
     """Model whose section state is the full section state, with a contact mode for each leg."""
 
+    friction: eqx.AbstractVar[Scalar]
     parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
     reports_contacts: ClassVar[bool] = True
+
+    def explain_impossible_gait(self, params: WheelParams) -> str:
+        """Return a sentence that states why one wheel can't have a gait, or "" if it may have one.
+
+        During a period T of a gait of total mass M, the momentum along the slope changes by
+        M g sin(slope) T plus the sum of the tangential impulses on the feet. The normal impulses
+        sum to M g cos(slope) T. Coulomb's law limits every tangential force and impulse to friction
+        times the normal one. The momentum is the same after a period only if friction is at least
+        tan(slope).
+        """
+        friction, required_friction = float(self.friction), math.tan(float(params.slope))
+        if friction >= required_friction:
+            return super().explain_impossible_gait(params)
+        return (
+            f"No steady gait can exist: friction is {friction:g}, below tan(slope) = "
+            f"{required_friction:.4g}, so the wheel slides down faster with each step."
+        )
 
     def compute_default_start(self, params: WheelParams) -> FullState:
         """Return a full section state near the gait of the wheel in Table 1 of the paper."""

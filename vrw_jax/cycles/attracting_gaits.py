@@ -127,9 +127,15 @@ def _find_gaits_from_starts(
         Outcome.NO_CYCLE_FOUND,
         selected_gaits.outcome,
     ).astype(np.int32)
+    get_searched_wheels = lambda gaits: (gaits.model, gaits.params)
+    searched_wheels = jax.tree.map(np.copy, get_searched_wheels(selected_gaits))
     for gait_array in jax.tree.leaves(selected_gaits):
         gait_array[is_gait_missing] = 0
-    selected_gaits = eqx.tree_at(lambda gaits: gaits.outcome, selected_gaits, outcome_codes)
+    selected_gaits = eqx.tree_at(
+        lambda gaits: (*get_searched_wheels(gaits), gaits.outcome),
+        selected_gaits,
+        (*searched_wheels, outcome_codes),
+    )
     return candidate_wheel_indices[selected_gait_indices], jax.device_put(selected_gaits)
 
 

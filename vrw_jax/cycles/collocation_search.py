@@ -133,6 +133,37 @@ class CollocationSystem(NamedTuple):
         return estimate_mesh_error(self.phase_sequence, self.phase_meshes, solution_with_lane)[0]
 
     @functools.partial(jax.jit, static_argnums=0)
+    def trace_checks(
+        self, parameters: Array, collocation_solution: CollocationSolution, is_phase_active: Array
+    ) -> list[Array]:
+        """Return the quantity of each of the ADMISSIBILITY_CHECKS except that of the mesh, for the
+        first gait step of one wheel.
+
+        A guard has one value at the start of its phase, at each node and at the end.
+        """
+        phase_constants = self.phase_constants_function(*parameters)
+        phase_points = self.evaluate_phase_points(parameters, collocation_solution)[0]
+        quantities = []
+        for phase, points, duration in zip(
+            self.phase_sequence.phases, phase_points, collocation_solution.durations[0], strict=True
+        ):
+            guards_by_instant = zip(
+                *(
+                    phase.guards_function(phase_constants, point)
+                    for point in (
+                        points.phase_start_point, points.node_points, points.phase_end_point
+                    )
+                ),
+                strict=True,
+            )  # fmt: skip
+            quantities += [duration, *(jnp.hstack(guards) for guards in guards_by_instant)]
+        return quantities + list(
+            self.phase_sequence.margins_function(
+                phase_constants, phase_points, is_phase_active[0] > 0.5
+            )
+        )
+
+    @functools.partial(jax.jit, static_argnums=0)
     def measure_takeoff_acceleration(
         self, parameters: Array, collocation_solution: CollocationSolution
     ) -> Array:

@@ -15,8 +15,15 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.continuation import floquet
 from vrw_jax.measures import FORCE_PEAK_MEASURES
-from vrw_jax.numerics import describe_step_ending, with_default_jax_settings
-from vrw_jax.printing import AbstractPrintable, LabelAndText, format_numbers, format_outcome_counts
+from vrw_jax.models import AbstractWheel
+from vrw_jax.numerics import with_default_jax_settings
+from vrw_jax.printing import (
+    AbstractPrintable,
+    LabelAndText,
+    format_each_batch_element,
+    format_numbers,
+    format_outcome_counts,
+)
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -143,17 +150,51 @@ class AbstractCycle(AbstractPrintable):
         return self.outcome == Outcome.STEPPED
 
     @property
+    @abc.abstractmethod
+    def searched_wheel(self) -> tuple[AbstractWheel, WheelParams]:
+        """Return the model and the wheel whose gait was searched."""
+
+    @property
     def ending(self) -> Any:
         """Return a sentence that describes how the search ended.
 
         For a batch the result is an array of such sentences.
         """
-        return describe_step_ending(self.outcome, Outcome)
+        return self._describe_each_outcome(lambda outcome_code, _: Outcome(outcome_code).meaning)
+
+    def _describe_each_outcome(
+        self, describe_outcome: Callable[[int, float], str], failed_checks: Any = 0.0
+    ) -> Any:
+        """Return the sentence of each outcome, or why no gait can exist."""
+        outcomes = np.asarray(self.outcome)
+        searched_wheels = jax.tree.map(np.asarray, self.searched_wheel)
+
+        def describe_element(flat_index: int, failed_check: float) -> str:
+            element_index = np.unravel_index(flat_index, outcomes.shape)
+            outcome_code = int(outcomes[element_index])
+            if outcome_code in RETRY_OUTCOMES:
+                model, params = jax.tree.map(
+                    lambda x: x[element_index] if x.ndim else x, searched_wheels
+                )
+                if impossibility_text := model.explain_impossible_gait(params):
+                    return impossibility_text
+            return describe_outcome(outcome_code, failed_check)
+
+        flat_indices = np.arange(outcomes.size).reshape(outcomes.shape)
+        return format_each_batch_element(describe_element, flat_indices, failed_checks)
 
     @property
     def why(self) -> Any:
-        """Return the sentence of `ending`, which contains the reason if no gait was found."""
-        return self.ending
+        """Return the sentence of `ending`, which contains the reason if no gait was found.
+
+        For one wheel without a gait, the text also names the last wheel with a gait on the straight
+        line from the wheel in Table 1 of the paper to this wheel.
+        """
+        if self.outcome.ndim or int(self.outcome) not in RETRY_OUTCOMES:
+            return self.ending
+        return " ".join(
+            filter(None, (self.ending, *(describe(self) for describe in LAST_GAIT_DESCRIBERS)))
+        )
 
     @property
     def period(self) -> Array:
@@ -312,6 +353,19 @@ def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str
         multiplier_texts.append(f"{n_unlisted_multipliers} below 5e-6")
     return float(np.abs(floquet_multipliers[0])), ", ".join(multiplier_texts)
 
+
+LAST_GAIT_DESCRIBERS: list[Callable[[Any], str]] = []
+"""Function that describes the last gait on the way from Table 1 to the wheel of a cycle. The module
+`gait_search` adds the function, because the function searches for gaits.
+"""
+
+RETRY_OUTCOMES = (
+    Outcome.NO_CYCLE_FOUND,
+    Outcome.EVENT_ORDER_MISMATCH,
+    Outcome.BRANCH_ENDS_BEFORE_TARGET,
+    Outcome.MESH_TOO_COARSE,
+)
+"""Outcomes after which the search is repeated, because it may have missed an existing gait."""
 
 FIELDS_ZERO_WITHOUT_GAIT = (
     "section_state",

@@ -95,7 +95,7 @@ def resolve_model_with_reason(
         return model, None
     paper_cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
     if not bool(paper_cycle.found):
-        return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.why}"
+        return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.ending}"
     section_state = selected_model.complete_section_state(params, paper_cycle.section_state)
     model_choice = selected_model.choose_model(params, section_state, StepOptions())[0]
     return model_choice.model, model_choice.why

@@ -20,6 +20,7 @@ from vrw_jax.batches import SolverIndex, select_cheapest_solver, step_batch
 from vrw_jax.cycles.attracting_gaits import find_attracting_gaits, find_slowest_gait_indices
 from vrw_jax.cycles.collocation_finder import CollocationFinder
 from vrw_jax.cycles.collocation_search import CollocationState
+from vrw_jax.cycles.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES
 from vrw_jax.cycles.finder import AbstractGaitFinder
 from vrw_jax.cycles.finder_selection import (
     UserCycleGuess,
@@ -35,6 +36,7 @@ from vrw_jax.cycles.gait_walks import (
     measure_period_defects,
     walk_to_gaits,
 )
+from vrw_jax.cycles.last_gait import describe_last_gait
 from vrw_jax.cycles.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.cycles.return_map_finder import ReturnMapCycle
@@ -54,14 +56,6 @@ from vrw_jax.validation import (
     require_untraced_arguments,
 )
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, stack_parameters
-
-RETRY_OUTCOMES = (
-    Outcome.NO_CYCLE_FOUND,
-    Outcome.EVENT_ORDER_MISMATCH,
-    Outcome.BRANCH_ENDS_BEFORE_TARGET,
-    Outcome.MESH_TOO_COARSE,
-)
-"""Outcomes after which the search is repeated, because it may have missed an existing gait."""
 
 
 FailureFillName = Literal["zeros", "nan"]
@@ -236,6 +230,9 @@ def limit_cycles(
         params, first_wheel_params = jax.device_put((params, select_tree_rows(params, 0)))
     gait_finder = resolve_finder(first_wheel_params, model, options, period_n)
     return _search_with_fallbacks(gait_finder, params, None, options is None, which)
+
+
+LAST_GAIT_DESCRIBERS[:] = [functools.partial(describe_last_gait, limit_cycle, limit_cycles)]
 
 
 def parse_gait_choice(which: GaitChoice) -> int:

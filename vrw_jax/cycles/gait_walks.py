@@ -84,7 +84,7 @@ def _make_section_states(
         * wheels.gravity
         / wheels.locked_length
         * np.sin(0.5 * wheels.leg_angle)
-        * np.sin(wheels.slope)
+        * np.sin(np.maximum(wheels.slope, 0.0))  # Without descent, no rolling gait exists.
     )
     rolling_rate = rigid_leg_rate / np.sin(wheels.leg_angle)
     leg_rate = -0.1 * np.sqrt(wheels.gravity * wheels.locked_length) / 3.0

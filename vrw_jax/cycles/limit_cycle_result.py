@@ -37,7 +37,7 @@ from vrw_jax.cycles.slope_response import (
 )
 from vrw_jax.models import DoubleSupportIndicators, Margins, SectionState, ViscoelasticWheel
 from vrw_jax.numerics import Scalar, StepOptions, evaluate_by_saved_trace, is_inside_jit
-from vrw_jax.printing import LabelAndText, format_each_batch_element, format_numbers
+from vrw_jax.printing import LabelAndText, format_numbers
 from vrw_jax.simulation import step
 from vrw_jax.wheel import (
     Motion,
@@ -67,6 +67,7 @@ class LimitCycle(AbstractCycle):
     - `parameters`: parameters as floats, in the order of params.PARAMETER_NAMES;
     - `collocation_state`: solution and its active phases, a start of the search for similar wheels;
     - `monodromy_value`: monodromy matrix, without derivatives;
+    - `searched_parameters`: parameters of the wheel, also if it has no gait, without derivatives;
     - `system`, `model`: the collocation system and the model.
 
     Examples:
@@ -86,6 +87,7 @@ class LimitCycle(AbstractCycle):
     parameters: Float[Array, " n_parameters"]
     collocation_state: CollocationState
     monodromy_value: Float[Array, "2 2"]
+    searched_parameters: Float[Array, " n_parameters"]
     system: CollocationSystem = eqx.field(static=True)
     model: ViscoelasticWheel = eqx.field(
         default_factory=ViscoelasticWheel
@@ -204,20 +206,23 @@ class LimitCycle(AbstractCycle):
         return self.map_over_batch_axes(compute_step_margins)(self.parameters, self.section_state)
 
     @property
+    def searched_wheel(self) -> tuple[ViscoelasticWheel, WheelParams]:
+        parameters = jnp.moveaxis(self.searched_parameters, -1, 0)
+        return self.model, make_wheel_from_parameters(parameters, self.system.n_legs)
+
+    @property
     def ending(self) -> Any:
         def describe_outcome(outcome_code: int, failed_check: float) -> str:
-            outcome_sentence = Outcome(int(outcome_code)).meaning
+            outcome_sentence = Outcome(outcome_code).meaning
             if outcome_code not in (
                 Outcome.EVENT_ORDER_MISMATCH,
                 Outcome.BRANCH_ENDS_BEFORE_TARGET,
             ):
                 return outcome_sentence
             check_index = int(failed_check - 1) % len(ADMISSIBILITY_CHECKS)
-            return f"{outcome_sentence} Broken: {ADMISSIBILITY_CHECKS[check_index]}."
+            return f"{outcome_sentence[:-1]}: {ADMISSIBILITY_CHECKS[check_index].failure}."
 
-        return format_each_batch_element(
-            describe_outcome, self.outcome, self.collocation_state.failed_check
-        )
+        return self._describe_each_outcome(describe_outcome, self.collocation_state.failed_check)
 
     def model_summary_rows(self) -> list[LabelAndText]:
         indicator_text = (
@@ -252,6 +257,7 @@ def _solve_limit_cycle(
         parameters.dtype
     )
     parameters = jnp.where(is_in_domain, parameters, table_1_parameters)
+    searched_parameters = lax.stop_gradient(parameters)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
         solve_cycle_with_derivatives(collocation_system, parameters, cycle_guess)
     )
@@ -310,6 +316,7 @@ def _solve_limit_cycle(
         parameters=parameters,
         collocation_state=collocation_state,
         monodromy_value=zero_without_gait(monodromy_value),
+        searched_parameters=searched_parameters,
         system=collocation_system,
     )
 

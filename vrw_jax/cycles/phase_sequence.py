@@ -23,7 +23,8 @@ from vrw_jax.collocation import (
 from vrw_jax.numerics import Elementwise, Vector, compute_sine_cosine
 from vrw_jax.wheel import (
     PAPER_PHASES,
-    SHARED_FAILURE_OUTCOMES,
+    TRANSITION_ASSUMPTIONS,
+    Assumption,
     PhaseInstant,
     Symbols,
     compute_symbols,
@@ -128,23 +129,17 @@ def _make_collocation_phase(
     )
 
 
-ADMISSIBILITY_CHECKS: tuple[str, ...] = (
+ADMISSIBILITY_CHECKS: tuple[Assumption, ...] = (
     *(
-        check_name
+        assumption
         for phase_class in PAPER_PHASES
-        for check_name in (
-            f"{phase_class.phase_name} lasts",
-            f"{phase_class.phase_name} ends only once",
-            *(
-                f"no {failure_outcome.name} in {phase_class.phase_name}"
-                for failure_outcome in (*phase_class.guard_outcomes[1:], *SHARED_FAILURE_OUTCOMES)
-            ),
+        for assumption in (
+            Assumption(f"{phase_class.phase_title} has no duration", "the duration", "T", "s"),
+            *phase_class.list_assumptions(),
         )
     ),
-    "λ4⁺ says whether there is DLS",
-    "λ_I4 holds the rear foot",
-    "Leg 2 extends",
-    "mesh",
+    *TRANSITION_ASSUMPTIONS,
+    Assumption("the mesh is too coarse", "the mesh", "", ""),
 )
 """Assumptions about a gait, in the order in which they are checked.
 

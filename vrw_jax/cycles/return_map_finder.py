@@ -82,6 +82,10 @@ class ReturnMapCycle(AbstractCycle):
     params: WheelParams
     model: AbstractWheel
 
+    @property
+    def searched_wheel(self) -> tuple[AbstractWheel, WheelParams]:
+        return self.model, self.params
+
     def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
         """Return the tree without its axis over the gait steps if the cycle has only one step."""
         if self.period_n > 1:

@@ -187,6 +187,19 @@ class AbstractWheel(eqx.Module):
         """
         raise NotImplementedError(f"{type(self).__name__} cannot begin within a step.")
 
+    def explain_impossible_gait(self, params: WheelParams) -> str:
+        """Return a sentence that states why one wheel can't have a gait, or "" if it may have one.
+
+        During a gait, gravity must supply the energy that impacts and dampers take.
+        """
+        slope = float(params.slope)
+        if slope > 0.0:
+            return ""
+        return (
+            f"No steady gait can exist: the slope is {slope:g} rad, but impacts and dampers take "
+            "energy, which gravity supplies on a positive slope only."
+        )
+
     @abc.abstractmethod
     def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return a section state from which a walk can start."""

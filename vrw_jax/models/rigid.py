@@ -95,6 +95,22 @@ class RigidWheel(AbstractWheel):
         static=True, converter=partial(check_bool, "held_landing"), default=False
     )
 
+    def explain_impossible_gait(self, params: WheelParams) -> str:
+        impossibility_text = super().explain_impossible_gait(params)
+        # The default start is the only rolling motion that may repeat.
+        outcome = self.take_step(params, self.compute_default_start(params), StepOptions()).outcome
+        if impossibility_text or outcome == Outcome.STEPPED:
+            return impossibility_text
+        if outcome == Outcome.FELL_BACK:
+            return (
+                "No steady gait can exist: each landing takes more energy than the wheel gains on "
+                "this slope, so its leg doesn't pass the vertical."
+            )
+        return (
+            "No steady gait can exist: in the only rolling motion that repeats, the ground would "
+            "have to pull on the foot."
+        )
+
     def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return the section state at the rolling fixed point, or a fast start if there is no fixed
         point.

@@ -31,8 +31,9 @@ from vrw_jax.wheel.params import (
 )
 from vrw_jax.wheel.phases import (
     PAPER_PHASES,
-    SHARED_FAILURE_OUTCOMES,
+    TRANSITION_ASSUMPTIONS,
     AbstractPhase,
+    Assumption,
     PhaseInstant,
     PhaseMargins,
     make_paper_phases,

@@ -35,6 +35,41 @@ SHARED_FAILURE_OUTCOMES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_L
 """Outcomes with which any phase can end instead of the regular end."""
 
 
+class Assumption(NamedTuple):
+    """Assumption of the paper's step about a quantity that must be positive, as text."""
+
+    failure: str  # clause that describes what happens if the quantity is negative
+    quantity: str
+    symbol: str
+    unit: str
+
+
+SHARED_ASSUMPTIONS = (
+    Assumption("the wheel would stop and roll back", "the rate", "θ̇", "rad/s"),
+    Assumption("a loaded leg would contract to its mass", "the length left", "L - a", "m"),
+    Assumption(
+        "the ground would have to pull on the fore foot", "the force on this foot", "λ2", "N"
+    ),
+)
+"""Assumptions of every phase, in the order of `SHARED_FAILURE_OUTCOMES`."""
+
+TRANSITION_ASSUMPTIONS = (
+    Assumption(
+        "just after the landing, the force on the rear foot would contradict the presence or "
+        "absence of double support",
+        "this force", "λ4⁺", "N",
+    ),
+    Assumption(
+        "in the landing, the ground would have to pull on the rear foot",
+        "the impulse on this foot", "λ_I4", "N s",
+    ),
+    Assumption(
+        "Leg 2 would meet its stopper without extending", "the rate of Leg 2", "dL2/dt", "m/s"
+    ),
+)  # fmt: skip
+"""Assumptions about landing, take-off and the collision of Leg 2 with its stopper."""
+
+
 class PhaseMargins(NamedTuple):
     """Margins of the model's assumptions in a phase. Margins do not affect the motion.
 
@@ -70,8 +105,14 @@ class AbstractPhase(abc.ABC):
     """
 
     phase_name: ClassVar[str]
+    phase_title: ClassVar[str]
+    """Name of the phase in sentences."""
+    start_title: ClassVar[str]
+    """Instant at which the phase begins, in sentences."""
     n_dof: ClassVar[int]
     """Number of degrees of freedom of the phase."""
+    specific_assumptions: ClassVar[tuple[Assumption, ...]]
+    """Assumptions behind the guards from `compute_end_guard` and `compute_specific_guards`."""
     guard_outcomes: ClassVar[tuple[Outcome, ...]]
     """Outcomes of the guards from `compute_end_guard` and `compute_specific_guards`, in this
     order.
@@ -199,6 +240,14 @@ class AbstractPhase(abc.ABC):
             *((phase_instant.fore_force.normal,) if self.stop_at_lift_off else ()),
         )
 
+    @classmethod
+    def list_assumptions(cls) -> tuple[Assumption, ...]:
+        """Return the assumptions about the guards, in the order of `compute_guards`."""
+        return tuple(
+            assumption._replace(failure=f"in {cls.phase_title}, {assumption.failure}")
+            for assumption in cls.specific_assumptions + SHARED_ASSUMPTIONS
+        )
+
     @property
     def all_guard_outcomes(self) -> tuple[Outcome, ...]:
         """Return the outcomes of all guards, in the order of `compute_guards`."""
@@ -297,6 +346,20 @@ class DoubleSupport(AbstractPhase):
     """
 
     phase_name, n_dof = "DLS", 1
+    phase_title, start_title = "double support", "just after the landing"
+    specific_assumptions = (
+        Assumption(
+            "the ground would have to pull on the rear foot", "the force on this foot", "λ4", "N"
+        ),
+        Assumption(
+            "Leg 2 would reach its stopper before its foot lifts off",
+            "the distance to the stopper", "L0 - L2", "m",
+        ),
+        Assumption(
+            "the next foot would meet the ground before the rear foot lifts off",
+            "the height of the next foot", "h", "m",
+        ),
+    )  # fmt: skip
     can_come_to_rest = True
     guard_outcomes = (
         Outcome.STEPPED, Outcome.STOPPER_IN_DOUBLE_SUPPORT, Outcome.TOUCHDOWN_BEFORE_STOPPER
@@ -360,6 +423,17 @@ class SingleSupport1(AbstractPhase):
     """
 
     phase_name, n_dof = "SLS-I", 3
+    phase_title = "single support before Leg 2 is at its stopper"
+    start_title = "at take-off of the rear foot"
+    specific_assumptions = (
+        Assumption(
+            "Leg 2 would reach its stopper twice", "the distance to the stopper", "L0 - L2", "m"
+        ),
+        Assumption(
+            "the next foot would meet the ground too early",
+            "the height of the next foot", "h", "m",
+        ),
+    )  # fmt: skip
     guard_outcomes = Outcome.STEPPED, Outcome.TOUCHDOWN_BEFORE_STOPPER
     counts_specific_margins_at_start = (False,)
     has_stiff_start = True
@@ -409,6 +483,13 @@ class SingleSupport2(AbstractPhase):
     """
 
     phase_name, n_dof = "SLS-II", 2
+    phase_title = "single support with Leg 2 at its stopper"
+    start_title = "at the collision of Leg 2 with its stopper"
+    specific_assumptions = (
+        Assumption(
+            "the next foot would meet the ground twice", "the height of the next foot", "h", "m"
+        ),
+    )
     guard_outcomes = (Outcome.STEPPED,)
     counts_contraction_at_start, counts_specific_margins_at_start = True, (True, True)
 
