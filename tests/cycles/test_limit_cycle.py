@@ -583,6 +583,20 @@ def test_section_newton_differentiates_fixed_point_and_multiplier():
     np.testing.assert_allclose(many[1], [expected[1], -2.0 * expected[1]], rtol=1e-13)
 
 
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_multipliers_of_a_fixed_point_are_the_eigenvalues_of_its_jacobian(n):
+    matrix = np.random.default_rng(n).uniform(-0.5, 0.5, (n, n))
+    result = vrw.solve_fixed_point(lambda x: matrix @ x + 1.0, jnp.zeros(n))
+    known = np.linalg.eigvals(matrix)
+    moduli = np.abs(result.multipliers)
+    assert np.all(np.diff(moduli) <= 1e-12)  # round-off of conjugate pairs
+    np.testing.assert_allclose(
+        np.sort_complex(result.multipliers), np.sort_complex(known), atol=1e-12
+    )
+    lost = result._replace(jacobian=jnp.full((n, n), jnp.nan))
+    assert np.isnan(lost.multipliers).all()
+
+
 def test_a_fixed_point_moves_without_second_derivatives_of_its_map():
     """Of the same map: its point to third order, its multiplier's derivative is told as unknown."""
     compute_found = lambda a: solve_fixed_point_implicit(lambda x: a - x**2, jnp.asarray([0.5]))

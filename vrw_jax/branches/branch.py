@@ -24,6 +24,20 @@ on a screen.
 """
 
 
+def _describe_ends(end_reasons: tuple[str, str]) -> str:
+    """Return one text with the reasons for which a branch or curve ends at its two ends."""
+    if end_reasons[0] == end_reasons[1]:
+        return f"At both ends: {end_reasons[0]}"
+    return f"At the first point: {end_reasons[0]} At the last point: {end_reasons[1]}"
+
+
+def _format_ends(first_point: str, last_point: str, end_reasons: tuple[str, str]) -> list[str]:
+    """Return a line for each end of a branch or curve, or one line if the reasons are equal."""
+    if end_reasons[0] == end_reasons[1]:
+        return [f"  at {first_point} and at {last_point}: {end_reasons[0]}"]
+    return [f"  at {first_point}: {end_reasons[0]}", f"  at {last_point}: {end_reasons[1]}"]
+
+
 class FixedPoint(NamedTuple):
     """Fixed point of a return map at one value of the continued parameter.
 
@@ -152,7 +166,7 @@ class Branch:
         """
         if not self.values.size:
             return self.ends[0] or self.outcome.meaning
-        return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
+        return _describe_ends(self.ends)
 
     def __str__(self) -> str:
         values = self.values
@@ -167,8 +181,7 @@ class Branch:
             f"Branch along {self.parameter}: {values.size} gaits from "
             f"{values.min():.6g} to {values.max():.6g}{parameter_unit}, "
             f"{int(is_gait_stable.sum())} stable, {int((~is_gait_stable).sum())} unstable.",
-            f"  at {values[0]:.6g}: {self.ends[0]}",
-            f"  at {values[-1]:.6g}: {self.ends[1]}",
+            *_format_ends(f"{values[0]:.6g}", f"{values[-1]:.6g}", self.ends),
             f"  special points: {len(self.special_points)}",
             *(
                 f"    {special_point}"
@@ -242,7 +255,7 @@ class SpecialPointCurve:
         """Return one text with the reasons for which the curve ends at its first and at its last
         point.
         """
-        return f"At the first point: {self.ends[0]} At the last point: {self.ends[1]}"
+        return _describe_ends(self.ends)
 
     def __str__(self) -> str:
         first_parameter_name, second_parameter_name = self.parameters
@@ -250,12 +263,10 @@ class SpecialPointCurve:
             f"Curve of {self.name} over {first_parameter_name} and {second_parameter_name}: "
             f"{len(self.values)} points."
         ]
-        for curve_end_index, curve_end_reason in zip((0, -1), self.ends, strict=True):
-            first_parameter_value, second_parameter_value = self.values[curve_end_index]
-            text_lines.append(
-                f"  at ({first_parameter_value:.6g}, {second_parameter_value:.6g}): "
-                f"{curve_end_reason}"
-            )
+        first_point, last_point = (
+            "({:.6g}, {:.6g})".format(*self.values[point_index]) for point_index in (0, -1)
+        )
+        text_lines += _format_ends(first_point, last_point, self.ends)
         return "\n".join(
             [*text_lines, *(f"    {codim2_point}" for codim2_point in self.codim2_points)]
         )

@@ -48,3 +48,11 @@ from vrw_jax.continuation.test_functions import (
     TestFunctionPoint,
     compute_offset_bifurcation_margins,
 )
+
+__all__ = (
+    "ArclengthOptions",
+    "FixedPointProblem",
+    "FixedPointResult",
+    "floquet_multipliers",
+    "solve_fixed_point",
+)  # The list of `help(vrw_jax.continuation)`.

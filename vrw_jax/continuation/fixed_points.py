@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vrw_jax.continuation.floquet import MULTIPLIER_TOLERANCES
+from vrw_jax.continuation.floquet import MULTIPLIER_TOLERANCES, floquet_multipliers
 from vrw_jax.hybrid import ReturnMap, Termination, get_compiled_program
 from vrw_jax.numerics import (
     Scalar,
@@ -60,6 +60,8 @@ class FixedPointResult(NamedTuple):
         >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
         >>> float(result.x[0]), float(result.jacobian[0, 0])
         (2.0, 0.5)
+        >>> result.multipliers.tolist()
+        [(0.5+0j)]
     """
 
     x: Float[Array, " n"]
@@ -68,6 +70,16 @@ class FixedPointResult(NamedTuple):
     converged: Bool[Array, ""]
     n_iterations: Int[Array, ""]
     termination: Int[Array, ""] | None = None
+
+    @property
+    def multipliers(self) -> Complex[Array, "... n"]:
+        """Return the Floquet multipliers in the order of decreasing modulus, shape (..., n).
+
+        The multipliers are NaN where the Jacobian is not finite.
+        """
+        is_finite = jnp.isfinite(self.jacobian).all((-2, -1))[..., None]
+        finite_jacobian = jnp.where(is_finite[..., None], self.jacobian, 0.0)
+        return jnp.where(is_finite, floquet_multipliers(finite_jacobian), jnp.nan)
 
     @property
     def ending(self) -> Any:
