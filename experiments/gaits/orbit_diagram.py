@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax import figures as plots
-from vrw_jax.figures.branch_figures import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
+from vrw_jax.figures._branches import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
 from vrw_jax.figures.style import draw_markers, format_axis_label
 from vrw_jax.simulation.attractors import (
     PeriodicWalkEnds,

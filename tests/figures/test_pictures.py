@@ -12,10 +12,10 @@ from PIL import Image
 
 import vrw_jax as vrw
 from experiments.shared.color_vision import simulate_color_vision
-from vrw_jax.figures import branch_figures as branch
+from vrw_jax.figures import _branches as branch
 from vrw_jax.figures import indicators, save_animation, style
-from vrw_jax.figures.branch_figures import basin_figure
-from vrw_jax.figures.tuning_figures import tuning_figure
+from vrw_jax.figures._branches import basin_figure
+from vrw_jax.figures._tuning import tuning_figure
 from vrw_jax.tuning import TrialKind
 from vrw_jax.tuning.maximization import TuneStatus
 from vrw_jax.tuning.tune_result import ActiveConstraint, WalkValidation

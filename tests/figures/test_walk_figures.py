@@ -7,7 +7,8 @@ import xarray as xr
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.figures import contact_figures, tornado_figure
+from vrw_jax.figures import _contact as contact
+from vrw_jax.figures import tornado_figure
 from vrw_jax.wheel import ContactMode
 
 
@@ -36,7 +37,7 @@ def ladder_walk() -> xr.Dataset:
 @pytest.mark.parametrize("name", ["paper_walk", "rigid_walk"])
 def test_feet_of_a_walk_in_phases_are_at_the_positions_of_its_variables(name, request):
     walk = request.getfixturevalue(name)
-    motion = contact_figures.compute_foot_motion(walk)
+    motion = contact.compute_foot_motion(walk)
     for leg in (1, 2):
         for axis, letter in enumerate("xz"):
             known = walk[f"foot_{leg}_{letter}"].values  # round-off of metres
@@ -53,7 +54,7 @@ def test_feet_of_a_walk_in_phases_are_at_the_positions_of_its_variables(name, re
 
 
 def test_feet_with_unilateral_contact_are_those_of_the_walk(sliding_walk):
-    motion = contact_figures.compute_foot_motion(sliding_walk)
+    motion = contact.compute_foot_motion(sliding_walk)
     np.testing.assert_array_equal(motion.foot_positions[..., 0], sliding_walk.foot_x)
     np.testing.assert_array_equal(motion.foot_positions[..., 1], sliding_walk.foot_z)
     np.testing.assert_array_equal(motion.contact_modes, sliding_walk.contact)
@@ -67,7 +68,7 @@ def test_feet_with_unilateral_contact_are_those_of_the_walk(sliding_walk):
 
 def test_bars_of_contact_modes_cover_the_time_of_each_mode(sliding_walk):
     bars = vrw.plot.gait_panels(sliding_walk).axes[2].collections
-    duration_by_color = dict.fromkeys(contact_figures.CONTACT_MODE_COLORS[1:], 0.0)
+    duration_by_color = dict.fromkeys(contact.CONTACT_MODE_COLORS[1:], 0.0)
     for bar in bars:
         color = mpl.colors.to_hex(bar.get_facecolor()[0]).upper()
         duration_by_color[color] += np.ptp(bar.get_paths()[0].vertices[:, 0])
@@ -81,7 +82,7 @@ def test_sticks_have_feet_in_the_colors_of_their_modes(sliding_walk):
     axes = vrw.plot.sticks(sliding_walk, interval=0.1).axes[0]
     colors = {line.get_color() for line in axes.lines if line.get_marker() in ("o", ">", "<")}
     modes = (ContactMode.OFF, ContactMode.STICK, ContactMode.SLIP_DOWN)
-    assert {contact_figures.CONTACT_MODE_COLORS[mode] for mode in modes} <= colors
+    assert {contact.CONTACT_MODE_COLORS[mode] for mode in modes} <= colors
     names = [text.get_text() for text in axes.get_legend().get_texts()]
     assert {"at rest", "sliding downhill", "in the air"} <= set(names)
 
@@ -96,14 +97,14 @@ def test_a_walk_of_every_model_is_drawn(name, request):
     frames, milliseconds = vrw.plot.walk_frames(walk, n_frames=3, slow=1.0)
     assert len(frames) == 3
     assert milliseconds == round(1e3 * float(walk.time[-1]) / 3)
-    color = contact_figures.CONTACT_MODE_COLORS[ContactMode.STICK]
+    color = contact.CONTACT_MODE_COLORS[ContactMode.STICK]
     wanted_pixel = np.round(255 * np.array(mpl.colors.to_rgb(color)))
     pixels = np.asarray(frames[0]).reshape(-1, 3)
     assert np.sum(np.all(pixels == wanted_pixel, axis=1)) > 5  # of the foot at rest
 
 
 def test_feet_between_two_samples_are_interpolated(sliding_walk):
-    motion = contact_figures.compute_foot_motion(sliding_walk)
+    motion = contact.compute_foot_motion(sliding_walk)
     middle = 0.5 * (motion.sample_times[7] + motion.sample_times[8])
     hub, feet, sample = motion.interpolate_at_time(middle)
     np.testing.assert_allclose(hub, motion.hub_positions[7:9].mean(0), atol=1e-14)  # round-off

@@ -5,7 +5,7 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.figures.branch_figures import basin_figure
+from vrw_jax.figures._branches import basin_figure
 from vrw_jax.measures import POST_LANDING_COMPONENT_NAMES, PRE_TOUCHDOWN_COMPONENT_NAMES
 from vrw_jax.simulation.attractors import PeriodicWalkEnds, find_distinct_orbits
 

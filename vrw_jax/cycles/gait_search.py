@@ -57,7 +57,6 @@ from vrw_jax.validation import (
 )
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, stack_parameters
 
-
 FailureFillName = Literal["zeros", "nan"]
 FAILURE_FILLS: tuple[str, ...] = get_args(FailureFillName)
 

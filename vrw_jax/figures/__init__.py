@@ -1,8 +1,20 @@
 """Figures of labeled results. Only this package imports matplotlib."""
 
-from vrw_jax.figures import branch_figures, style
-from vrw_jax.figures.branch_figures import basin_figure, branch_figure
-from vrw_jax.figures.scan_figures import map_figure, scan_figures
+from vrw_jax.figures import style
+from vrw_jax.figures._branches import basin_figure, branch_figure
+from vrw_jax.figures._scans import map_figure, scan_figures
+from vrw_jax.figures._tornado import tornado_figure
+from vrw_jax.figures._tuning import tuning_figure
+from vrw_jax.figures._walks import (
+    foot_height,
+    gait_panels,
+    ground_forces,
+    indicators,
+    rear_force,
+    save_animation,
+    sticks,
+    walk_frames,
+)
 from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
@@ -12,14 +24,22 @@ from vrw_jax.figures.style import (
     figure_style,
     save,
 )
-from vrw_jax.figures.tornado_figures import tornado_figure
-from vrw_jax.figures.tuning_figures import tuning_figure
-from vrw_jax.figures.walk_figures import (
-    foot_height,
-    gait_panels,
-    indicators,
-    rear_force,
-    save_animation,
-    sticks,
-    walk_frames,
-)
+
+__all__ = (
+    "basin_figure",
+    "branch_figure",
+    "figure_style",
+    "foot_height",
+    "gait_panels",
+    "ground_forces",
+    "indicators",
+    "map_figure",
+    "rear_force",
+    "save",
+    "save_animation",
+    "scan_figures",
+    "sticks",
+    "tornado_figure",
+    "tuning_figure",
+    "walk_frames",
+)  # The list of `help(vrw.plot)`.

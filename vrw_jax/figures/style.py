@@ -4,8 +4,10 @@ Figures are created inside `figure_style()`, and `save` writes them to files. No
 matplotlib changes, and no window opens.
 """
 
+import io
 import math
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,13 +17,14 @@ import matplotlib as mpl
 import numpy as np
 import xarray as xr
 from cycler import cycler
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from vrw_jax.measures import MEASURES, format_mathtext
-from vrw_jax.validation import check_path, check_type
+from vrw_jax.validation import check_path, check_real, check_type
 from vrw_jax.wheel import Outcome
 
 OKABE_ITO_BLUE = "#0072B2"
@@ -70,20 +73,39 @@ MATPLOTLIB_SETTINGS: dict[Any, Any] = {
     ),
     "figure.constrained_layout.use": True,
     "savefig.dpi": 200,
+    # Journals refuse Type 3 fonts, which are matplotlib's default.
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
     "svg.hashsalt": "vrw_jax",  # The same figure then gives the same file.
 }
 """Matplotlib settings for all figures. The serif font is included in matplotlib, and the journal
 uses it.
 """
 
-LEGEND_BESIDE_PANEL: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
-"""Settings of a legend that is on the right of its panel."""
-
 COLUMN_FIGURE_WIDTH_INCHES = 3.4
 """Width of a figure in one column, inches, chosen because it is the column width of the journal."""
 
 PAGE_FIGURE_WIDTH_INCHES = 6.9
 """Width of a figure across the page, inches, chosen because it is the text width of the journal."""
+
+FIGURE_WIDTHS_INCHES = {"column": COLUMN_FIGURE_WIDTH_INCHES, "page": PAGE_FIGURE_WIDTH_INCHES}
+"""Named widths of figures, inches."""
+
+FIGURE_WIDTH_LIMITS_MM = (80.0, 500.0)
+"""Widths that figures accept, mm. Narrower figures leave no space for legends, and the upper limit
+refuses widths in pixels.
+"""
+
+FULL_ROW_WIDTH_INCHES = 6.0
+"""Width of a figure from which on no row of panels is split, inches. It is chosen below the text
+widths of journals, which are 150 mm to 190 mm.
+"""
+
+MIN_PANEL_WIDTH_INCHES = 2.2
+"""Width that a panel of curves needs with its labels, inches."""
+
+MIN_BAR_PANEL_WIDTH_INCHES = 1.5
+"""Width that a panel of bars needs with its labels, inches."""
 
 MAX_PANELS_PER_ROW = 3
 """Largest number of panels in a row of bars, chosen because four panels leave no space for
@@ -162,16 +184,68 @@ def figure_style() -> Iterator[None]:
         yield
 
 
+class StyledFigure(Figure):
+    """Figure that has the style of all figures wherever it is drawn, and that notebooks show."""
+
+    # Matplotlib reads the fonts and their embedding when it draws and saves.
+    draw = figure_style()(Figure.draw)
+    savefig = figure_style()(Figure.savefig)
+
+    def _repr_png_(self) -> bytes:
+        png_buffer = io.BytesIO()
+        self.savefig(png_buffer, format="png", dpi=self.dpi)
+        return png_buffer.getvalue()
+
+
+FigureWidth = str | float | None
+"""Width of a figure: "column", "page", a number in mm, or None for the usual width."""
+
+
+def find_width_inches(width: FigureWidth, usual_width_inches: float) -> float:
+    """Return the width of a figure, inches. Raise an error if `width` is not a width."""
+    if width is None:
+        return usual_width_inches
+    remedy = 'give "column", "page", or a number of mm'
+    if isinstance(width, str):
+        if width not in FIGURE_WIDTHS_INCHES:
+            raise ValueError(f"width is {width!r}, but it is no width of a figure: {remedy}.")
+        return FIGURE_WIDTHS_INCHES[width]
+    width_mm = check_real("width", width)
+    if not FIGURE_WIDTH_LIMITS_MM[0] <= width_mm <= FIGURE_WIDTH_LIMITS_MM[1]:
+        raise ValueError(
+            f"width is {width_mm:g} mm, but a figure is {FIGURE_WIDTH_LIMITS_MM[0]:g} to "
+            f"{FIGURE_WIDTH_LIMITS_MM[1]:g} mm wide: {remedy}."
+        )
+    return width_mm / 25.4
+
+
+def count_panel_columns(
+    width_inches: float, n_panels: int, min_panel_width: float = MIN_PANEL_WIDTH_INCHES
+) -> int:
+    """Return how many panels a figure has in a row that has `n_panels` across a page."""
+    if width_inches >= FULL_ROW_WIDTH_INCHES:
+        return n_panels
+    return min(n_panels, max(1, int(width_inches / min_panel_width)))
+
+
+def scale_to_width(n_across_page: int, width_inches: float) -> int:
+    """Return how many columns a matrix of small panels has if a page has `n_across_page`."""
+    return min(n_across_page, round(n_across_page * width_inches / PAGE_FIGURE_WIDTH_INCHES))
+
+
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
-    """Write `figure` as SVG and PNG files into `folder`, and return the paths.
+    """Write `figure` as SVG and PNG files, or as one file of another format, and return the paths.
+
+    Texts of PDF files remain texts, in embedded fonts (Type 42).
 
     Args:
         figure: a matplotlib figure.
         folder: folder for the files, created if it does not exist.
-        name: name of the files without the suffix.
+        name: name of the files. A name that ends in .pdf, or in another format of matplotlib, is
+            the name of a single file.
 
     Returns:
-        list[Path]: the paths of `name`.svg and `name`.png.
+        list[Path]: the paths of `name`.svg and `name`.png, or of the single file.
 
     Raises:
         TypeError: if `folder` is not a path.
@@ -182,13 +256,21 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
         >>> figure, folder = vrw.plot.sticks(gait), Path(tempfile.mkdtemp())
         >>> [path.suffix for path in vrw.plot.save(figure, folder, "sticks")]
         ['.svg', '.png']
+        >>> [path.name for path in vrw.plot.save(figure, folder, "sticks.pdf")]
+        ['sticks.pdf']
     """
     folder = check_path("folder", folder, 'give a folder, such as "figures"')
     folder.mkdir(parents=True, exist_ok=True)
-    figure_paths = [folder / f"{name}.svg", folder / f"{name}.png"]
+    is_file_name = Path(name).suffix[1:] in figure.canvas.get_supported_filetypes()
+    figure_paths = (
+        [folder / name] if is_file_name else [folder / f"{name}.svg", folder / f"{name}.png"]
+    )
+    # Without dates and versions, the same figure gives the same file.
+    varying_keys = {".svg": "Date", ".png": "Software", ".pdf": "CreationDate"}
     with figure_style():
-        figure.savefig(figure_paths[0], metadata={"Date": None})
-        figure.savefig(figure_paths[1], metadata={"Software": None})
+        for figure_path in figure_paths:
+            varying_key = varying_keys.get(figure_path.suffix)
+            figure.savefig(figure_path, metadata={varying_key: None} if varying_key else None)
     return figure_paths
 
 
@@ -266,19 +348,102 @@ def format_value_label(
 
 
 def make_panel_grid(
-    n_panels: int, panel_height: float, legend_height: float, **subplot_settings: Any
+    width_inches: float,
+    n_panels: int,
+    panel_height: float,
+    legend_height: float,
+    max_n_columns: int,
+    min_panel_width: float = MIN_PANEL_WIDTH_INCHES,
+    **subplot_settings: Any,
 ) -> tuple[Figure, np.ndarray]:
-    """Return a figure with rows of up to `MAX_PANELS_PER_ROW` panels, and the axes of its panels.
+    """Return a figure with rows of up to `max_n_columns` panels, and the axes of its panels.
 
-    The heights are in inches, and `legend_height` is that of the figure without its panels.
+    Narrow figures have fewer panels in a row. The heights are in inches, and `legend_height` is
+    that of the figure without its panels.
     """
-    n_columns = min(n_panels, MAX_PANELS_PER_ROW)
+    n_columns = count_panel_columns(width_inches, min(n_panels, max_n_columns), min_panel_width)
     n_rows = math.ceil(n_panels / n_columns)
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, n_rows * panel_height + legend_height))
+    figure = StyledFigure(figsize=(width_inches, n_rows * panel_height + legend_height))
     panel_axes = figure.subplots(n_rows, n_columns, squeeze=False, **subplot_settings).ravel()
     for axes in panel_axes[n_panels:]:
         axes.set_axis_off()
     return figure, panel_axes[:n_panels]
+
+
+def make_bar_panels(
+    width_inches: float,
+    measure_names: Sequence[str],
+    panel_height: float,
+    legend_height: float,
+    **subplot_settings: Any,
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with one panel of bars per measure, and the axes of its panels."""
+    figure, panel_axes = make_panel_grid(
+        width_inches,
+        len(measure_names),
+        panel_height,
+        legend_height,
+        MAX_PANELS_PER_ROW,
+        MIN_BAR_PANEL_WIDTH_INCHES,
+        **subplot_settings,
+    )
+    n_columns = panel_axes[0].get_gridspec().ncols
+    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
+        # An inch contains 18 letters.
+        title = textwrap.fill(
+            MEASURES[measure_name].long_name, int(18.0 * width_inches / n_columns)
+        )
+        axes.set_title(typeset_greek_symbols(title))
+    return figure, panel_axes
+
+
+def add_wrapped_legend(
+    owner: Figure | Axes, max_n_columns: int, max_width_inches: float, **legend_settings: Any
+) -> float:
+    """Add a legend to a figure or a panel, with as many columns as `max_width_inches` allows.
+
+    Return by how much the legend is higher than a legend with `max_n_columns`, inches.
+    """
+    figure: Any = owner.get_figure(root=True)
+    lowest_height = math.inf
+    for n_columns in range(max_n_columns, 0, -1):
+        legend = owner.legend(ncols=n_columns, **legend_settings)
+        extent = legend.get_window_extent()
+        lowest_height = min(lowest_height, extent.height)
+        if n_columns == 1 or extent.width <= max_width_inches * figure.dpi:
+            break
+        legend.remove()
+    return float(extent.height - lowest_height) / figure.dpi
+
+
+def add_figure_legend(
+    figure: Figure, handles: Sequence[Artist], max_n_columns: int, **legend_settings: Any
+) -> None:
+    """Add a legend below a figure, with as many columns as the width of the figure allows.
+
+    Further rows make the figure higher.
+    """
+    legend_settings |= {"handles": handles, "loc": "outside lower center"}
+    width_inches, height_inches = figure.get_size_inches()
+    added_height = add_wrapped_legend(figure, max_n_columns, width_inches, **legend_settings)
+    figure.set_figheight(height_inches + added_height)
+
+
+def add_side_legend(
+    axes: Axes, handles: Sequence[Artist] | None = None, beside: bool = True
+) -> None:
+    """Add a legend on the right of a panel, or above the panel in a narrow figure.
+
+    - `beside`: if False, the legend is above the panel in every figure.
+    """
+    handles = axes.get_legend_handles_labels()[0] if handles is None else handles
+    figure: Any = axes.get_figure(root=True)
+    if beside and count_panel_columns(figure.get_figwidth(), 2) > 1:
+        axes.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return
+    legend_settings = {"handles": handles, "loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    # The labels of the vertical axis take a fifth of a narrow figure.
+    add_wrapped_legend(axes, len(handles), 0.8 * figure.get_figwidth(), **legend_settings)
 
 
 def draw_panel_letter(axes: Axes, panel_letter: str) -> None:

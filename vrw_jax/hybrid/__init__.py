@@ -27,3 +27,18 @@ from vrw_jax.hybrid.simulation import (
     simulate_hybrid,
     time_errors,
 )
+
+__all__ = (
+    "Guard",
+    "HybridSolution",
+    "LCPStatus",
+    "Mode",
+    "ReturnMap",
+    "Termination",
+    "enumerate_lcp_solutions",
+    "flow_jacobian_determinant",
+    "product_multipliers",
+    "segment_maps",
+    "simulate_hybrid",
+    "time_errors",
+)  # The list of `help(vrw_jax.hybrid)`.

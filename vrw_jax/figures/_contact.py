@@ -14,12 +14,12 @@ from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
-    LEGEND_BESIDE_PANEL,
     OKABE_ITO_AMBER,
     OKABE_ITO_GREEN,
     OKABE_ITO_PINK,
     OKABE_ITO_SKY_BLUE,
-    PAGE_FIGURE_WIDTH_INCHES,
+    StyledFigure,
+    add_side_legend,
     draw_panel_letter,
     format_axis_label,
 )
@@ -196,8 +196,9 @@ def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
     ]
 
 
-def make_contact_panels(walk: xr.Dataset) -> Figure:
-    """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time.
+def make_contact_panels(walk: xr.Dataset, width_inches: float, forces_only: bool) -> Figure:
+    """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time, or
+    of the forces only.
 
     The walk is a trajectory with contact modes.
     """
@@ -211,20 +212,28 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
         leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_line_styles)
         for leg_number in moving_legs
     }
-    figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 8.0))
     panel_height_ratios = [1.0, 1.0, 0.35 + 0.11 * len(touching_legs), 1.0, 1.2, 1.2]
-    panel_axes = figure.subplots(6, 1, sharex=True, height_ratios=panel_height_ratios)
-    for axes, panel_letter in zip(panel_axes, "abcdef", strict=True):
-        draw_panel_letter(axes, panel_letter)
-    angle_axes, length_axes, mode_axes, height_axes, normal_axes, tangential_axes = panel_axes
-    angle_axes.plot(times_with_gaps, insert_landing_gaps(walk, walk.theta.values), color="black")
-    angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
-    leg_panels = (
-        (length_axes, moving_legs, walk.length, "$L$ [m]"),
-        (height_axes, touching_legs, walk.foot_z, "height of\nfoot [m]"),
-        (normal_axes, touching_legs, walk.normal, "normal\nforce [N]"),
-        (tangential_axes, touching_legs, walk.tangential, "tangential\nforce [N]"),
+    first_panel = 4 if forces_only else 0
+    panel_height_ratios = panel_height_ratios[first_panel:]
+    figure = StyledFigure(figsize=(width_inches, 3.4 if forces_only else 8.0))
+    panel_axes = figure.subplots(
+        len(panel_height_ratios), 1, sharex=True, height_ratios=panel_height_ratios
     )
+    for axes, panel_letter in zip(panel_axes, "abcdef", strict=False):
+        draw_panel_letter(axes, panel_letter)
+    leg_panels = [
+        (panel_axes[-2], touching_legs, walk.normal, "normal\nforce [N]"),
+        (panel_axes[-1], touching_legs, walk.tangential, "tangential\nforce [N]"),
+    ]
+    if not forces_only:
+        angle_axes, length_axes, mode_axes, height_axes, *_ = panel_axes
+        angle_axes.plot(times_with_gaps, insert_landing_gaps(walk, walk.theta), color="black")
+        angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
+        _draw_contact_modes(mode_axes, walk, foot_motion.contact_modes, touching_legs)
+        leg_panels += [
+            (length_axes, moving_legs, walk.length, "$L$ [m]"),
+            (height_axes, touching_legs, walk.foot_z, "height of\nfoot [m]"),
+        ]
     for axes, drawn_legs, quantity_by_leg, panel_label in leg_panels:
         for leg_number in drawn_legs:
             line_color, line_style = line_style_by_leg[leg_number]
@@ -236,29 +245,35 @@ def make_contact_panels(walk: xr.Dataset) -> Figure:
                 label=f"Leg {leg_number}",
             )
         axes.set_ylabel(panel_label)
-    for axes in panel_axes[3:]:
+    for axes in panel_axes[-3:]:
         axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4, zorder=0)
+    panel_axes[-1].set(xlabel="time [s]", xlim=foot_motion.sample_times[[0, -1]])
+    add_side_legend(panel_axes[0] if forces_only else length_axes)
+    figure.align_ylabels(panel_axes)
+    return figure
+
+
+def _draw_contact_modes(
+    axes: Axes, walk: xr.Dataset, contact_modes: np.ndarray, touching_legs: list[int]
+) -> None:
+    """Draw a bar in the color of the contact mode for each foot while it touches the ground."""
     for bar_row_index, leg_number in enumerate(touching_legs):
         for start_time, end_time, contact_mode in find_constant_spans(
-            walk, foot_motion.contact_modes[:, leg_number - 1]
+            walk, contact_modes[:, leg_number - 1]
         ):
             if contact_mode != ContactMode.OFF:
-                mode_axes.broken_barh(
+                axes.broken_barh(
                     [(start_time, end_time - start_time)],
                     (bar_row_index - 0.35, 0.7),
                     color=CONTACT_MODE_COLORS[contact_mode],
                 )
-    mode_axes.set_yticks(range(len(touching_legs)), list(map(str, touching_legs)))
-    mode_axes.set(ylabel="foot on\nthe ground", ylim=(len(touching_legs) - 0.5, -0.5))
+    axes.set_yticks(range(len(touching_legs)), list(map(str, touching_legs)))
+    axes.set(ylabel="foot on\nthe ground", ylim=(len(touching_legs) - 0.5, -0.5))
     mode_handles = [
         Patch(color=CONTACT_MODE_COLORS[contact_mode], label=CONTACT_MODE_NAMES[contact_mode])
-        for contact_mode in np.unique(foot_motion.contact_modes[is_foot_touching])
+        for contact_mode in np.unique(contact_modes[contact_modes != ContactMode.OFF])
     ]
-    mode_axes.legend(handles=mode_handles, **LEGEND_BESIDE_PANEL)
-    tangential_axes.set(xlabel="time [s]", xlim=foot_motion.sample_times[[0, -1]])
-    length_axes.legend(**LEGEND_BESIDE_PANEL)
-    figure.align_ylabels(panel_axes)
-    return figure
+    add_side_legend(axes, mode_handles)
 
 
 def draw_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:

@@ -10,13 +10,17 @@ from matplotlib.ticker import MaxNLocator
 
 from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
-    LEGEND_BESIDE_PANEL,
     LIGHT_GRAY_COLOR,
     OKABE_ITO_BLUE,
     OKABE_ITO_ORANGE,
     PAGE_FIGURE_WIDTH_INCHES,
+    FigureWidth,
+    StyledFigure,
+    add_side_legend,
+    count_panel_columns,
     draw_markers,
     figure_style,
+    find_width_inches,
     format_axis_label,
     typeset_greek_symbols,
 )
@@ -26,7 +30,7 @@ from vrw_jax.validation import check_type
 
 
 @figure_style()
-def tuning_figure(tuned: TuneResult) -> Figure:
+def tuning_figure(tuned: TuneResult, *, width: FigureWidth = None) -> Figure:
     """Return a figure of a tuning run: objective, parameters, and slacks of the constraints.
 
     Filled symbols are gaits that satisfy every constraint; open symbols are gaits that violate a
@@ -35,6 +39,7 @@ def tuning_figure(tuned: TuneResult) -> Figure:
 
     Args:
         tuned: result of `vrw.tune`.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: objective and parameters over the evaluated gaits, and the slacks at start and end.
@@ -48,11 +53,19 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     path_dataset = tuned.path
     n_constraints = path_dataset.sizes["constraint"]
     # Each constraint has one line of text.
-    figure_height_inches = max(3.2, 0.19 * n_constraints + 1.0)
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, figure_height_inches))
-    panel_axes = figure.subplot_mosaic(
-        [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
-    )
+    slack_height_inches = 0.19 * n_constraints + 1.0
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    if has_two_columns := count_panel_columns(width_inches, 3) == 3:  # Names need one column.
+        figure = StyledFigure(figsize=(width_inches, max(3.2, slack_height_inches)))
+        panel_axes = figure.subplot_mosaic(
+            [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
+        )
+    else:
+        panel_heights = [1.8, 1.8, slack_height_inches]
+        figure = StyledFigure(figsize=(width_inches, sum(panel_heights)))
+        panel_axes = figure.subplot_mosaic(
+            [["objective"], ["parameters"], ["slack"]], height_ratios=panel_heights
+        )
     panel_axes["objective"].sharex(panel_axes["parameters"])
     _draw_objective_path(panel_axes["objective"], path_dataset)
     parameter_axes = panel_axes["parameters"]
@@ -73,8 +86,8 @@ def tuning_figure(tuned: TuneResult) -> Figure:
     parameter_axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
     parameter_axes.set(xlabel="gaits evaluated", ylim=(-0.05, 1.05))
     parameter_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    parameter_axes.legend(**LEGEND_BESIDE_PANEL)
-    _draw_constraint_slacks(panel_axes["slack"], tuned)
+    add_side_legend(parameter_axes)
+    _draw_constraint_slacks(panel_axes["slack"], tuned, " " if has_two_columns else "\n")
     return figure
 
 
@@ -122,8 +135,11 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
     axes.legend(loc="best", fontsize=7.0)
 
 
-def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
-    """Draw bars for the slack of each constraint at the start and at the tuned gait."""
+def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult, label_break: str) -> None:
+    """Draw bars for the slack of each constraint at the start and at the tuned gait.
+
+    - `label_break`: space or line break in the label of the horizontal axis.
+    """
     path_dataset = tune_result.path
     constraint_names = list(map(str, path_dataset.constraint.values))
     slacks = path_dataset.constraint_value.values - path_dataset.margin.values
@@ -164,7 +180,7 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult) -> None:
             tick_label.set_color(OKABE_ITO_ORANGE)
             tick_label.set_fontweight("bold")
     axes.set(
-        xlabel="slack, share of the largest on the path\n(active in bold)",
+        xlabel=f"slack, share of the{label_break}largest on the path\n(active in bold)",
         xlim=(min(-0.05, axes.get_xlim()[0]), 1.05),
     )
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)

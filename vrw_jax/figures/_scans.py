@@ -3,6 +3,7 @@
 """
 
 import textwrap
+from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,19 +21,24 @@ from vrw_jax.branches import SpecialPointCurve
 from vrw_jax.figures.style import (
     COLUMN_FIGURE_WIDTH_INCHES,
     LIGHT_GRAY_COLOR,
-    MAX_PANELS_PER_ROW,
     OKABE_ITO_AMBER,
     OKABE_ITO_BLUE,
     OUTCOME_LABELS_AND_COLORS,
     PAGE_FIGURE_WIDTH_INCHES,
     UNSTABLE_CYCLE_CODE,
+    FigureWidth,
+    StyledFigure,
+    add_figure_legend,
     draw_outcome_cells,
     figure_style,
+    find_width_inches,
     format_axis_label,
     format_value_label,
+    make_bar_panels,
     make_outcome_patches,
     make_panel_grid,
     require_dataset_variables,
+    scale_to_width,
     select_special_point_style,
     typeset_greek_symbols,
 )
@@ -82,13 +88,26 @@ each other.
 """
 
 
-def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
+class FiguresByName(dict[str, Any]):
+    """Figures by name, which notebooks show one below the other."""
+
+    def _repr_html_(self) -> str:
+        return "".join(
+            f'<img alt="{name}" src="data:image/png;base64,'
+            f'{b64encode(figure._repr_png_()).decode()}"><br>'
+            for name, figure in self.items()
+        )
+
+
+def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Figure]:
     """Return the figures of a scan, by name.
 
-    A grid with one or two axes leads to one figure. Further axes add one figure each.
+    A grid with one or two axes leads to one figure. Further axes add one figure each. Narrow
+    figures show fewer slices of a grid and fewer pairs of parameters.
 
     Args:
         scan: dataset that `vrw.scan` returns for a grid or for samples.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         dict[str, Figure]: the figures, whose names depend on the design.
@@ -109,32 +128,32 @@ def scan_figures(scan: xr.Dataset) -> dict[str, Figure]:
     ] or swept_parameters
     if "sample" in scan.dims:
         if len(varied_parameters) < 3:
-            return {"scan": draw_scan_samples(scan, varied_parameters)}
-        figures_by_name = {
-            "scan_pairs": draw_parameter_pairs(scan, varied_parameters[:MAX_PAIRED_PARAMETERS])
-        }
+            return FiguresByName(scan=draw_scan_samples(scan, varied_parameters, width))
+        figures_by_name = FiguresByName(
+            scan_pairs=draw_parameter_pairs(scan, varied_parameters, width)
+        )
         if read_scan_manifest(scan.attrs).get("design", {}).get("kind") == SALTELLI_DESIGN_KIND:
             measure_names = [
                 measure_name for measure_name in DIFFERENTIABLE_MEASURES if measure_name in scan
             ]
             figures_by_name["sobol_indices"] = draw_sobol_indices(
-                sobol_indices(scan, measure_names)
+                sobol_indices(scan, measure_names), width
             )
         return figures_by_name
     if len(varied_parameters) == 1:
-        return {"scan": draw_measure_curves(scan, varied_parameters[0])}
+        return FiguresByName(scan=draw_measure_curves(scan, varied_parameters[0], width))
     x, y, *further_parameters = varied_parameters
     if not further_parameters:
-        return {"scan": draw_scan_slices(scan, x, y)}
-    return {
-        f"scan_over_{parameter_name}": draw_scan_slices(scan, x, y, parameter_name)
+        return FiguresByName(scan=draw_scan_slices(scan, x, y, None, width))
+    return FiguresByName(
+        (f"scan_over_{parameter_name}", draw_scan_slices(scan, x, y, parameter_name, width))
         for parameter_name in further_parameters
-    }
+    )
 
 
 @figure_style()
 def draw_scan_slices(
-    scan: xr.Dataset, x: str, y: str, panel_column_parameter: str | None = None
+    scan: xr.Dataset, x: str, y: str, panel_column_parameter: str | None, width: FigureWidth
 ) -> Figure:
     """Return a figure over two parameters, with one column of panels per value of
     `panel_column_parameter`.
@@ -149,17 +168,20 @@ def draw_scan_slices(
         if parameter_name in scan.dims and parameter_name not in (x, y, panel_column_parameter)
     }
     panel_column_datasets = [scan.isel(slice_indices).transpose(y, x, ...)]
+    width_inches = find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES)
     if panel_column_parameter is not None:
         last_index = scan.sizes[panel_column_parameter] - 1
-        panel_column_indices = np.linspace(0, last_index, min(last_index + 1, MAX_PANEL_COLUMNS))
+        if last_index:
+            width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+        max_n_columns = scale_to_width(MAX_PANEL_COLUMNS, width_inches)
+        panel_column_indices = np.linspace(0, last_index, min(last_index + 1, max_n_columns))
         panel_column_datasets = [
             panel_column_datasets[0].isel({panel_column_parameter: panel_column_index})
             for panel_column_index in panel_column_indices.round().astype(int)
         ]
     n_panel_columns = len(panel_column_datasets)
     panel_measures = _list_shown_measures(scan)
-    figure_width = PAGE_FIGURE_WIDTH_INCHES if n_panel_columns > 1 else COLUMN_FIGURE_WIDTH_INCHES
-    figure = Figure(figsize=(figure_width, 1.65 * (len(panel_measures) + 1) + 1.0))
+    figure = StyledFigure(figsize=(width_inches, 1.65 * (len(panel_measures) + 1) + 1.0))
     panel_axes = figure.subplots(
         len(panel_measures) + 1, n_panel_columns, sharex=True, sharey=True, squeeze=False
     )
@@ -198,7 +220,9 @@ def draw_scan_slices(
             panel_value = dataset[panel_column_parameter].item()
             axes_of_column[0].set_title(format_value_label(panel_column_parameter, panel_value))
         axes_of_column[-1].set_xlabel(
-            format_axis_label(x, "{name} {symbol}" if n_panel_columns < 3 else "{symbol}")
+            format_axis_label(
+                x, "{name} {symbol}" if width_inches > 2.5 * n_panel_columns else "{symbol}"
+            )
         )
     for axes in panel_axes[:, 0]:
         axes.set_ylabel(format_axis_label(y, "{symbol}"))
@@ -213,13 +237,16 @@ def draw_scan_slices(
 
 
 @figure_style()
-def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
+def draw_scan_samples(
+    scan: xr.Dataset, parameter_names: Sequence[str], width: FigureWidth
+) -> Figure:
     """Return a figure of individual samples over the first two parameters."""
     x, y, *_ = (*parameter_names, "sample")
     measure_names = _list_shown_measures(scan)
     marker_size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.9))
-    panel_axes = figure.subplots(1, len(measure_names) + 1, sharey=True, squeeze=False)[0]
+    n_panels = len(measure_names) + 1
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    figure, panel_axes = make_panel_grid(width_inches, n_panels, 2.4, 0.5, n_panels, sharey=True)
     for axes, measure_name in zip(panel_axes, measure_names, strict=False):
         point_collection = _draw_measure_samples(axes, scan, x, y, measure_name, marker_size)
         _add_color_bar(
@@ -243,7 +270,9 @@ def draw_scan_samples(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figur
 
 
 @figure_style()
-def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Figure:
+def draw_parameter_pairs(
+    scan: xr.Dataset, parameter_names: Sequence[str], width: FigureWidth
+) -> Figure:
     """Return a figure with one panel of samples per pair of parameters.
 
     Panels below the diagonal show a measure, and panels above the diagonal show the outcome. The
@@ -254,9 +283,11 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
     drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
     measure_name = next(iter(_list_shown_measures(scan)), None)
     outcome_codes = _compute_displayed_outcome_codes(drawn_samples)
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    parameter_names = parameter_names[: scale_to_width(MAX_PAIRED_PARAMETERS, width_inches)]
     n_parameters = len(parameter_names)
     marker_size = float(np.clip(8000.0 / len(outcome_codes), 0.6, 8.0))
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, PAGE_FIGURE_WIDTH_INCHES * 0.9))
+    figure = StyledFigure(figsize=(width_inches, width_inches * 0.9))
     panel_axes = figure.subplots(n_parameters, n_parameters, sharex="col", squeeze=False)
     point_collection = None
     for (i, j), axes in np.ndenumerate(panel_axes):
@@ -285,6 +316,11 @@ def draw_parameter_pairs(scan: xr.Dataset, parameter_names: Sequence[str]) -> Fi
         elif i != j:
             axes.tick_params(labelleft=False)
     panel_axes[0, 0].set_ylabel("share that walks")
+    if width_inches < 1.3 * n_parameters:  # The labels need more space than the panels have.
+        panel_axes[0, 0].set_ylabel("share that\nwalks")
+        for axes in panel_axes.flat:
+            axes.locator_params(nbins=2)
+            axes.tick_params("x", rotation=90)
     if measure_name is not None and point_collection is not None:
         _add_color_bar(
             figure,
@@ -329,12 +365,17 @@ def _draw_outcome_samples(
 
 
 @figure_style()
-def draw_sobol_indices(indices: xr.Dataset) -> Figure:
+def draw_sobol_indices(indices: xr.Dataset, width: FigureWidth) -> Figure:
     """Return a figure of the Sobol' indices of each measure, with their confidence intervals."""
-    measure_names = indices.measure.values
+    measure_names = list(map(str, indices.measure.values))
     bar_positions = np.arange(indices.sizes["parameter"])
-    figure, panel_axes = make_panel_grid(
-        len(measure_names), 0.26 * len(bar_positions) + 0.5, 0.6, sharex=True, sharey=True
+    figure, panel_axes = make_bar_panels(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
+        measure_names,
+        0.26 * len(bar_positions) + 0.5,
+        0.6,
+        sharex=True,
+        sharey=True,
     )
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         sobol_indices_of_measure = indices.sel(measure=measure_name)
@@ -359,16 +400,14 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
             )
         if sobol_indices_of_measure.is_constant_measure:
             axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
-        axes.set_title(typeset_greek_symbols(MEASURES[str(measure_name)].long_name))
         parameter_names = indices.parameter.values
         axes.set_yticks(bar_positions, [f"${MEASURES[name].mathtext}$" for name in parameter_names])
         axes.set_xlim(0.0, 1.05)
     panel_axes[0].invert_yaxis()
-    for axes in panel_axes[-MAX_PANELS_PER_ROW:]:
+    for axes in panel_axes[-panel_axes[0].get_gridspec().ncols :]:
         axes.set_xlabel("share of the variance")
         axes.tick_params(labelbottom=True)
-    legend_entries = panel_axes[0].get_legend_handles_labels()
-    figure.legend(*legend_entries, loc="outside lower center", ncols=2)
+    add_figure_legend(figure, panel_axes[0].get_legend_handles_labels()[0], 2)
     omitted_samples_percent = 100.0 * indices.attrs["left_out"]
     omitted_rows_note = (
         f"{indices.attrs['rows']:,} rows; {omitted_samples_percent:.1f} % left out, without a gait"
@@ -378,7 +417,7 @@ def draw_sobol_indices(indices: xr.Dataset) -> Figure:
 
 
 @figure_style()
-def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
+def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
     """Return a figure of the measures in `SHOWN_MEASURE_NAMES` as functions of one parameter.
 
     Parameter values without a gait are gray.
@@ -391,7 +430,8 @@ def draw_measure_curves(scan: xr.Dataset, x: str) -> Figure:
         }
     ).sortby(x)
     measure_names = _list_shown_measures(scan) or ["fore_foot_force"]
-    figure = Figure(figsize=(COLUMN_FIGURE_WIDTH_INCHES, 1.6 * len(measure_names) + 0.6))
+    width_inches = find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES)
+    figure = StyledFigure(figsize=(width_inches, 1.6 * len(measure_names) + 0.6))
     panel_axes = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
     cell_edges = _find_cell_edges(scan[x].values)
     missing_gait_indices = np.flatnonzero(scan.outcome.values != Outcome.STEPPED)
@@ -515,17 +555,23 @@ def _add_scan_legend(
     """Add a legend of outcomes and of margin curves below a figure."""
     margin_names = sorted(legend_lines, key=DRAWN_MARGIN_NAMES.index)
     margin_lines = [legend_lines[margin_name] for margin_name in margin_names]
-    figure.legend(
-        handles=[*make_outcome_patches(outcome_codes), *margin_lines],
-        loc="outside lower center",
-        ncols=4 if n_panel_columns > 1 else 2,
+    add_figure_legend(
+        figure,
+        [*make_outcome_patches(outcome_codes), *margin_lines],
+        4 if n_panel_columns > 1 else 2,
         fontsize=7.5,
         columnspacing=1.4,
     )
 
 
 @figure_style()
-def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurve]) -> Figure:
+def map_figure(
+    scan: xr.Dataset,
+    measure: str,
+    curves: Sequence[SpecialPointCurve],
+    *,
+    width: FigureWidth = None,
+) -> Figure:
     """Return a map of a measure over two parameters, with curves of special points.
 
     Cells without a gait are gray. A curve is thin where its gaits are unstable.
@@ -534,6 +580,7 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
         scan: dataset that `vrw.scan` returns for a grid of two parameters.
         measure: name of a measure in the scan.
         curves: results of `vrw.continue_special_point` for the same parameters; may be empty.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: one panel, in SI units.
@@ -552,7 +599,8 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
             parameter_name for parameter_name in SWEEPABLE_PARAMETERS if parameter_name in scan.dims
         )
     )
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 0.62 * PAGE_FIGURE_WIDTH_INCHES))
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    figure = StyledFigure(figsize=(width_inches, 0.62 * width_inches))
     axes = figure.subplots()
     axes.set_facecolor(LIGHT_GRAY_COLOR)
     measure_values = scan[measure].where(scan.outcome == 0).transpose(y, x).values
@@ -610,5 +658,5 @@ def map_figure(scan: xr.Dataset, measure: str, curves: Sequence[SpecialPointCurv
         ylim=scan[y].values[[0, -1]],
     )
     if curves:
-        figure.legend(loc="outside lower center", ncols=2)
+        add_figure_legend(figure, axes.get_legend_handles_labels()[0], 2)
     return figure

@@ -1,5 +1,7 @@
 """Figures of branches and their special points, and figures of basins of attraction."""
 
+import itertools
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
@@ -11,16 +13,22 @@ from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
+    OKABE_ITO_AMBER,
     OKABE_ITO_GREEN,
     OKABE_ITO_PINK,
+    OKABE_ITO_SKY_BLUE,
     OKABE_ITO_YELLOW,
     PAGE_FIGURE_WIDTH_INCHES,
+    FigureWidth,
+    add_figure_legend,
     draw_outcome_cells,
     draw_panel_letter,
     figure_style,
+    find_width_inches,
     format_axis_label,
     format_value_label,
     make_outcome_patches,
+    make_panel_grid,
     require_variables_of_datasets,
     typeset_greek_symbols,
 )
@@ -41,11 +49,10 @@ SPECIAL_POINT_COLORS = {
 }
 """Colors of special points by kind. Other kinds, which change the stability, are black."""
 
-COMMON_BRANCH_PANELS = (
-    ("DLS fraction", {"dls_fraction": LEG_1_COLOR}),
-    ("moduli of multipliers", {"spectral_radius": "black"}),
-)
-"""Panels of every branch figure: the label, and the color of each measure in the panel."""
+MULTIPLIER_PANEL = ("moduli of multipliers", {"spectral_radius": "black"})
+"""Panel of every branch figure: the label, and the color of each measure in the panel."""
+COMMON_BRANCH_PANELS = (("DLS fraction", {"dls_fraction": LEG_1_COLOR}), MULTIPLIER_PANEL)
+"""Panels of the figures of all branches of gaits."""
 PAPER_BRANCH_PANELS = (
     *COMMON_BRANCH_PANELS,
     (
@@ -63,34 +70,63 @@ OTHER_MODEL_BRANCH_PANELS = (
 """Panels of the figure of a branch that was computed with a model without the paper's
 indicators.
 """
+COMPONENT_COLORS = (
+    LEG_1_COLOR, LEG_2_COLOR, OKABE_ITO_SKY_BLUE, OKABE_ITO_AMBER, DARK_GRAY_COLOR, "black",
+)  # fmt: skip
+"""Colors of the components of a fixed point of a map, in turn."""
 
 
 @figure_style()
-def branch_figure(branch: Branch) -> Figure:
+def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
     """Return a figure of a branch and its special points.
 
     The panels show the DLS fraction, the moduli of multipliers, indicators and clearance. For
-    models other than the paper's, speed and period replace indicators and clearance. Curves are
-    solid where gaits are stable, and dashed where gaits are unstable. Special points are numbered
-    from left to right.
+    models other than the paper's, speed and period replace indicators and clearance. For maps, the
+    panels show the fixed points and the moduli of multipliers. Curves are solid where gaits are
+    stable, and dashed where gaits are unstable. Special points are numbered from left to right.
 
     Args:
-        branch: result of `vrw.continue_branch` with respect to a parameter of the wheel.
+        branch: result of `vrw.continue_branch` or `vrw.continue_map`.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
-        Figure: four panels with the parameter on the horizontal axis, in SI units.
+        Figure: panels with the parameter on the horizontal axis, in SI units.
+
+    Raises:
+        TypeError, ValueError: if the branch has no point, or an argument is no branch or width.
 
     Examples:
         >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 230.0))
         >>> figure = vrw.plot.branch_figure(branch)
     """
     check_type("branch", branch, Branch, "give vrw.continue_branch(params, name, bounds)")
+    if not branch.values.size:
+        raise ValueError(
+            f"the branch has no point to draw: {branch.ending} Start it at a gait or fixed point."
+        )
     parameter_values, branch_dataset = branch.values, branch.dataset
     special_points = sorted(branch.special_points, key=lambda special_point: special_point.value)
-    n_legend_rows = -(-len(special_points) // 2)
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 4.0 + 0.16 * n_legend_rows))
-    panel_axes = figure.subplots(2, 2, sharex=True)
     has_dls_indicators = "lambda_2_plus" in branch_dataset
+    drawn_panels: tuple[tuple[str, dict[str, str]], ...] = (
+        PAPER_BRANCH_PANELS if has_dls_indicators else OTHER_MODEL_BRANCH_PANELS
+    )
+    if "x" in branch_dataset:  # fixed points of a map
+        components = {
+            f"$x_{{{number}}}$": values
+            for number, values in enumerate(branch_dataset.x.transpose("component", "point"), 1)
+        }
+        branch_dataset = branch_dataset.assign(components)
+        component_colors = dict(zip(components, itertools.cycle(COMPONENT_COLORS), strict=False))
+        drawn_panels = (("fixed point", component_colors), MULTIPLIER_PANEL)
+    legend_height = 0.32 + 0.16 * -(-len(special_points) // 2)
+    figure, panel_axes = make_panel_grid(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
+        len(drawn_panels),
+        1.84,
+        legend_height,
+        2,
+        sharex=True,
+    )
     stability_changes = (np.flatnonzero(np.diff(branch.stable.astype(int))) + 1).tolist()
     # A piece of equal stability ends at the point where the next piece starts.
     pieces_of_equal_stability = [
@@ -99,9 +135,8 @@ def branch_figure(branch: Branch) -> Figure:
             [0, *stability_changes], [*stability_changes, branch.values.size], strict=True
         )
     ]
-    drawn_panels = PAPER_BRANCH_PANELS if has_dls_indicators else OTHER_MODEL_BRANCH_PANELS
     for axes, (panel_label, panel_measure_names), panel_letter in zip(
-        panel_axes.ravel(), drawn_panels, "abcd", strict=True
+        panel_axes, drawn_panels, "abcd", strict=False
     ):
         draw_panel_letter(axes, panel_letter)
         for measure_name, line_color in panel_measure_names.items():
@@ -122,11 +157,11 @@ def branch_figure(branch: Branch) -> Figure:
                 )
         _draw_special_points(axes, special_points, draws_numbers=panel_letter in "ab")
         axes.set_ylabel(panel_label)
-    panel_axes[0, 1].axhline(1.0, color=DARK_GRAY_COLOR, linewidth=0.5)
-    panel_axes[0, 1].set_ylim(0.0, None)
-    force_axes, clearance_axes = panel_axes[1]
+    panel_axes[1].axhline(1.0, color=DARK_GRAY_COLOR, linewidth=0.5)
+    panel_axes[1].set_ylim(0.0, None)
     if has_dls_indicators:
-        for axes in panel_axes[1]:
+        force_axes, clearance_axes = panel_axes[2:]
+        for axes in panel_axes[2:]:
             axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.5)
         for measure_name, line_color in PAPER_BRANCH_PANELS[2][1].items():
             force_axes.plot([], [], color=line_color, label=f"${MEASURES[measure_name].mathtext}$")
@@ -136,8 +171,13 @@ def branch_figure(branch: Branch) -> Figure:
         clearance_axes.set_ylim(
             2.0 * min(clearance_mm.min(), -0.1), 2.0 * max(clearance_mm.max(), 0.1)
         )
-    for axes in panel_axes[1]:
-        axes.set_xlabel(format_axis_label(branch.parameter))
+    if "x" in branch_dataset and 1 < len(component_colors) <= len(COMPONENT_COLORS):
+        for component_name, line_color in component_colors.items():
+            panel_axes[0].plot([], [], color=line_color, label=component_name)
+        panel_axes[0].legend()
+    for axes in panel_axes:
+        if axes.get_subplotspec().is_last_row():
+            axes.set_xlabel(format_axis_label(branch.parameter))
     _add_branch_legend(figure, special_points, branch.parameter)
     return figure
 
@@ -201,11 +241,13 @@ def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], param
         Line2D([], [], color="black", linestyle="-", label="stable"),
         Line2D([], [], color="black", linestyle="--", label="unstable"),
     ]
-    figure.legend(handles=legend_handles, loc="outside lower center", ncols=2, fontsize=7.5)
+    add_figure_legend(figure, legend_handles, 2, fontsize=7.5)
 
 
 @figure_style()
-def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
+def basin_figure(
+    results: list[xr.Dataset], titles: list[str], *, width: FigureWidth = None
+) -> Figure:
     """Return a figure of basins of attraction, one panel per result.
 
     Crosses mark the section states of the gaits. Shades of gray show after how many steps a walk
@@ -214,6 +256,7 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     Args:
         results: results of `vrw.basin`, each with two axes of starts.
         titles: title of each panel.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: the panels side by side.
@@ -237,8 +280,14 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
     max_n_steps_to_gait = max(
         float(steps_to_gait.max()) for steps_to_gait in steps_to_gait_by_panel
     )
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 3.3))
-    panel_axes = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
+    figure, panel_axes = make_panel_grid(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
+        len(results),
+        2.8,
+        0.5,
+        len(results),
+        sharey=True,
+    )
     for axes, basin_dataset, steps_to_gait, panel_title in zip(
         panel_axes, results, steps_to_gait_by_panel, titles, strict=True
     ):
@@ -267,14 +316,10 @@ def basin_figure(results: list[xr.Dataset], titles: list[str]) -> Figure:
                 markeredgewidth=1.6,
             )
         axes.set(title=panel_title, xlabel=format_axis_label(horizontal_axis_name, "{symbol}"))
-    panel_axes[0].set_ylabel(format_axis_label(str(results[0].attractor.dims[0]), "{symbol}"))
+        if axes.get_subplotspec().is_first_col():
+            axes.set_ylabel(format_axis_label(vertical_axis_name, "{symbol}"))
     color_bar = figure.colorbar(step_count_image, ax=list(panel_axes), aspect=25, pad=0.01)
     color_bar.set_label("steps until the gait is reached")
     color_bar.ax.set_ylim(0.0, max_n_steps_to_gait)
-    figure.legend(
-        handles=make_outcome_patches(failure_outcome_codes),
-        loc="outside lower center",
-        ncols=4,
-        fontsize=7.5,
-    )
+    add_figure_legend(figure, make_outcome_patches(failure_outcome_codes), 4, fontsize=7.5)
     return figure

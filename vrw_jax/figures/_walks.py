@@ -2,16 +2,19 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from vrw_jax.figures.contact_figures import (
+from vrw_jax.figures._contact import (
+    CONTACT_MODE_COLORS,
     GROUND_FORCE_NAMES,
     LEG_LINE_STYLES,
     OTHER_LEG_COLOR,
@@ -30,14 +33,20 @@ from vrw_jax.figures.style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
-    LEGEND_BESIDE_PANEL,
     LIGHT_GRAY_COLOR,
     PAGE_FIGURE_WIDTH_INCHES,
+    FigureWidth,
+    StyledFigure,
+    add_figure_legend,
+    add_side_legend,
+    count_panel_columns,
     draw_markers,
     draw_panel_letter,
     figure_style,
+    find_width_inches,
     format_axis_label,
     format_value_label,
+    make_panel_grid,
     require_dataset_variables,
     require_variables_of_datasets,
 )
@@ -66,7 +75,7 @@ def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
 
 
 @figure_style()
-def gait_panels(gait: xr.Dataset) -> Figure:
+def gait_panels(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
     """Return a figure of the motion and the ground forces of a gait (Fig. 6 of the paper).
 
     The panels show angle, leg lengths, load share, foot height and ground forces. Gray bands mark
@@ -75,6 +84,7 @@ def gait_panels(gait: xr.Dataset) -> Figure:
 
     Args:
         gait: dataset that `vrw.simulate` returns for any model.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: panels over time (s), in SI units.
@@ -83,56 +93,67 @@ def gait_panels(gait: xr.Dataset) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.gait_panels(gait)
     """
+    return _make_gait_panels(gait, width, forces_only=False)
+
+
+@figure_style()
+def ground_forces(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
+    """Return a figure of the ground forces of a gait, which is the last part of `gait_panels`.
+
+    Args:
+        gait: dataset that `vrw.simulate` returns for any model.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        Figure: forces (N) over time (s). With unilateral contact, one panel shows the normal
+        forces, and another panel shows the tangential forces.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.ground_forces(gait, width="column")
+    """
+    return _make_gait_panels(gait, width, forces_only=True)
+
+
+def _make_gait_panels(gait: xr.Dataset, width: FigureWidth, forces_only: bool) -> Figure:
+    """Return the figure of `gait_panels`, or only its panels of forces."""
     _require_nonempty_walk("gait", gait)
+    width_inches = find_width_inches(width, 0.8 * PAGE_FIGURE_WIDTH_INCHES)
     if reports_contact_modes(gait):
-        return make_contact_panels(gait)
-    times, theta, L1, L2, rear_foot_height, *ground_forces = (
+        return make_contact_panels(gait, width_inches, forces_only)
+    times, theta, L1, L2, rear_foot_height, *forces = (
         insert_landing_gaps(gait, gait[variable_name].values)
         for variable_name in ("time", "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES)
     )
-    rear_load_percent = 100.0 * ground_forces[3] / (ground_forces[1] + ground_forces[3])
-    phase_spans = find_constant_spans(gait, gait.phase.values)
-    figure = Figure(figsize=(0.8 * PAGE_FIGURE_WIDTH_INCHES, 7.4))
-    panel_axes = figure.subplots(5, 1, sharex=True, height_ratios=[1, 1, 1, 1, 1.5])
-    for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
-        draw_panel_letter(axes, panel_letter)
-        for start_time, end_time, phase_code in phase_spans:
-            if phase_code == 0:
-                axes.axvspan(start_time, end_time, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
-            if phase_code == 2:
-                dotted = (0, (1, 2))
-                axes.axvline(
-                    start_time, color=DARK_GRAY_COLOR, linewidth=0.5, linestyle=dotted, zorder=0
-                )
-    angle_axes, length_axes, load_axes, height_axes, force_axes = panel_axes
+    panel_height_ratios = [1.5] if forces_only else [1, 1, 1, 1, 1.5]
+    figure = StyledFigure(figsize=(width_inches, 2.3 if forces_only else 7.4))
+    panel_axes = figure.subplots(
+        len(panel_height_ratios), 1, sharex=True, squeeze=False, height_ratios=panel_height_ratios
+    )[:, 0]
     leg_1_style, leg_2_style = (
         {"color": line_color, "linestyle": line_style}
         for line_color, line_style in LEG_LINE_STYLES.values()
     )
-    angle_axes.plot(times, theta, color="black")
-    angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
-    for start_time, end_time, phase_code in phase_spans[:3]:
-        angle_axes.annotate(
-            PHASE_NAMES[phase_code],
-            (0.5 * (start_time + end_time), 1.0),
-            xycoords=("data", "axes fraction"),
-            ha="center",
-            va="bottom",
-            fontsize=7.5,
-            rotation=90 if phase_code == 2 else 0,
-        )
-    length_axes.plot(times, L1, label="Leg 1, $L_1$", **leg_1_style)
-    length_axes.plot(times, L2, label="Leg 2, $L_2$", **leg_2_style)
-    length_axes.set_ylabel("$L_1,\\ L_2$ [m]")
-    load_axes.plot(times, 100.0 - rear_load_percent, label="foot 1", **leg_1_style)
-    load_axes.plot(times, rear_load_percent, label="foot 2", **leg_2_style)
-    load_axes.set_ylabel("share of the\nnormal force [%]")
-    height_axes.plot(times, rear_foot_height, **leg_2_style)
-    height_axes.set_ylabel("$z_2$ [m]")
+    if not forces_only:
+        for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
+            draw_panel_letter(axes, panel_letter)
+        angle_axes, length_axes, load_axes, height_axes, _ = panel_axes
+        angle_axes.plot(times, theta, color="black")
+        angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
+        length_axes.plot(times, L1, label="Leg 1, $L_1$", **leg_1_style)
+        length_axes.plot(times, L2, label="Leg 2, $L_2$", **leg_2_style)
+        length_axes.set_ylabel("$L_1,\\ L_2$ [m]")
+        rear_load_percent = 100.0 * forces[3] / (forces[1] + forces[3])
+        load_axes.plot(times, 100.0 - rear_load_percent, label="foot 1", **leg_1_style)
+        load_axes.plot(times, rear_load_percent, label="foot 2", **leg_2_style)
+        load_axes.set_ylabel("share of the\nnormal force [%]")
+        height_axes.plot(times, rear_foot_height, **leg_2_style)
+        height_axes.set_ylabel("$z_2$ [m]")
+    force_axes = panel_axes[-1]
     for i, force_name in enumerate(GROUND_FORCE_NAMES):
         force_axes.plot(
             times,
-            ground_forces[i],
+            forces[i],
             linewidth=(0.7, 1.4)[i % 2],
             label=f"${MEASURES[force_name].mathtext}$",
             **(leg_1_style if i < 2 else leg_2_style),
@@ -141,14 +162,58 @@ def gait_panels(gait: xr.Dataset) -> Figure:
     force_axes.set(
         xlabel="time [s]", ylabel="ground reaction\nforce [N]", xlim=(times[0], times[-1])
     )
-    for axes in (length_axes, load_axes, force_axes):
-        axes.legend(**LEGEND_BESIDE_PANEL)
+    if forces_only and count_panel_columns(width_inches, 2) == 1:  # The names of phases are above.
+        add_figure_legend(figure, force_axes.get_legend_handles_labels()[0], 4)
+    else:
+        for axes in (force_axes,) if forces_only else (length_axes, load_axes, force_axes):
+            add_side_legend(axes)
     figure.align_ylabels(panel_axes)
+    _mark_phases(panel_axes, find_constant_spans(gait, gait.phase.values))
     return figure
 
 
+def _mark_phases(panel_axes: np.ndarray, phase_spans: list[tuple[float, float, int]]) -> None:
+    """Mark double support and collision II, and name the phases of the first step on top.
+
+    A name is upright where its phase is shorter than the name, and is omitted where it would cover
+    another one.
+    """
+    for axes in panel_axes:
+        for start_time, end_time, phase_code in phase_spans:
+            if phase_code == 0:
+                axes.axvspan(start_time, end_time, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
+            if phase_code == 2:
+                dotted = (0, (1, 2))
+                axes.axvline(
+                    start_time, color=DARK_GRAY_COLOR, linewidth=0.5, linestyle=dotted, zorder=0
+                )
+    axes = panel_axes[0]
+    names = [
+        axes.annotate(
+            PHASE_NAMES[phase_code],
+            (0.5 * (start_time + end_time), 1.0),
+            xycoords=("data", "axes fraction"),
+            ha="center",
+            va="bottom",
+            fontsize=7.5,
+        )
+        for start_time, end_time, phase_code in phase_spans[:3]
+    ]
+    axes.figure.draw_without_rendering()  # The layout defines the widths of the phases.
+    pixels_per_second = axes.bbox.width / np.ptp(axes.get_xlim())
+    last_right_edge = -np.inf
+    for name, (start_time, end_time, _) in zip(names, phase_spans, strict=False):
+        if name.get_window_extent().width > (end_time - start_time) * pixels_per_second:
+            name.set_rotation(90)
+        extent = name.get_window_extent()
+        if extent.x0 < last_right_edge:
+            name.remove()
+        else:
+            last_right_edge = extent.x1
+
+
 @figure_style()
-def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
+def sticks(gait: xr.Dataset, interval: float = 0.05, *, width: FigureWidth = None) -> Figure:
     """Return a stick diagram in the X-Z plane (Fig. 7 of the paper).
 
     Leg 1 is solid and Leg 2 is dotted. Colors show the phases. For walks with unilateral contact,
@@ -158,6 +223,7 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     Args:
         gait: dataset that `vrw.simulate` returns for any model.
         interval: time between two sticks, in s.
+        width: "column", "page" or a number of mm. By default, short walks are narrower than a page.
 
     Returns:
         Figure: one panel, in m.
@@ -168,22 +234,37 @@ def sticks(gait: xr.Dataset, interval: float = 0.05) -> Figure:
     """
     _require_nonempty_walk("gait", gait)
     check_positive("interval", interval)
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    figure = StyledFigure(figsize=(width_inches, 2.8))
     axes = figure.subplots()
     draw_sticks(axes, gait, interval)
     axes.plot(gait.hub_x, gait.hub_z, color=LEG_2_COLOR, linewidth=1.0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
-    last_hub_x = float(gait.hub_x[-1])
+    # The word "downhill" needs 0.2 inches below the ground, or 0.12 m of a short walk.
+    lower_limit = -max(0.12, 0.2 * np.ptp(axes.get_xlim()) / (0.85 * width_inches))
+    arrow_z, last_hub_x = 0.07 / 0.12 * lower_limit, float(gait.hub_x[-1])
     axes.annotate(
         "downhill",
-        (last_hub_x, -0.07),
-        (last_hub_x - 0.3, -0.07),
+        (last_hub_x, arrow_z),
+        (last_hub_x - 0.3, arrow_z),
         va="center",
         ha="right",
         arrowprops={"arrowstyle": "->", "linewidth": 0.6},
     )
-    axes.set(xlabel="$X$ [m]", ylabel="$Z$ [m]", ylim=(-0.12, None), aspect="equal")
-    axes.legend(**LEGEND_BESIDE_PANEL)
+    axes.set(xlabel="$X$ [m]", ylabel="$Z$ [m]", ylim=(lower_limit, None), aspect="equal")
+    length_to_height = np.ptp(axes.get_xlim()) / np.ptp(axes.get_ylim())
+    # The panel of a long walk is lower than a legend beside it.
+    add_side_legend(axes, beside=length_to_height < 4.0)
+    layout_engine: Any = figure.get_layout_engine()
+    for _ in range(2):  # The labels need other space after the first change of the size.
+        figure.draw_without_rendering()
+        outer_box: Any = axes.get_tightbbox()
+        label_space = np.subtract(outer_box.size, axes.bbox.size) / figure.dpi
+        label_space += 2.0 * layout_engine.get()["w_pad"]
+        panel_width = width_inches - label_space[0]
+        if width is None:
+            panel_width = min(panel_width, (2.8 - label_space[1]) * length_to_height)
+        figure.set_size_inches(label_space + panel_width * np.array([1.0, 1.0 / length_to_height]))
     return figure
 
 
@@ -197,7 +278,9 @@ def _format_gait_label(gait: xr.Dataset, varied_parameter: str) -> str:
 
 
 @figure_style()
-def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
+def foot_height(
+    gaits: Sequence[xr.Dataset], vary: str = "damping", *, width: FigureWidth = None
+) -> Figure:
     """Return a figure of the height of foot 2 during one step of each gait (Fig. 8 of the paper).
 
     A second panel shows the height around take-off, in mm.
@@ -205,6 +288,7 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
     Args:
         gaits: datasets that `vrw.simulate` returns for one step, one per curve.
         vary: name of the parameter in which the gaits differ, used in the legend.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: two panels over the time since the landing, in s.
@@ -214,8 +298,9 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> figure = vrw.plot.foot_height([gait])
     """
     require_variables_of_datasets("gaits", gaits, ("phase", "foot_2_z"), NO_PAPER_WALK_REMEDY)
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.6))
-    step_axes, takeoff_axes = figure.subplots(1, 2)
+    figure, (step_axes, takeoff_axes) = make_panel_grid(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES), 2, 2.6, 0.0, 2
+    )
     for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
         foot_height_mm = 1e3 * gait.foot_2_z
         lowest_mm = float(foot_height_mm.min())
@@ -254,13 +339,16 @@ def foot_height(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
 
 @figure_style()
-def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
+def rear_force(
+    gaits: Sequence[xr.Dataset], vary: str = "damping", *, width: FigureWidth = None
+) -> Figure:
     """Return a figure of the normal force on foot 2 in double support of each gait (Fig. 9 of the
     paper).
 
     Args:
         gaits: datasets that `vrw.simulate` returns for one step, one per curve.
         vary: name of the parameter in which the gaits differ, used in the legend.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: one panel over the time since the landing, in s.
@@ -270,7 +358,7 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
         >>> figure = vrw.plot.rear_force([gait])
     """
     require_variables_of_datasets("gaits", gaits, ("phase", "lambda_4"), NO_PAPER_WALK_REMEDY)
-    figure = Figure(figsize=(COLUMN_FIGURE_WIDTH_INCHES, 2.5))
+    figure = StyledFigure(figsize=(find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES), 2.5))
     axes = figure.subplots()
     for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
         double_support = gait.isel(time=gait.phase.values == 0)
@@ -299,7 +387,7 @@ def rear_force(gaits: Sequence[xr.Dataset], vary: str = "damping") -> Figure:
 
 
 @figure_style()
-def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
+def indicators(gaits: xr.Dataset, every: int = 4, *, width: FigureWidth = None) -> Figure:
     """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10 of the paper).
 
     Symbols are filled if foot 2 stays above the ground, and open if foot 2 scuffs.
@@ -310,6 +398,7 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
             `parameter_slope` is the slope in rad.
         every: spacing of the symbols: they are drawn at parameter values that are multiples of this
             number, and at the first and the last value.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: the impulse and the two forces over the parameter.
@@ -340,8 +429,9 @@ def indicators(gaits: xr.Dataset, every: int = 4) -> Figure:
         ((("lambda_I4", LEG_1_COLOR, "o"),), "impulse [N·s]"),
         ((("lambda_2_plus", LEG_1_COLOR, "s"), ("lambda_4_plus", LEG_2_COLOR, "o")), "force [N]"),
     )
-    figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.7))
-    panel_axes = figure.subplots(1, 2)
+    figure, panel_axes = make_panel_grid(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES), 2, 2.7, 0.0, 2
+    )
     for axes, panel_letter, (panel_indicators, axis_label) in zip(
         panel_axes, "ab", panel_rows, strict=True
     ):
@@ -487,6 +577,10 @@ def _draw_wheel_at_time(
     return sample_index
 
 
+GIF_PALETTE_SIZE = 32
+"""Number of colors of an animation, chosen because twice as many enlarge the file by a seventh."""
+
+
 def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str | Path) -> Path:
     """Write frames as a looping GIF file with one shared palette of 32 colors.
 
@@ -512,11 +606,26 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str |
     check_type("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
     path = check_path("path", path, 'give a file, such as "walk.gif"')
     path.parent.mkdir(parents=True, exist_ok=True)
-    shared_palette = frames[0].quantize(32)
-    paletted_frames = [
-        frame_image.quantize(palette=shared_palette, dither=Image.Dither.NONE)
-        for frame_image in frames
-    ]
+    largest_areas: dict[Any, int] = {}  # number of pixels of each color in a frame
+    for frame_image in frames:
+        for area, color in frame_image.getcolors(frame_image.width * frame_image.height) or []:
+            largest_areas[color] = max(area, largest_areas.get(color, 0))
+    # Feet are small but keep the colors of the other figures.
+    palette = [tuple(round(255.0 * x) for x in to_rgb(color)) for color in CONTACT_MODE_COLORS]
+    other_colors = set(largest_areas).difference(palette)
+    palette += sorted(other_colors, key=lambda color: largest_areas[color], reverse=True)
+    palette_array = np.array(palette[:GIF_PALETTE_SIZE])
+    paletted_frames = []
+    for frame_image in frames:
+        frame_colors, color_indices = np.unique(
+            np.asarray(frame_image).reshape(-1, 3), axis=0, return_inverse=True
+        )
+        distances = np.sum(np.square(frame_colors[:, None] - palette_array), axis=-1)
+        nearest = np.argmin(distances, axis=-1)[color_indices.ravel()]
+        paletted_frame = Image.new("P", frame_image.size)
+        paletted_frame.putdata(nearest.tolist())
+        paletted_frame.putpalette(palette_array.ravel().tolist())
+        paletted_frames.append(paletted_frame)
     paletted_frames[0].save(
         path,
         save_all=True,

@@ -10,11 +10,13 @@ from vrw_jax.figures.style import (
     OKABE_ITO_AMBER,
     OKABE_ITO_BLUE,
     PAGE_FIGURE_WIDTH_INCHES,
+    FigureWidth,
+    add_figure_legend,
     figure_style,
+    find_width_inches,
     format_axis_label,
-    make_panel_grid,
+    make_bar_panels,
     require_dataset_variables,
-    typeset_greek_symbols,
 )
 from vrw_jax.measures import MEASURES
 from vrw_jax.validation import check_names, check_positive, require_known_name
@@ -37,6 +39,7 @@ def tornado_figure(
     measures: str | Iterable[str] | None = None,
     *,
     spreads: Mapping[str, float] | None = None,
+    width: FigureWidth = None,
 ) -> Figure:
     """Return a figure of the change of each measure with each parameter, with largest changes on
     top.
@@ -51,6 +54,7 @@ def tornado_figure(
         measures: names of the measures; by default the first six of the table.
         spreads: change of each parameter, by name, in the parameter's unit; other parameters are
             omitted.
+        width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
         Figure: one panel per measure, with one bar per parameter.
@@ -89,32 +93,30 @@ def tornado_figure(
             parameter_changes
         )
     panel_height = PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8
-    figure, panel_axes = make_panel_grid(len(measure_names), panel_height, 0.3)
-    if len(measure_names) == 1:
-        figure.set_figwidth(0.6 * PAGE_FIGURE_WIDTH_INCHES)
+    width_fraction = 0.6 if len(measure_names) == 1 else 1.0
+    width_inches = find_width_inches(width, width_fraction * PAGE_FIGURE_WIDTH_INCHES)
+    figure, panel_axes = make_bar_panels(width_inches, measure_names, panel_height, 0.3)
+    parameter_change_text = "1 %" if spreads is None else "by its spread"
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         bars = measure_changes.sel(measure=measure_name)
         bars = bars[np.isfinite(bars.values)]
         bars = bars[np.argsort(-np.abs(bars.values), kind="stable")]
-        for change_sign, bar_color in ((1.0, OKABE_ITO_BLUE), (-1.0, OKABE_ITO_AMBER)):
+        for change_sign, direction, bar_color in (
+            (1.0, "up", OKABE_ITO_BLUE),
+            (-1.0, "down", OKABE_ITO_AMBER),
+        ):
             axes.barh(
                 range(bars.size),
                 change_sign * bars.values,
                 0.7,
                 color=bar_color,
-                label=str(change_sign),
+                label=f"parameter {direction} {parameter_change_text}",
             )
         axes.axvline(0.0, color="black", linewidth=0.6)
         parameter_symbols = [f"${MEASURES[str(name)].mathtext}$" for name in bars.parameter.values]
         axes.set_yticks(range(bars.size), parameter_symbols)
         axes.set_ylim(bars.size - 0.5, -0.5)
-        axes.set_title(typeset_greek_symbols(MEASURES[measure_name].long_name))
         change_label = format_axis_label(measure_name, "change of {symbol}")
         axes.set_xlabel("change [%]" if spreads is None else change_label)
-    parameter_change_text = "1 %" if spreads is None else "by its spread"
-    legend_handles, _ = panel_axes[0].get_legend_handles_labels()
-    legend_texts = [
-        f"parameter {direction} {parameter_change_text}" for direction in ("up", "down")
-    ]
-    figure.legend(legend_handles, legend_texts, loc="outside lower center", ncols=2)
+    add_figure_legend(figure, panel_axes[0].get_legend_handles_labels()[0], 2)
     return figure
