@@ -10,6 +10,7 @@ from typing import Any
 from vrw_jax.cli.config import (
     RANDOM_DESIGN_FUNCTIONS,
     BranchConfig,
+    FigureConfig,
     GaitConfig,
     ScanConfig,
     TuneConfig,
@@ -104,6 +105,7 @@ _TABLES = (
         TuneConfig,
         "The table `[tune]` contains the objective, bounds and constraints of `vrw tune`.",
     ),
+    ("figures", FigureConfig, "The table `[figures]` contains the width and files of figures."),
 )
 _GRID = (
     "`parameter = [1.0, 2.0]` lists values, and `parameter = { from = 1.0, to = 2.0, count = 5 }` "

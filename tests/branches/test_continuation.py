@@ -12,6 +12,7 @@ from support.files import assert_netcdf_round_trip
 import vrw_jax as vrw
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation import MapContinuation
+from vrw_jax.cli.config import FigureConfig
 from vrw_jax.cli.reports import write_branch_report
 from vrw_jax.continuation.arclength import (
     AbstractContinuationProblem,
@@ -19,7 +20,7 @@ from vrw_jax.continuation.arclength import (
     continue_from,
 )
 from vrw_jax.continuation.sign_changes import locate_function_roots
-from vrw_jax.figures.branch_figures import branch_figure
+from vrw_jax.figures._branches import branch_figure
 from vrw_jax.hybrid.minima import GuardsAndMargins
 from vrw_jax.hybrid.phase_integration import integrate_phase
 
@@ -622,7 +623,7 @@ def test_invalid_arguments_of_a_continuation_are_refused_in_one_sentence():
 def test_a_branch_is_written_drawn_and_summarized(branch, tmp_path):
     assert_netcdf_round_trip(branch.dataset, tmp_path)
     assert len(branch_figure(branch).axes) == 4
-    names = {path.name for path in write_branch_report(branch, tmp_path)}
+    names = {path.name for path in write_branch_report(branch, tmp_path, FigureConfig())}
     assert names == {"branch.zarr", "borders.csv", "summary.md", "branch.svg", "branch.png"}
     assert "219.84768" in (tmp_path / "summary.md").read_text()
     assert "ends the branch" in branch._repr_html_()

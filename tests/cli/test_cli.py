@@ -303,6 +303,46 @@ def test_a_tilde_is_the_home_folder_in_paths_of_configs_and_results(
     assert not (config.parent / "~").exists()
 
 
+def test_a_figure_is_written_to_the_given_file_and_the_data_to_the_usual_folder(
+    config: Path,
+) -> None:
+    config.write_text(SCAN_CONFIG + '[figures]\nwidth = "column"\n')
+    result = run_command("scan", config, "--out", "paper/fig3.pdf")
+    assert result.exit_code == 0, result.output
+    assert "paper/fig3.pdf" in result.stdout
+    assert [path.name for path in Path("paper").iterdir()] == ["fig3.pdf"]
+    assert b"/MediaBox [ 0 0 244.8 " in Path("paper/fig3.pdf").read_bytes()  # 3.4 inches
+    assert [path.name for path in Path("results/small").iterdir()] == ["scan.zarr"]
+    config.write_text(SCAN_CONFIG + '[figures]\nformats = ["pdf"]\n')
+    assert run_command("scan", config).exit_code == 0
+    assert Path("results/small/scan_over_stiffness.pdf").exists()
+    assert not list(Path("results/small").glob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("table", "options", "sentence"),
+    [
+        ("", ("--out", "x.eps"), "figures are written as .pdf, .svg or .png"),
+        ("", ("--out", "x.pdf", "--no-picture"), "drop one of the two"),
+        ("width = 30", (), "80 to 500 mm wide"),
+        ("width = true", (), "width is True"),
+        ('width = "wide"', (), '"column", "page"'),
+        ('formats = ["eps"]', (), '"svg", "png" and "pdf"'),
+        ("formats = []", (), '"svg", "png" and "pdf"'),
+        ("file = 3", (), 'such as "fig3.pdf"'),
+        ("font = 9", (), "font"),
+    ],
+)
+def test_wrong_settings_of_figures_are_refused_before_the_scan(
+    config: Path, table: str, options: tuple[str, ...], sentence: str
+) -> None:
+    config.write_text(f"{SCAN_CONFIG}[figures]\n{table}\n")
+    result = run_command("scan", config, *options)
+    assert result.exit_code == 2
+    assert sentence in " ".join(result.stderr.split())
+    assert [path.name for path in config.parent.iterdir()] == [config.name]
+
+
 def test_a_stopped_scan_names_the_command_that_continues_it(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,6 +10,7 @@ import os
 import signal
 import tempfile
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ import typer
 from vrw_jax.branches import SPECIAL_POINT_MEASURES, continue_branch
 from vrw_jax.cli import console as printing
 from vrw_jax.cli import scanning
-from vrw_jax.cli.config import Config, load_config, parse_assignment
+from vrw_jax.cli.config import Config, is_figure_file, load_config, parse_assignment
 from vrw_jax.cli.console import (
     ExitCode,
     print_error_sentence,
@@ -51,7 +52,11 @@ SENSITIVITY_NORM_MEASURES = ("period", "speed")
 
 FolderOption = Annotated[
     Path | None,
-    typer.Option("--out", help="Folder for the result; results/NAME of the config by default."),
+    typer.Option(
+        "--out",
+        help="Folder for the result; results/NAME of the config by default. FILE.pdf, FILE.svg or "
+        "FILE.png is the file of the figure, and the data are then in results/NAME.",
+    ),
 ]
 PictureOption = Annotated[bool, typer.Option(help="Draw the result.")]
 """Options that several commands share."""
@@ -287,6 +292,20 @@ def _require_writable_folder(folder: Path, draws_figure: bool = False) -> None:
         ) from backend_error
 
 
+def _require_writable_output(
+    command_config: Config, folder: Path, draws_figure: bool, tests_backend: bool = True
+) -> None:
+    """Raise a ValueError if the folder or the file of the figure cannot be written."""
+    _require_writable_folder(folder, draws_figure and tests_backend)
+    if (figure_file := command_config.figures.file) is not None:
+        if not draws_figure:
+            raise ValueError(
+                f"--no-picture is given, but the figure {figure_file} is asked for: drop one of "
+                "the two."
+            )
+        _require_writable_folder(figure_file.parent)
+
+
 @app.command("reproduce")
 def run_reproduce_command(
     folder: Annotated[
@@ -301,6 +320,10 @@ def run_reproduce_command(
     with report_command_errors():
         _start_jax_and_load_config(None)
         folder = check_path("--out", folder, "give a folder")
+        if is_figure_file(folder):
+            raise ValueError(
+                f"--out is {folder}, but this command writes several figures: give a folder."
+            )
         _require_writable_folder(folder, draws_figure=True)
     from vrw_jax.paper import reproduce_paper
 
@@ -378,13 +401,13 @@ def run_scan_command(
             scanning.verify_scan_store(scan_plan, store_path)
             return
         has_figures = (folder / scanning.FIGURE_RECORD_NAME).exists()
-        _require_writable_folder(folder, draws_figure=picture and not has_figures)
+        _require_writable_output(scan_config, folder, picture, tests_backend=not has_figures)
     scan_dataset = scanning.compute_scan_with_progress(scan_plan, store_path, dask)
     with report_command_errors(f"stopped; the data are in {store_path}."):
         printing.print_outcome_counts(scan_dataset)
         stdout_console.print(f"data: {store_path}", highlight=False, soft_wrap=True)
         if picture:
-            scanning.draw_scan_figures(scan_dataset, store_path)
+            scanning.draw_scan_figures(scan_dataset, store_path, scan_config.figures)
 
 
 @app.command("robustness")
@@ -441,7 +464,7 @@ def run_map_command(
             special_point_map_config, None, SPECIAL_POINT_MEASURES
         )
         require_map_grid(scan_plan.design)
-        _require_writable_folder(folder, draws_figure=True)
+        _require_writable_output(special_point_map_config, folder, draws_figure=True)
     scan_dataset = scanning.compute_scan_with_progress(scan_plan, folder / "scan.zarr", None)
 
     with (
@@ -457,7 +480,9 @@ def run_map_command(
             stage_reporter,
         )
         stage_reporter("drawing the map")
-        written_paths = write_special_point_map(special_point_map, folder)
+        written_paths = write_special_point_map(
+            special_point_map, folder, special_point_map_config.figures
+        )
     printing.print_written_paths(written_paths)
 
 
@@ -486,7 +511,7 @@ def run_tune_command(
         command_config, folder = _load_config_with_table(config, folder, "tune", "tune")
         tune_config = command_config.tune
         assert tune_config is not None
-        _require_writable_folder(folder, picture)
+        _require_writable_output(command_config, folder, picture)
         from vrw_jax.cli.reports import write_tuning_report
 
         with show_computation_stages("tuning (the first time compiles for a while)"):
@@ -501,7 +526,9 @@ def run_tune_command(
                 max_evaluations=tune_config.evaluations,
             )
         printing.print_text_table("Tuned gait", tune_result.describe().items())
-        printing.print_written_paths(write_tuning_report(tune_result, folder, picture))
+        printing.print_written_paths(
+            write_tuning_report(tune_result, folder, command_config.figures if picture else None)
+        )
     if not tune_result.converged:
         print_error_sentence(
             f"this is no optimum ({tune_result.status.name}): what was reached is written."
@@ -531,7 +558,7 @@ def run_continue_command(
         command_config, folder = _load_config_with_table(config, folder, "branch", "branch")
         branch_config = command_config.branch
         assert branch_config is not None
-        _require_writable_folder(folder, picture)
+        _require_writable_output(command_config, folder, picture)
         from vrw_jax.cli.reports import write_branch_report
 
         arclength_options = ArclengthOptions()
@@ -554,7 +581,9 @@ def run_continue_command(
             )
             raise typer.Exit(ExitCode.CHECK_FAILED)
         stdout_console.print(str(branch), highlight=False, markup=False)
-        printing.print_written_paths(write_branch_report(branch, folder, picture))
+        printing.print_written_paths(
+            write_branch_report(branch, folder, command_config.figures if picture else None)
+        )
 
 
 def _start_jax_and_load_config(config_path: Path | None) -> Config:
@@ -596,8 +625,8 @@ def _load_config_with_table(
 ) -> tuple[Config, Path]:
     """Load a config, and return it with the folder for the results.
 
-    Raise a ValueError if the config lacks the table that the command needs, or if the command does
-    not support the model.
+    If `result_folder` is the file of a figure, the config contains this file. Raise a ValueError if
+    the config lacks the table that the command needs, or if the command does not support the model.
     """
     command_config = _start_jax_and_load_config(config_path)
     if getattr(command_config, table_name) is None:
@@ -609,5 +638,9 @@ def _load_config_with_table(
             f"command takes {', '.join(supported_models)}: write "
             f"{'one of these' if len(supported_models) > 1 else 'that'} below [model]."
         )
-    result_folder = result_folder or Path("results") / config_path.stem
-    return command_config, check_path("--out", result_folder, "give a folder")
+    if result_folder is not None:
+        result_folder = check_path("--out", result_folder, "give a folder")
+    if result_folder is not None and is_figure_file(result_folder):
+        figure_config = replace(command_config.figures, file=result_folder)
+        command_config, result_folder = replace(command_config, figures=figure_config), None
+    return command_config, result_folder or Path("results") / config_path.stem

@@ -52,6 +52,7 @@ CONFIG_TABLE_NAMES = (
     "scan",
     "tune",
     "branch",
+    "figures",
     *DESIGN_TABLE_NAMES,
 )
 PARAMETER_SET_KEY = "parameter_set"
@@ -262,6 +263,69 @@ class BranchConfig:
         return branch_config
 
 
+FIGURE_FORMATS = ("svg", "png", "pdf")
+"""File formats in which commands write figures."""
+
+
+@dataclass(frozen=True)
+class FigureConfig:
+    """Table `[figures]`: width and files of the figures.
+
+    - `width`: "column" (86 mm), "page" (175 mm), or a number of mm; by default the usual width of
+      each figure;
+    - `formats`: file formats in the folder of the result, of "svg", "png" and "pdf";
+    - `file`: path of the figure, such as "fig3.pdf", instead of files in the folder of the result.
+      If there are several figures, their names follow the name of the file.
+    """
+
+    width: str | float | None = None
+    formats: tuple[str, ...] = ("svg", "png")
+    file: Path | None = None
+
+    @classmethod
+    def from_table(cls, config_table: ConfigTable) -> "FigureConfig":
+        """Read the settings of the table `[figures]`."""
+
+        def parse_width(_: str, width: Any) -> str | float:
+            from vrw_jax.figures import style  # imports matplotlib only if the table has a width
+
+            try:
+                style.find_width_inches(width, 1.0)
+            except TypeError as width_error:
+                raise ValueError(str(width_error)) from width_error
+            return width
+
+        def parse_formats(setting_name: str, formats: Any) -> tuple[str, ...]:
+            is_nonempty_list = isinstance(formats, list) and len(formats) > 0
+            if not is_nonempty_list or not all(name in FIGURE_FORMATS for name in formats):
+                raise _make_value_error(setting_name, formats, 'a list of "svg", "png" and "pdf"')
+            return tuple(formats)
+
+        def parse_file(setting_name: str, path_text: object) -> Path:
+            if not isinstance(path_text, str) or not is_figure_file(Path(path_text)):
+                raise _make_value_error(setting_name, path_text, 'a path, such as "fig3.pdf"')
+            return Path(path_text).expanduser()
+
+        return cls(
+            **_parse_settings(
+                config_table, "[figures]", width=parse_width, formats=parse_formats, file=parse_file
+            )
+        )
+
+
+def is_figure_file(path: Path) -> bool:
+    """Return whether a path is the path of a figure.
+
+    Raise a ValueError for formats of images that are not supported.
+    """
+    if path.suffix.lower() in (".eps", ".ps", ".jpg", ".jpeg", ".tif", ".tiff", ".gif"):
+        raise ValueError(
+            f"{path} has the suffix {path.suffix}, but figures are written as .pdf, .svg or .png: "
+            "give one of these suffixes, or a folder."
+        )
+    return path.suffix[1:] in FIGURE_FORMATS
+
+
 @dataclass(frozen=True)
 class Config:
     """Validated settings from a config, and the text of the file."""
@@ -274,6 +338,7 @@ class Config:
     gait: GaitConfig = GaitConfig()
     tune: TuneConfig | None = None
     branch: BranchConfig | None = None
+    figures: FigureConfig = FigureConfig()
     design: designs.AbstractSampleDesign | None = None
     source_text: str = ""
     file_name: str = ""
@@ -400,6 +465,7 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
         branch=BranchConfig.from_table(tables["branch"], parameter_names)
         if "branch" in config_tables
         else None,
+        figures=FigureConfig.from_table(tables["figures"]),
         design=sample_design,
         source_text=config_text,
         file_name=file_name,

@@ -4,12 +4,14 @@ import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from vrw_jax import figures
 from vrw_jax.branches import Branch
+from vrw_jax.cli.config import FigureConfig
 from vrw_jax.measures import MEASURES, describe_violation, get_measure
 from vrw_jax.printing import format_markdown_table
 from vrw_jax.scans import DIFFERENTIABLE_MEASURES, SpecialPointMap
@@ -17,18 +19,37 @@ from vrw_jax.tuning import TuneResult
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
 
-def write_scan_figures(scan: xr.Dataset, folder: Path) -> list[Path]:
-    """Write the figures of a scan into `folder`, and return the paths."""
+def write_figures(
+    figure_by_name: Mapping[str, Any], folder: Path, figure_config: FigureConfig
+) -> list[Path]:
+    """Write figures into `folder`, or to the file of the config, and return the paths."""
+    formats, figure_file = figure_config.formats, figure_config.file
+    if figure_file is not None:
+        formats, folder = (figure_file.suffix[1:],), figure_file.parent
+        has_one_figure = len(figure_by_name) == 1
+        figure_by_name = {
+            figure_file.stem if has_one_figure else f"{figure_file.stem}_{figure_name}": figure
+            for figure_name, figure in figure_by_name.items()
+        }
     return [
         figure_path
-        for figure_name, figure in figures.scan_figures(scan).items()
-        for figure_path in figures.save(figure, folder, figure_name)
+        for figure_name, figure in figure_by_name.items()
+        for figure_format in formats
+        for figure_path in figures.save(figure, folder, f"{figure_name}.{figure_format}")
     ]
 
 
-def write_tuning_report(tune_result: TuneResult, folder: Path, draws_figure: bool) -> list[Path]:
+def write_scan_figures(scan: xr.Dataset, folder: Path, figure_config: FigureConfig) -> list[Path]:
+    """Write the figures of a scan, and return the paths."""
+    figure_by_name = figures.scan_figures(scan, width=figure_config.width)
+    return write_figures(figure_by_name, folder, figure_config)
+
+
+def write_tuning_report(
+    tune_result: TuneResult, folder: Path, figure_config: FigureConfig | None
+) -> list[Path]:
     """Write the data, summary, config and figure for a tuned gait into `folder`, and return the
-    paths.
+    paths. No figure is drawn if `figure_config` is None.
     """
     toml_lines = [
         f"# Tuned: {tune_result.objective} {tune_result.value:.6g}. Walk it with `vrw gait`.",
@@ -50,14 +71,17 @@ def write_tuning_report(tune_result: TuneResult, folder: Path, draws_figure: boo
             "summary.md": format_tuning_summary(tune_result),
         },
     )
-    if draws_figure:
-        written_paths += figures.save(figures.tuning_figure(tune_result), folder, "tuning")
+    if figure_config is not None:
+        figure = figures.tuning_figure(tune_result, width=figure_config.width)
+        written_paths += write_figures({"tuning": figure}, folder, figure_config)
     return written_paths
 
 
-def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True) -> list[Path]:
+def write_branch_report(
+    branch: Branch, folder: Path, figure_config: FigureConfig | None
+) -> list[Path]:
     """Write the data, table, summary and figure for a branch into `folder`, and return the
-    paths.
+    paths. No figure is drawn if `figure_config` is None.
     """
     csv_buffer = io.StringIO(newline="")
     csv_writer = csv.writer(csv_buffer)
@@ -78,12 +102,15 @@ def write_branch_report(branch: Branch, folder: Path, draws_figure: bool = True)
         branch.dataset,
         {"borders.csv": csv_buffer.getvalue(), "summary.md": format_branch_summary(branch)},
     )
-    if draws_figure and branch.values.size:
-        written_paths += figures.save(figures.branch_figure(branch), folder, "branch")
+    if figure_config is not None and branch.values.size:
+        figure = figures.branch_figure(branch, width=figure_config.width)
+        written_paths += write_figures({"branch": figure}, folder, figure_config)
     return written_paths
 
 
-def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) -> list[Path]:
+def write_special_point_map(
+    special_point_map: SpecialPointMap, folder: Path, figure_config: FigureConfig
+) -> list[Path]:
     """Write the text, table and figure for a map of special points into `folder`.
 
     Return the paths.
@@ -100,9 +127,10 @@ def write_special_point_map(special_point_map: SpecialPointMap, folder: Path) ->
     measure_name = next(
         variable_name for variable_name in scan_dataset if variable_name in DIFFERENTIABLE_MEASURES
     )
-    figure_paths = figures.save(
-        figures.map_figure(scan_dataset, str(measure_name), special_point_curves), folder, "map"
+    figure = figures.map_figure(
+        scan_dataset, str(measure_name), special_point_curves, width=figure_config.width
     )
+    figure_paths = write_figures({"map": figure}, folder, figure_config)
     return [folder / "map.csv", folder / "map.md", *figure_paths]
 
 
@@ -151,7 +179,7 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
 
 def format_branch_summary(branch: Branch) -> str:
     """Return a Markdown summary of a branch."""
-    heading_line, *_ = str(branch).split("\n")
+    heading_line, *further_lines = str(branch).split("\n")
     summary_lines = [f"# Branch along {branch.parameter}", "", heading_line, ""]
     if not branch.values.size:
         return "\n".join(summary_lines)
@@ -167,7 +195,7 @@ def format_branch_summary(branch: Branch) -> str:
         )
     return "\n".join([
         *summary_lines,
-        *(f"- at {branch.values[i]:.6g}: {branch.ends[i]}" for i in (0, -1)),
+        *(f"- {line.strip()}" for line in further_lines if line.startswith("  at ")),
         f"- spectral radius {spectral_radius.min():.4f} to {spectral_radius.max():.4f}, DLS "
         f"fraction {dls_fraction.min():.4f} to {dls_fraction.max():.4f}",
         f"- walked, every gait repeats within {np.max(branch.dataset.closure.values):.1e}",

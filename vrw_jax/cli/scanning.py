@@ -6,7 +6,7 @@ from pathlib import Path
 import typer
 
 from vrw_jax.cli import console as printing
-from vrw_jax.cli.config import Config
+from vrw_jax.cli.config import Config, FigureConfig
 from vrw_jax.cli.console import (
     ExitCode,
     print_error_sentence,
@@ -100,26 +100,30 @@ def compute_scan_with_progress(
             )
 
 
-def draw_scan_figures(scan_dataset: "xr.Dataset", store_path: Path) -> None:
-    """Write the figures of a scan beside its store, and print their paths.
+def draw_scan_figures(
+    scan_dataset: "xr.Dataset", store_path: Path, figure_config: FigureConfig
+) -> None:
+    """Write the figures of a scan beside its store, or to the file of the config, and print their
+    paths.
 
-    Figures that were drawn from the same results with the same code are not drawn again.
+    Figures that were drawn from the same results with the same code and config are not drawn again.
     """
     record_path = store_path.with_name(FIGURE_RECORD_NAME)
     figure_origin = {
         "results": compute_store_digest(store_path),
         "code": compute_source_digest(),
         "matplotlib": find_library_version("matplotlib"),
+        "config": repr(figure_config),
     }
     figure_record = read_metadata_file(record_path)
-    figure_paths = [store_path.with_name(name) for name in figure_record.pop("files", [])]
+    figure_paths = list(map(Path, figure_record.pop("files", [])))
     if figure_record == figure_origin and all(map(Path.is_file, figure_paths)):
         for figure_path in figure_paths:
             stdout_console.print(f"up to date: {figure_path}", highlight=False, soft_wrap=True)
         return
     from vrw_jax.cli.reports import write_scan_figures
 
-    figure_paths = write_scan_figures(scan_dataset, store_path.parent)
-    figure_record = figure_origin | {"files": [figure_path.name for figure_path in figure_paths]}
+    figure_paths = write_scan_figures(scan_dataset, store_path.parent, figure_config)
+    figure_record = figure_origin | {"files": [str(path) for path in figure_paths]}
     record_path.write_text(json.dumps(figure_record, indent=2), encoding="utf-8")
     printing.print_written_paths(figure_paths)
