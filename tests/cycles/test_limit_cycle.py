@@ -591,7 +591,9 @@ def test_multipliers_of_a_fixed_point_are_the_eigenvalues_of_its_jacobian(n):
     moduli = np.abs(result.multipliers)
     assert np.all(np.diff(moduli) <= 1e-12)  # round-off of conjugate pairs
     np.testing.assert_allclose(
-        np.sort_complex(result.multipliers), np.sort_complex(known), atol=1e-12
+        np.sort_complex(result.multipliers),
+        np.sort_complex(known),
+        atol=1e-12,  # round-off
     )
     lost = result._replace(jacobian=jnp.full((n, n), jnp.nan))
     assert np.isnan(lost.multipliers).all()

@@ -95,6 +95,8 @@ def test_a_figure_has_its_width_and_texts_that_are_readable_in_print(name, width
     with vrw.plot.figure_style():
         figure.draw_without_rendering()
         boxes = {text: text.get_window_extent() for text in list_drawn_texts(figure)}
+    for axes in figure.axes:
+        assert axes.bbox.width >= 1.5 * figure.dpi  # 38 mm, about half of a column
     for text, box in boxes.items():
         assert text.get_fontsize() >= 7.0, text  # points, at the printed size
         is_inside = box.x0 > -1.0 and box.y0 > -1.0 and box.x1 < figure.bbox.width + 1.0
