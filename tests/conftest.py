@@ -47,6 +47,7 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     if distributes_tests and not config.getoption("collectonly"):
         return
+    os.environ["VRW_PROGRESS"] = "0"  # Tests compare standard error, also of other processes.
     gc.set_threshold(20_000, 10, 10)  # what JAX keeps of programs is looked through less often
     shape_checks.import_with_checks(PACKAGE_POSITIONS)
     import vrw_jax

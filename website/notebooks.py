@@ -1,5 +1,6 @@
 """Write a notebook as a page with its outputs."""
 
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ def page_of(notebook: Path, folder: Path, *, execute: bool) -> Path:
     if execute:
         from nbclient import NotebookClient
 
+        os.environ["VRW_PROGRESS"] = "0"  # Notices of long calls do not belong into a page.
         NotebookClient(content, timeout=1800, kernel_name="python3").execute()
     parts: list[str] = []
     for cell in content.cells:

@@ -50,6 +50,7 @@ from vrw_jax.numerics import (
     map_in_batches,
     with_default_jax_settings,
 )
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import convert_model_argument, convert_section_state, convert_step_options
 from vrw_jax.validation import (
     check_choice,
@@ -82,6 +83,7 @@ NEXT_SLOPE_INPUT_INDEX = len(PARAMETER_NAMES) + 3
 """Index, among the inputs of a gait step, of the slope of the ground after the next landing."""
 
 
+@announce_wait("batches of gait steps", "10 s")
 @with_default_jax_settings
 def step_batch(
     params: WheelParams,

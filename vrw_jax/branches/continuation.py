@@ -68,6 +68,7 @@ from vrw_jax.numerics import (
     select_tree_rows,
     with_default_jax_settings,
 )
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import (
     ModelLike,
     collect_provenance_attributes,
@@ -170,6 +171,7 @@ class GaitContinuation(AbstractContinuation):
         )
 
 
+@announce_wait("gaits, their derivatives and special points", "30 s")
 @with_default_jax_settings
 def continue_branch(
     params: WheelParams,
@@ -249,6 +251,7 @@ def continue_branch(
     return branch
 
 
+@announce_wait("gaits, their derivatives and special points", "30 s")
 @with_default_jax_settings
 def continue_branches(
     params: WheelParams,
@@ -627,6 +630,7 @@ class MapContinuation(AbstractContinuation):
         return jax.device_put(select_tree_rows((points.z, points.p), np.flatnonzero(is_usable)[:1]))
 
 
+@announce_wait("the map and its derivatives", "10 s")
 @with_default_jax_settings
 def continue_map(
     function: Callable[[Any, Array, Array], Array],

@@ -11,6 +11,7 @@ from vrw_jax.branches.gait_test_functions import FORCE_QUANTITY_NAMES
 from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import LimitCycle
 from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
+from vrw_jax.runtime import announce_wait
 from vrw_jax.validation import check_names, check_range, check_type
 from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, make_wheel_from_parameters
 
@@ -25,6 +26,7 @@ DEFAULT_PARAMETER_BOUNDS: ParameterBounds = {
 """Default bounds of the two parameters of a curve, for wheels with legs of 1 m."""
 
 
+@announce_wait("gaits and the second derivatives of the special point", "90 s")
 def continue_special_point(
     name: str,
     parameters: tuple[str, str],

@@ -35,7 +35,7 @@ from vrw_jax.continuation import ArclengthOptions
 from vrw_jax.cycles import limit_cycle, make_finder, resolve_model_with_reason
 from vrw_jax.measures import FORCE_PEAK_MEASURES
 from vrw_jax.robustness import first_passage, gait_sensitivity
-from vrw_jax.runtime import find_library_version, start_jax
+from vrw_jax.runtime import PROGRESS_VARIABLE, find_library_version, start_jax
 from vrw_jax.scans import follow_special_points, forecast_scan, require_map_grid
 from vrw_jax.selection import list_model_config_names
 from vrw_jax.simulation import step
@@ -79,6 +79,10 @@ def main() -> None:
     signal.signal(signal.SIGINT, _handle_first_interrupt)
     show_warnings_as_sentences()
     replace_unencodable_output()
+    if (
+        not printing.stderr_console.is_terminal
+    ):  # Standard error of commands contains only messages.
+        os.environ.setdefault(PROGRESS_VARIABLE, "0")
     with printing.report_stdout_errors():
         app()
 
@@ -178,28 +182,27 @@ def run_gait_command(
         section_state = model.compute_default_start(params) if start is None else jnp.asarray(start)
         section_state = model.complete_section_state(params, section_state)
         n_steps_walked, n_steps = 0, steps or gait_config.gait.steps
-        with show_computation_stages("walking (the first time compiles for a while)"):
-            while True:
-                step_result: Any = step(params, section_state, model=model, options=options)
-                has_stepped = int(step_result.outcome) == Outcome.STEPPED
-                n_steps_walked += has_stepped
-                if not has_stepped or n_steps_walked == n_steps:
-                    break
-                section_state = step_result.section_state
-            model, model_selection_reason = resolve_model_with_reason(params, model)
-            can_search_without_start = (
-                start is None or make_finder(model, params.n_legs).supports_cold_start
-            )
-            limit_cycle_result: Any = limit_cycle(
-                params, guess=None if can_search_without_start else section_state, model=model
-            )
-            force_peaks: dict[str, Any] = {}
-            missing_force_peaks_reason = ""
-            if model.is_compliant and limit_cycle_result.found:
-                try:
-                    force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
-                except ValueError as error:  # for unilateral contact without machine code
-                    missing_force_peaks_reason = str(error)
+        while True:
+            step_result: Any = step(params, section_state, model=model, options=options)
+            has_stepped = int(step_result.outcome) == Outcome.STEPPED
+            n_steps_walked += has_stepped
+            if not has_stepped or n_steps_walked == n_steps:
+                break
+            section_state = step_result.section_state
+        model, model_selection_reason = resolve_model_with_reason(params, model)
+        can_search_without_start = (
+            start is None or make_finder(model, params.n_legs).supports_cold_start
+        )
+        limit_cycle_result: Any = limit_cycle(
+            params, guess=None if can_search_without_start else section_state, model=model
+        )
+        force_peaks: dict[str, Any] = {}
+        missing_force_peaks_reason = ""
+        if model.is_compliant and limit_cycle_result.found:
+            try:
+                force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
+            except ValueError as error:  # for unilateral contact without machine code
+                missing_force_peaks_reason = str(error)
         printing.print_wheel_and_gait(
             params, step_result, section_state, n_steps_walked, limit_cycle_result, force_peaks
         )
@@ -437,13 +440,10 @@ def run_robustness_command(
             )
         if robustness_config.design is None:
             params, wheel_model = robustness_config.make_wheel(), robustness_config.make_model()
-            with show_computation_stages(
-                "walking over random slopes (the first time compiles for a while)"
-            ):
-                first_passage_result = first_passage(params, slope_sd, model=wheel_model)
-                sensitivity_result = gait_sensitivity(
-                    params, SENSITIVITY_NORM_MEASURES, model=wheel_model
-                )
+            first_passage_result = first_passage(params, slope_sd, model=wheel_model)
+            sensitivity_result = gait_sensitivity(
+                params, SENSITIVITY_NORM_MEASURES, model=wheel_model
+            )
             print(first_passage_result)
             print(sensitivity_result)
             return
@@ -514,17 +514,16 @@ def run_tune_command(
         _require_writable_output(command_config, folder, picture)
         from vrw_jax.cli.reports import write_tuning_report
 
-        with show_computation_stages("tuning (the first time compiles for a while)"):
-            tune_result = tune(
-                command_config.make_wheel(),
-                tune_config.objective,
-                tuple(tune_config.bounds),
-                tune_config.bounds,
-                tune_config.constraints,
-                model=command_config.make_model(),
-                options=command_config.make_options(),
-                max_evaluations=tune_config.evaluations,
-            )
+        tune_result = tune(
+            command_config.make_wheel(),
+            tune_config.objective,
+            tuple(tune_config.bounds),
+            tune_config.bounds,
+            tune_config.constraints,
+            model=command_config.make_model(),
+            options=command_config.make_options(),
+            max_evaluations=tune_config.evaluations,
+        )
         printing.print_text_table("Tuned gait", tune_result.describe().items())
         printing.print_written_paths(
             write_tuning_report(tune_result, folder, command_config.figures if picture else None)
@@ -565,15 +564,14 @@ def run_continue_command(
         if branch_config.max_ds is not None:
             initial_ds = min(arclength_options.initial_ds, branch_config.max_ds)
             arclength_options = ArclengthOptions(initial_ds=initial_ds, max_ds=branch_config.max_ds)
-        with show_computation_stages("following the branch (the first time compiles for a while)"):
-            branch = continue_branch(
-                command_config.make_wheel(),
-                branch_config.parameter,
-                branch_config.bounds,
-                period_n=branch_config.period,
-                model=command_config.make_model(),
-                options=arclength_options,
-            )
+        branch = continue_branch(
+            command_config.make_wheel(),
+            branch_config.parameter,
+            branch_config.bounds,
+            period_n=branch_config.period,
+            model=command_config.make_model(),
+            options=arclength_options,
+        )
         if not branch.values.size:
             print_error_sentence(
                 f"there is no gait to start from ({branch.outcome.name}: "

@@ -23,6 +23,7 @@ from vrw_jax.cycles import LimitCycle, ReturnMapCycle, format_floquet_multiplier
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import StepResult
+from vrw_jax.runtime import PROGRESS_VARIABLE
 from vrw_jax.scans import ScanProgress, format_duration
 from vrw_jax.wheel import PARAMETER_DOMAINS, Outcome, WheelParams
 
@@ -212,6 +213,7 @@ def make_progress_bar(task_name: str) -> Progress:
         if task_name == "scan"
         else (TimeElapsedColumn(),)
     )
+    os.environ[PROGRESS_VARIABLE] = "0"  # The bar replaces the notices of the library.
     task_columns = (TextColumn("{task.description}"), BarColumn(), *last_columns)
     return Progress(*task_columns, console=stderr_console)
 

@@ -31,6 +31,7 @@ from vrw_jax.continuation.arclength import (
     make_continuation_result,
 )
 from vrw_jax.numerics import select_tree_rows, select_trees_by_condition
+from vrw_jax.runtime import report_progress
 
 
 class PlaneNewtonState(NamedTuple):
@@ -180,7 +181,10 @@ def continue_branches_uncompiled(
     setup = ContinuationSetup(problem, options, parameter_bounds)
     branch_batch = init_branches(setup, z, p, direction_signs, is_branch_requested)
     branch_buffer_indices = jnp.arange(len(p))
+    n_iterations = 0
     while np.any(is_branch_unfinished := np.asarray(_are_branches_active_jit(branch_batch))):
+        n_iterations += 1
+        report_progress(f"{n_iterations:,} Newton iterations along {len(p)} curves")
         newton_steps = _linearize_selected_branches(
             setup, args_by_branch, branch_batch[0].trial_point, is_branch_unfinished
         )

@@ -24,6 +24,7 @@ from vrw_jax.printing import (
     format_numbers,
     format_quantity,
 )
+from vrw_jax.runtime import announce_wait
 from vrw_jax.validation import (
     check_callable,
     check_int,
@@ -126,6 +127,7 @@ the fixed point needs.
 """
 
 
+@announce_wait("the map and its derivatives", "10 s")
 def solve_fixed_point(
     function: Callable[[Array], Array],
     start: Float[Array, " n"],

@@ -24,6 +24,7 @@ from vrw_jax.printing import (
     format_numbers,
     format_outcome_counts,
 )
+from vrw_jax.runtime import announce_wait
 from vrw_jax.validation import check_choice
 from vrw_jax.wheel import Outcome, WheelParams
 
@@ -184,6 +185,7 @@ class AbstractCycle(AbstractPrintable):
         return format_each_batch_element(describe_element, flat_indices, failed_checks)
 
     @property
+    @announce_wait("the search for the last gait on the way from Table 1", "a minute")
     def why(self) -> Any:
         """Return the sentence of `ending`, which contains the reason if no gait was found.
 
@@ -258,6 +260,7 @@ class AbstractCycle(AbstractPrintable):
         newton_matrix = jnp.eye(self.monodromy_value.shape[-1]) - self.monodromy_value
         return self._zero_without_gait(jnp.linalg.cond(newton_matrix))
 
+    @announce_wait("the measure of a gait", "20 s")
     @with_default_jax_settings
     def measure(self, measure_name: str) -> Array:
         """Return the measure that `CYCLE_MEASURE_FUNCTIONS` computes for this name.
@@ -269,6 +272,7 @@ class AbstractCycle(AbstractPrintable):
             check_choice("the measure", measure_name, tuple(CYCLE_MEASURE_FUNCTIONS))
         ](self)
 
+    @announce_wait("measures of a gait", "20 s")
     def measures(self, measure_names: Iterable[str]) -> dict[str, Array]:
         """Return the requested measures by name. Only these measures are traced."""
         measure_names = tuple(measure_names)

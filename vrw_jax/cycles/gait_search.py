@@ -47,6 +47,7 @@ from vrw_jax.numerics import (
     select_tree_rows,
     with_default_jax_settings,
 )
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import (
     check_choice,
@@ -93,6 +94,7 @@ def limit_cycle(
 ) -> LimitCycle | ReturnMapCycle: ...
 
 
+@announce_wait("the search for a gait", "10 s, or 50 s if it finds no gait")
 @with_default_jax_settings
 def limit_cycle(
     params: WheelParams,
@@ -169,6 +171,7 @@ def limit_cycle(
     return cycle.replace_missing_gaits_by_nan(params) if fills_missing_gait_with_nan else cycle
 
 
+@announce_wait("the search for gaits", "10 s, or 50 s if it finds no gait")
 @with_default_jax_settings
 def limit_cycles(
     params: WheelParams,

@@ -16,11 +16,13 @@ from vrw_jax.cycles.options import CycleOptions
 from vrw_jax.measures import MEASURES
 from vrw_jax.measures import xarray as xr
 from vrw_jax.numerics import StepOptions, with_default_jax_settings
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_names, format_name_suggestion, require_untraced_arguments
 from vrw_jax.wheel import Outcome, WheelParams
 
 
+@announce_wait("the gait with its derivatives", "15 s")
 @with_default_jax_settings
 def sensitivities(
     params: WheelParams,

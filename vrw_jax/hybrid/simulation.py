@@ -30,6 +30,7 @@ from vrw_jax.numerics import (
     make_opaque_loop_condition,
     with_default_jax_settings,
 )
+from vrw_jax.runtime import announce_wait
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000
@@ -116,6 +117,7 @@ class HybridSolution(NamedTuple):
         return describe_step_ending(self.termination, Termination)
 
 
+@announce_wait("the system's equations and guards", "10 s")
 @with_default_jax_settings
 def simulate_hybrid(
     modes: Sequence[Mode] | Mode,

@@ -11,6 +11,7 @@ from vrw_jax.cycles import AbstractCycle
 from vrw_jax.numerics import StepOptions, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import (
     ModelLike,
     compute_section_states_of_starts,
@@ -76,6 +77,7 @@ class BasinShare(AbstractPrintable):
         ]
 
 
+@announce_wait("gaits and walks", "20 s")
 @with_default_jax_settings
 def basin_share(
     params: WheelParams,

@@ -22,6 +22,7 @@ from vrw_jax.robustness.gait_sensitivity import (
     parse_sensitivity_measures,
 )
 from vrw_jax.robustness.smallest_disturbance import compute_smallest_disturbance
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.validation import check_int, check_names, check_type
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams
@@ -35,6 +36,7 @@ BASIN_VARIABLE_ATTRS = {
 """Unit and meaning of each variable in the dataset that `measure_basins` returns."""
 
 
+@announce_wait("gaits and walks", "20 s")
 @with_default_jax_settings
 def measure_basins(
     branch: Branch,
@@ -114,6 +116,7 @@ def measure_basins(
     )
 
 
+@announce_wait("gaits and their response to slopes", "20 s")
 @with_default_jax_settings
 def measure_gait_sensitivity(
     branch: Branch,

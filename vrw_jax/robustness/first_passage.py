@@ -26,6 +26,7 @@ from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.robustness.rigid_passage import solve_rigid_passage
 from vrw_jax.robustness.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import (
     ModelLike,
     convert_model_argument,
@@ -146,6 +147,7 @@ class FirstPassage(AbstractPrintable):
         ]
 
 
+@announce_wait("gaits and random walks", "10 s")
 @with_default_jax_settings
 def first_passage(
     params: WheelParams,

@@ -19,6 +19,7 @@ from vrw_jax.cycles import (
 from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STEP_MEASURES, UNILATERAL_STEP_MEASURES
 from vrw_jax.numerics import Scalar, StepOptions, describe_step_ending, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_names, has_traced_leaf, require_known_name
 from vrw_jax.wheel import Outcome, WheelParams
@@ -94,6 +95,7 @@ class GaitSensitivity(AbstractPrintable):
         ]
 
 
+@announce_wait("the gait and its response to slopes", "15 s")
 @with_default_jax_settings
 def gait_sensitivity(
     params: WheelParams,

@@ -20,6 +20,7 @@ import numpy as np
 from vrw_jax.batches import StepBatchResult, step_batch
 from vrw_jax.numerics import StepOptions
 from vrw_jax.robustness.failure_density import GaussianMixture, fit_failure_density
+from vrw_jax.runtime import report_progress
 from vrw_jax.wheel import Outcome, WheelParams
 
 
@@ -492,6 +493,7 @@ def _estimate_failure_probability(
         while n_sampling_rounds < n_rounds_at_error_test and (
             n_sampling_rounds < options.min_sampling_rounds or walker_groups.n_steps < max_steps
         ):
+            report_progress(f"{walker_groups.n_walkers:,} walks of {walker_groups.n_steps:,} steps")
             walk_weights = failure_weight_sampler()
             weight_sum_by_group += walk_weights.reshape(walker_groups.n_groups, -1).mean(1)
             weight_moments += (

@@ -20,6 +20,7 @@ from vrw_jax.numerics import (
 )
 from vrw_jax.printing import AbstractPrintable, LabelAndText
 from vrw_jax.robustness.gait_arrival import StableGait, walk_until_on_gait
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import ModelLike
 from vrw_jax.validation import check_int, check_positive
 from vrw_jax.wheel import Outcome, WheelParams
@@ -90,6 +91,7 @@ class SmallestDisturbance(AbstractPrintable):
         ]
 
 
+@announce_wait("gaits, walks and derivatives", "20 s")
 @with_default_jax_settings
 def smallest_disturbance(
     params: WheelParams,

@@ -18,6 +18,7 @@ from pathlib import Path
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.measures import xarray as xr
 from vrw_jax.numerics import StepOptions, with_default_jax_settings
+from vrw_jax.runtime import announce_wait, report_progress
 from vrw_jax.scans.design import AbstractSampleDesign
 from vrw_jax.scans.integrity import MANIFEST_ATTRIBUTE
 from vrw_jax.scans.planning import (
@@ -54,6 +55,7 @@ class ScanProgress:
     n_reused: int  # samples that an earlier run computed
 
 
+@announce_wait("batches of gaits and gait steps", "15 s")
 @with_default_jax_settings
 def scan(
     design: AbstractSampleDesign,
@@ -228,6 +230,7 @@ def _compute_and_write_chunks(
                 n_done=scan_progress.n_done + has_failed.size,
                 n_failed=scan_progress.n_failed + int(has_failed.sum()),
             )
+            report_progress(f"{scan_progress.n_done:,} of {n_samples:,} samples")
             if on_progress is not None:
                 on_progress(scan_progress)
     except KeyboardInterrupt:

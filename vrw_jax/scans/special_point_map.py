@@ -17,6 +17,7 @@ from vrw_jax.branches import (
 from vrw_jax.cycles import CycleOptions
 from vrw_jax.measures import xarray as xr
 from vrw_jax.numerics import StepOptions
+from vrw_jax.runtime import announce_wait
 from vrw_jax.scans.design import AbstractSampleDesign
 from vrw_jax.scans.execution import ProgressCallback, scan
 from vrw_jax.selection import describe_accepted_models
@@ -64,6 +65,7 @@ class SpecialPointMap(NamedTuple):
         return str(self)
 
 
+@announce_wait("gaits and the second derivatives of special points", "120 s")
 def map_special_points(
     design: AbstractSampleDesign,
     measures: str | Iterable[str] = ("dls_fraction",),

@@ -19,6 +19,7 @@ from vrw_jax.measures import (
 from vrw_jax.measures import xarray as xr
 from vrw_jax.models import AbstractWheel
 from vrw_jax.numerics import EngineName, StepOptions, with_default_jax_settings
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation.attractors import (
     find_distinct_orbits,
     measure_orbit_steps,
@@ -45,6 +46,7 @@ an axis.
 """
 
 
+@announce_wait("batches of gait steps", "10 s")
 @with_default_jax_settings
 def basin(
     params: WheelParams,

@@ -9,6 +9,7 @@ import numpy as np
 
 from vrw_jax.measures import FORCE_PEAK_MEASURES, make_measure_attributes
 from vrw_jax.measures import xarray as xr
+from vrw_jax.runtime import announce_wait
 from vrw_jax.validation import check_type
 
 
@@ -35,6 +36,7 @@ SAMPLED_FORCE_PEAK_MEASURES = tuple(
 """Measures of the peaks of the normal force between impacts."""
 
 
+@announce_wait("samples of gait steps", "10 s")
 def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     """Return the peaks of the normal force in each step of a walk that `vrw.simulate` returned.
 

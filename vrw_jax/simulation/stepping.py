@@ -38,6 +38,7 @@ from vrw_jax.printing import (
     format_outcome_counts,
     format_quantity,
 )
+from vrw_jax.runtime import announce_wait
 from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice, describe_accepted_models
 from vrw_jax.validation import check_int, check_reals, check_type, format_value
 from vrw_jax.wheel import Outcome, WheelParams
@@ -242,6 +243,7 @@ def step(
 ) -> StepResult: ...
 
 
+@announce_wait("a gait step", "5 s")
 @with_default_jax_settings
 def step(
     params: WheelParams,
@@ -282,6 +284,7 @@ def step(
     return model.take_step(params, section_state, options)
 
 
+@announce_wait("a gait step", "5 s")
 @with_default_jax_settings
 def return_map(
     params: WheelParams,
@@ -414,6 +417,7 @@ def _simulate_walk_by_scan(
     return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
 
 
+@announce_wait("a gait step", "5 s")
 @with_default_jax_settings
 def walk(
     params: WheelParams,
@@ -526,6 +530,7 @@ def start_walk_toward_gait(
     return walk(params, model.compute_default_start(params), n_steps, model=model, options=options)
 
 
+@announce_wait("a gait step of each model", "20 s")
 @with_default_jax_settings
 def choose_model(
     params: WheelParams,

@@ -33,6 +33,7 @@ from vrw_jax.models import (
     separate_next_slope,
 )
 from vrw_jax.numerics import EngineName, StepOptions, with_default_jax_settings
+from vrw_jax.runtime import announce_wait
 from vrw_jax.selection import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.simulation.provenance import collect_provenance_attributes
 from vrw_jax.simulation.stepping import (
@@ -51,6 +52,7 @@ from vrw_jax.wheel import (
 )
 
 
+@announce_wait("gait steps and their samples", "5 s")
 @with_default_jax_settings
 def simulate(
     params: WheelParams,

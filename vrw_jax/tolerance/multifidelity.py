@@ -20,6 +20,7 @@ import numpy as np
 from vrw_jax.measures import MEASURES
 from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
 from vrw_jax.printing import AbstractPrintable, LabelAndText
+from vrw_jax.runtime import announce_wait
 from vrw_jax.tolerance.contact_steps import ContactWheelBatch
 from vrw_jax.tolerance.lower_fidelity import ModelIndex, find_paper_gaits, select_wheels
 from vrw_jax.tolerance.measure_result import MeasureResult
@@ -126,6 +127,7 @@ GAIT_ERROR_FRACTION = 0.1
 MIN_PILOT_GAITS = 8
 
 
+@announce_wait("gaits of each model", "30 s")
 @with_default_jax_settings
 def multifidelity_mean(
     measure: str,

@@ -19,6 +19,7 @@ import numpy as np
 
 from vrw_jax.cycles import GaitChoice, compute_walk_starts, parse_gait_choice
 from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
+from vrw_jax.runtime import announce_wait
 from vrw_jax.tolerance.contact_steps import (
     TIGHT_TOLERANCE,
     VERY_TIGHT_TOLERANCE,
@@ -58,6 +59,7 @@ from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, convert_friction
 MIN_TOL_FOR_TIGHT_STEPS = 1e-7
 
 
+@announce_wait("gait steps of each model", "30 s")
 @with_default_jax_settings
 def measure_to_tolerance(
     measures: str | Sequence[str],

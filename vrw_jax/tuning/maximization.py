@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.numerics import StatusCode
+from vrw_jax.runtime import report_progress
 from vrw_jax.tuning.objective import (
     GaitEvaluation,
     compute_max_violation,
@@ -198,6 +199,7 @@ class _TrialRecord:
                 np.array(normalized_parameters), nearest_trial
             )
             self.kinds[trial_key] = TrialKind.TRIAL
+            report_progress(f"{len(self.trials):,} gaits evaluated")
         trial = self.trials[trial_key]
         if not trial.is_usable_trial:
             self.kinds[trial_key] = (

@@ -40,6 +40,7 @@ from vrw_jax.measures import (
 )
 from vrw_jax.measures import xarray as xr
 from vrw_jax.numerics import StepOptions, with_default_jax_settings
+from vrw_jax.runtime import announce_wait
 from vrw_jax.simulation import (
     ModelLike,
     collect_provenance_attributes,
@@ -119,6 +120,7 @@ WALK_VALIDATION_OPTIONS = WalkValidationOptions()
 """Options of all walks that validate tuned wheels."""
 
 
+@announce_wait("the gait, objective and constraints with derivatives", "25 s")
 @with_default_jax_settings
 def tune(
     params: WheelParams,
