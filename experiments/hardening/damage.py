@@ -170,26 +170,15 @@ def compute() -> list[list[float]]:
     import jax
     import jax.numpy as jnp
 
-    from vrw_jax.numerics import (
-        compile_batch_function,
-        compile_cached_lane_program,
-        compile_exported_function,
-    )
+    from vrw_jax import simd
 
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     x, results = np.arange(4.0), []
     for factor in (2.0, 3.0):
-        lanes = lambda _, rows, f=factor: (f * rows[0],)
-        results.append(
-            compile_cached_lane_program(lanes, [], 1, x.dtype, ("times", factor))([], [x])[0]
-        )
-        inner = compile_batch_function(lambda y, f=factor: f * y, lambda y: y, ("inner", factor))
-        call = lambda y, g=inner: jnp.sin(g(y))
-        results.append(
-            compile_exported_function(call, (jnp.asarray(x),), ("call", factor), jax.devices()[0])(
-                x
-            )
-        )
+        times = simd.compile_batch_function(lambda y, f=factor: f * y)
+        results.append(times.run(x))
+        call = lambda y, g=times: jnp.sin(g(y))
+        results.append(simd.compile_exported_function(call, (jnp.asarray(x),), jax.devices()[0])(x))
     return [np.asarray(values).tolist() for values in results]
 
 

@@ -42,7 +42,8 @@ def start_without_cache() -> None:
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     jax.config.update("jax_platforms", "cpu")
     jax.clear_caches()
-    code._machine_code_by_record_name.clear()
+    code._machine_code_by_name.clear()
+    code._lane_program_by_index_name.clear()
     _cache = tempfile.TemporaryDirectory()
     vrw.start_jax(_cache.name)
     compilation_cache.reset_cache()  # The cache may have opened another folder.

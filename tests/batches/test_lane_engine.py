@@ -12,6 +12,7 @@ from support.batched import (
     TIME_LIMIT_CASES,
     make_parameter_rows,
 )
+from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
@@ -26,8 +27,10 @@ from vrw_jax.integrator.tableaus import (
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.numerics import batch_programs, batch_sizes
+from vrw_jax.numerics import batch_sizes
 from vrw_jax.numerics.trigonometry import compute_sine_cosine
+from vrw_jax.simd import lane_function
+from vrw_jax.simd.batching import choose_batch_size
 
 STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(
@@ -182,39 +185,32 @@ COARSE_OPTIONS = vrw.StepOptions(solver="Bosh3", max_solver_steps=60, rtol=1e-4,
 def test_xla_blocks_agree_with_machine_code(monkeypatch):
     parameter_rows, states = draw_hard_starts(300)
     solution, codes = compute_values(parameter_rows, states, COARSE_OPTIONS)
-    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
+    disable_machine_code(monkeypatch)
     monkeypatch.setattr(batch_sizes, "XLA_LANE_BATCH_SIZE", 64)
-    monkeypatch.setattr(batch_programs, "STRAGGLER_COUNT_DIVISOR", 10**9)  # no block stops early
+    monkeypatch.setattr(lane_function, "STRAGGLER_COUNT_DIVISOR", 10**9)  # no block stops early
     patient, code = compute_values(parameter_rows, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(code, codes)
     # Their step control takes powers that differ in the sixth digit: both keep their tolerance.
     np.testing.assert_allclose(patient, solution, rtol=1e-4, atol=1e-4)
-    monkeypatch.setattr(batch_programs, "STRAGGLER_COUNT_DIVISOR", 2)  # stragglers run again
+    monkeypatch.setattr(lane_function, "STRAGGLER_COUNT_DIVISOR", 2)  # stragglers run again
     second_states, code = compute_values(parameter_rows, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(second_states, patient)
     np.testing.assert_array_equal(code, codes)
 
 
 def test_an_xla_program_without_lanes_returns_empty_arrays(monkeypatch):
-    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
-    program = batch_programs.compile_batch_program(
-        lambda _, lanes: (lanes[0] + lanes[1], lanes[0] > 0.0),
-        [],
-        2,
-        np.dtype(float),
-        "no lanes",
-        4,
-    )
-    total, is_positive = program([], [np.empty(0), np.empty(0)])
+    disable_machine_code(monkeypatch)
+    program = simd.compile_batch_function(lambda x, y: (x + y, x > 0.0), 4)
+    total, is_positive = program.run(np.empty(0), np.empty(0))
     assert total.shape == is_positive.shape == (0,)
     assert (total.dtype, is_positive.dtype) == (np.dtype(float), np.dtype(bool))
 
 
 def test_batches_of_gaits_are_larger_on_a_gpu(monkeypatch):
-    assert batch_sizes.choose_batch_size(64, 4096) == 64
+    assert choose_batch_size(64, 4096) == 64
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert batch_sizes.choose_batch_size(64, 4096) == 4096
-    assert batch_sizes.choose_batch_size(10_000, 4096) == 10_000
+    assert choose_batch_size(64, 4096) == 4096
+    assert choose_batch_size(10_000, 4096) == 10_000
 
 
 def test_a_batched_walk_equals_single_walks_and_ends_at_its_first_failure():

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax import simd
 from vrw_jax.contact import batch_walks as ground_lanes
 from vrw_jax.contact import embed_section_states, step_batch_with_jacobian
 from vrw_jax.continuation.arclength import ArclengthOptions
@@ -398,7 +398,7 @@ def test_derivatives_of_a_batch_element_do_not_depend_on_the_others(unilateral_b
 def test_integration_by_xla_agrees_with_machine_code(unilateral_batch, monkeypatch):
     *_, walk_result = unilateral_batch
     solution = walk_result(slice(None))
-    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
+    disable_machine_code(monkeypatch)
     by_xla = walk_result(slice(None))
     np.testing.assert_array_equal(by_xla.outcome, solution.outcome)
     # Rounding alone tells them apart, grown by the events of three steps.

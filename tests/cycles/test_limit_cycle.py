@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support import reference_values
 from support.files import assert_netcdf_round_trip
+from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
@@ -730,7 +731,7 @@ def test_a_search_by_xla_agrees_with_machine_code(monkeypatch):
         )
 
     *solution, outcome, passes = jax.jit(evaluate)(rows)
-    monkeypatch.setattr(simd, "is_machine_code_available", lambda: False)
+    disable_machine_code(monkeypatch)
     *by_xla, code, n = jax.jit(lambda parameter_rows: evaluate(parameter_rows))(rows)
     np.testing.assert_array_equal(code, outcome)
     np.testing.assert_array_equal(n, passes)

@@ -20,7 +20,7 @@ from vrw_jax.hybrid import (
     simulate_hybrid,
     time_errors,
 )
-from vrw_jax.hybrid.program_cache import (
+from vrw_jax.simd.program_cache import (
     MAX_CACHED_PROGRAMS,
     _program_by_key,
     call_compiled_program,
@@ -137,6 +137,23 @@ def test_a_changed_attribute_of_an_object_class_or_module_changes_the_result():
             assert_third_impact(mode, gravity, restitution)
     ground.restitution = 0.6
     assert_third_impact(modes[0], 1.62, 0.6)
+
+
+def test_a_constant_of_a_class_that_a_library_seems_to_define_is_read_again():
+    """Reference: the fall from 1 m takes sqrt(2 / g)."""
+    for module_name in ("jaxmodel", "numpy_model"):
+        planet = type("Planet", (), {"__module__": module_name})()
+        fall_on_planet = lambda y, planet=planet: jnp.stack([y[1], -planet.g + 0.0 * y[1]])
+        for planet.g in (9.81, 1.62):
+            solution = drop_ball(1.0, [Mode(fall_on_planet, Guard(lambda y: y[0], jnp.negative))])
+            assert solution.times[0] == pytest.approx(np.sqrt(2.0 / planet.g), abs=1e-12)
+
+
+def test_a_constant_that_is_read_by_a_computed_name_is_read_again():
+    fall_by_name = lambda y: jnp.stack([y[1], -getattr(moon, "gra" + "vity") + 0.0 * y[1]])
+    for moon.gravity in (9.81, 1.62):
+        solution = drop_ball(1.0, [Mode(fall_by_name, Guard(lambda y: y[0], jnp.negative))])
+        assert solution.times[0] == pytest.approx(np.sqrt(2.0 / moon.gravity), abs=1e-12)
 
 
 def test_a_program_for_another_shape_has_the_constants_of_its_own_functions():

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from vrw_jax import figures as plots
 from vrw_jax.cli import commands as cli
-from vrw_jax.paper import facts
 from vrw_jax.paper import reproduction as reproduce
+from vrw_jax.paper.facts import table as facts
 from vrw_jax.paper.facts.base import PaperEvidence
 from vrw_jax.wheel.outcomes import Outcome
 

@@ -1,5 +1,6 @@
 """Only code that the user stored under the same name is executed from the cache."""
 
+import functools
 import os
 import stat
 import subprocess
@@ -10,17 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.experimental.compilation_cache import compilation_cache
-from support.machine_code import CodeRegistrySpy
+from support.machine_code import CodeRegistrySpy, use_cache_folder
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.numerics import (
-    compile_batch_function,
-    compile_cached_lane_program,
-    compile_exported_function,
-)
-from vrw_jax.runtime import disk_cache as store
+from vrw_jax import simd
+from vrw_jax.simd import disk_cache as store
 
 X = np.arange(4.0)
 FACTORS = (2.0, 3.0)
@@ -29,12 +25,8 @@ FACTORS = (2.0, 3.0)
 @pytest.fixture
 def folder(tmp_path):
     """Return a cache folder of the test."""
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    compilation_cache.reset_cache()
-    yield tmp_path
-    jax.config.update("jax_compilation_cache_dir", before)
-    compilation_cache.reset_cache()
+    with use_cache_folder(tmp_path):
+        yield tmp_path
 
 
 @pytest.fixture
@@ -43,21 +35,18 @@ def process(monkeypatch):
     return CodeRegistrySpy(monkeypatch)
 
 
+def multiply(factor, x):
+    return factor * x
+
+
 def multiples():
     """Return the numbers of X times each factor, by machine code and by a trace that calls it."""
     results = []
     for factor in FACTORS:
-        lanes = lambda _, x, factor=factor: (factor * x[0],)
-        results.append(
-            compile_cached_lane_program(lanes, [], 1, X.dtype, ("times", factor))([], [X])[0]
-        )
-        within = compile_batch_function(lambda x, f=factor: f * x, lambda x: x, ("within", factor))
-        call = lambda x, g=within: g(x) + 0.0
-        results.append(
-            compile_exported_function(call, (jnp.asarray(X),), ("call", factor), jax.devices()[0])(
-                X
-            )
-        )
+        times = simd.compile_batch_function(functools.partial(multiply, factor))
+        results.append(times.run(X))
+        call = lambda x, g=times: g(x) + 0.0
+        results.append(simd.compile_exported_function(call, (jnp.asarray(X),), jax.devices()[0])(X))
     return results
 
 
@@ -167,18 +156,13 @@ def test_another_users_records_are_not_used(folder, process, monkeypatch):
 
 
 def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
-    traces = []
-
-    def double(x):
-        traces.append(1)
-        return 2.0 * x
-
-    run = lambda: compile_exported_function(double, (X,), "versions", jax.devices()[0])(X)
+    spy = CodeRegistrySpy(monkeypatch)
+    run = lambda: simd.compile_batch_function(lambda x: 2.0 * x).run(X)
     run(), run()
-    assert len(traces) == 1
+    assert spy.n_traces == 1
     monkeypatch.setattr(store, "find_library_version", lambda library_name: "0.0")
     run()
-    assert len(traces) == 2
+    assert spy.n_traces == 2
 
 
 def test_a_record_that_can_t_be_written_whole_leaves_nothing(folder, monkeypatch):
@@ -205,9 +189,7 @@ def started(code="", **environment):
 def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     code = (
         "vrw.start_jax(); import numpy as np; "
-        "from vrw_jax.numerics import compile_cached_lane_program; "
-        "compile_cached_lane_program(lambda _, x: (2.0 * x[0],), [], 1, np.dtype(float), 'd')([], "
-        "[np.ones(4)])"
+        "from vrw_jax import simd; simd.compile_batch_function(lambda x: 2.0 * x).run(np.ones(4))"
     )
     made = started(code, XDG_CACHE_HOME=str(tmp_path / "a" / "b"))
     assert made.returncode == 0, made.stderr

@@ -1,5 +1,6 @@
 """Start of a process: number format, cached traces and XLA's quick compilation."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -10,8 +11,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.numerics.cached_programs import wrap_with_saved_trace
-from vrw_jax.runtime.start import make_fusion_emitter_options
+from vrw_jax.simd import saved_traces
+from vrw_jax.simd.settings import make_fusion_emitter_options
 
 
 def read_output_lines(code, **environment):
@@ -31,15 +32,17 @@ def cache_folder(tmp_path):
     jax.config.update("jax_compilation_cache_dir", before)
 
 
-def make_counted_function():
-    """Return a function of two arrays, and the list to which each of its traces appends."""
-    traces = []
+@pytest.fixture
+def exports(monkeypatch):
+    """Return a list to which each export of a trace appends."""
+    exported, original_export = [], saved_traces.export.export
+    spy = lambda *a, **k: exported.append(1) or original_export(*a, **k)
+    monkeypatch.setattr(saved_traces.export, "export", spy)
+    return exported
 
-    def function(x, y):
-        traces.append(x.shape)
-        return {"sum": jnp.sin(x) + y}
 
-    return function, traces
+def add_sine(shift, x, y):
+    return {"sum": jnp.sin(x) + shift * y}
 
 
 def test_started_processes_compute_in_64_bits_with_the_fast_compiler(tmp_path):
@@ -80,28 +83,29 @@ def test_a_flag_set_by_the_user_is_kept():
     assert read_output_lines(code, XLA_FLAGS=flag) == [flag]
 
 
-def test_a_cached_trace_is_reused_and_gives_the_same_values(cache_folder):
-    function, traces = make_counted_function()
+def evaluate_by_saved_trace(shift, x, y):
+    """Evaluate as another process would: nothing is remembered but on disk."""
+    function = functools.partial(add_sine, shift)
+    return jax.jit(lambda x, y: saved_traces.wrap_with_saved_trace(function)(x, y)["sum"])(x, y)
+
+
+def test_a_cached_trace_is_reused_and_gives_the_same_values(cache_folder, exports):
     x, y = jnp.arange(3.0), jnp.ones(3)
-    expected = function(x, y)["sum"]
-    traces.clear()
-    for _ in range(2):  # each as another process would: nothing is remembered but on disk
-        result = jax.jit(lambda x, y: wrap_with_saved_trace(function, "ours")(x, y)["sum"])(x, y)
-        np.testing.assert_array_equal(result, expected)
-    assert len(traces) == 1
-    jax.jit(lambda x, y: wrap_with_saved_trace(function, "other settings")(x, y)["sum"])(x, y)
-    jax.jit(lambda x, y: wrap_with_saved_trace(function, "ours")(x, y)["sum"])(x[:2], y[:2])
-    assert len(traces) == 3
+    for _ in range(2):
+        np.testing.assert_array_equal(evaluate_by_saved_trace(1.0, x, y), jnp.sin(x) + y)
+    assert len(exports) == 1
+    np.testing.assert_array_equal(evaluate_by_saved_trace(2.0, x, y), jnp.sin(x) + 2.0)
+    np.testing.assert_array_equal(evaluate_by_saved_trace(1.0, x[:2], y[:2]), jnp.sin(x[:2]) + 1.0)
+    assert len(exports) == 3
 
 
-def test_a_damaged_trace_is_traced_again(cache_folder):
-    function, traces = make_counted_function()
-    call = lambda x: wrap_with_saved_trace(function, "ours")(x, x)["sum"]
-    expected = jax.jit(call)(jnp.ones(2))
+def test_a_damaged_trace_is_traced_again(cache_folder, exports):
+    expected = evaluate_by_saved_trace(1.0, jnp.ones(2), jnp.ones(2))
     (place,) = cache_folder.glob("vrw_trace_*")
     place.write_bytes(place.read_bytes()[:-1] + b"?")
-    np.testing.assert_array_equal(jax.jit(lambda x: call(x))(jnp.ones(2)), expected)
-    assert len(traces) == 2
+    again = evaluate_by_saved_trace(1.0, jnp.ones(2), jnp.ones(2))
+    np.testing.assert_array_equal(again, expected)
+    assert len(exports) == 2
 
 
 @pytest.mark.skipif(

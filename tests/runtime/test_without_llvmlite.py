@@ -13,6 +13,7 @@ import vrw_jax as vrw
 PROGRAM = """
 import json, sys
 sys.modules["llvmlite"] = sys.modules["llvmlite.ir"] = sys.modules["llvmlite.binding"] = None
+import jax
 import numpy as np
 import vrw_jax as vrw
 from vrw_jax import simd
@@ -28,9 +29,7 @@ results = {
 }
 for name, call in {
     "engine": lambda: vrw.step(params, start, engine="lanes"),
-    "program": lambda: simd.compile_lane_program(
-        lambda _, x: (x[0],), [], 1, np.dtype(float), 0, None
-    ),
+    "program": lambda: simd.kernel.write_llvm_kernel(jax.make_jaxpr(lambda x: x)(1.0), 4),
 }.items():
     try:
         call()

@@ -32,7 +32,9 @@ def compute_waves(a, b):
 
 def compile_for_arm(function, *lanes):
     return machine.compile_llvm_for_processor(
-        kernel.write_llvm_kernel(code.trace_for_machine_code(function, *lanes), LANES_PER_REGISTER)
+        kernel.write_llvm_kernel(
+            code.trace_for_machine_code(function, *lanes)[0], LANES_PER_REGISTER
+        )
     )
 
 

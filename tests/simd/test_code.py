@@ -10,92 +10,64 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from support.machine_code import CodeRegistrySpy
+from support.machine_code import CodeRegistrySpy, use_cache_folder
 
 from vrw_jax import simd
 from vrw_jax.simd import code_cache as code
 from vrw_jax.simd import kernel
 
-LANES, X = [np.arange(4.0)], np.arange(4.0)
-
-
-class MemoryStore(dict):
-    """A store in memory."""
-
-    load_cache_record = dict.get
-    save_cache_record = dict.__setitem__
+X = np.arange(4.0)
 
 
 @pytest.fixture(autouse=True)
-def fresh_process(monkeypatch):
+def process(monkeypatch):
     return CodeRegistrySpy(monkeypatch)
 
 
-def make_counted_function(factor=2.0):
-    """Return a function of lanes, and the list to which each of its traces appends."""
-    traces = []
-
-    def times(_, lanes):
-        traces.append(factor)
-        return (factor * lanes[0],)
-
-    return times, traces
+@pytest.fixture(autouse=True)
+def folder(tmp_path):
+    with use_cache_folder(tmp_path):
+        yield tmp_path
 
 
-def run_program(function, key, store):
-    compute_again = lambda *arguments: function(
-        *arguments
-    )  # JAX knows the trace of the function itself
-    return list(
-        simd.compile_lane_program(compute_again, [], 1, LANES[0].dtype, key, store)([], LANES)[0]
-    )
+def multiply(factor):
+    """Return multiples of X by machine code of a function that is defined anew."""
+    scope = {}
+    exec(f"def times(x):\n    return {factor} * x", scope)  # its number is part of the code
+    return simd.compile_batch_function(scope["times"]).run(X).tolist()
 
 
-def test_a_later_start_neither_traces_nor_compiles(monkeypatch, fresh_process):
-    double, traces = make_counted_function()
-    store = MemoryStore()
-    assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
+def test_a_later_start_neither_traces_nor_compiles(monkeypatch, process):
+    assert multiply(2.0) == [0.0, 2.0, 4.0, 6.0]
     monkeypatch.setattr(code, "compile_llvm_for_processor", None)  # would fail
-    assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
-    fresh_process.reset_registry()
-    assert run_program(double, "double", store) == [0.0, 2.0, 4.0, 6.0]
-    assert len(traces) == 1
+    assert multiply(2.0) == [0.0, 2.0, 4.0, 6.0]
+    process.reset_registry()
+    assert multiply(2.0) == [0.0, 2.0, 4.0, 6.0]
+    assert process.n_traces == 1
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test_the_same_trace_under_another_key_is_not_compiled(monkeypatch, fresh_process, elsewhere):
-    double, traces = make_counted_function()
-    store = MemoryStore()
-    run_program(double, "double", store)
+def test_the_same_trace_of_another_function_is_not_compiled(monkeypatch, process, elsewhere):
+    multiply("2.0")
     if elsewhere:
-        fresh_process.reset_registry()
-    else:
-        store = None
+        process.reset_registry()
     monkeypatch.setattr(code, "compile_llvm_for_processor", None)  # would fail
-    assert run_program(double, ("double", "after an edit of its docstring"), store) == [
-        0.0,
-        2.0,
-        4.0,
-        6.0,
-    ]
-    assert len(traces) == 2
+    assert multiply("abs(-2.0)") == multiply("float(2)") == [0.0, 2.0, 4.0, 6.0]
+    assert process.n_traces == 3
 
 
-def run_two_programs(x, key, *functions):
-    calls = [simd.compile_lane_function(f, f, (key, i), None) for i, f in enumerate(functions)]
-    return sum(call(x) for call in calls)
+def add_two_programs(x, *functions):
+    return sum(simd.compile_batch_function(function)(x) for function in functions)
 
 
-def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch):
-    store = MemoryStore()
-    assert run_program(make_counted_function(2.0)[0], 2, store)[3] == 6.0
-    assert run_program(make_counted_function(3.0)[0], 3, store)[3] == 9.0
+def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch, process, folder):
+    assert multiply(2.0)[3] == 6.0
+    assert multiply(3.0)[3] == 9.0
     monkeypatch.setattr(code, "describe_compiler_settings", lambda: "by another processor")
-    double, traces = make_counted_function()
-    assert run_program(double, 2, store)[3] == 6.0
-    assert len(traces) == 1
-    names = [name.split("_")[1] for name in store]
-    assert (names.count("code"), names.count("index")) == (3, 3)
+    assert multiply(2.0)[3] == 6.0
+    assert process.n_traces == 3
+    for kind in ("code", "index"):
+        assert len(list(folder.glob(f"lanes_{kind}_*"))) == 3
 
 
 def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatch):
@@ -103,7 +75,7 @@ def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatc
     monkeypatch.setattr(
         code, "compile_llvm_for_processor", lambda text: may.wait(60) and compiled(text)
     )
-    evaluate_both = lambda x: run_two_programs(x, "at work", lambda x: 2.5 * x, lambda x: 3.5 * x)
+    evaluate_both = lambda x: add_two_programs(x, lambda x: 2.5 * x, lambda x: 3.5 * x)
     traced = jax.jit(evaluate_both).trace(X)
     may.set()
     np.testing.assert_array_equal(traced.lower().compile()(X), 6.0 * X)
@@ -112,50 +84,41 @@ def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatc
         raise RuntimeError("no such instruction")
 
     monkeypatch.setattr(code, "compile_llvm_for_processor", refuse)
-    traced = jax.jit(
-        lambda x: run_two_programs(x, "refused", lambda x: 4.5 * x, lambda x: x / 7.0)
-    ).trace(X)
+    traced = jax.jit(lambda x: add_two_programs(x, lambda x: 4.5 * x, lambda x: x / 7.0)).trace(X)
     with pytest.raises(RuntimeError, match="no such instruction"):
         traced.lower()
 
 
-def test_an_index_without_its_code_is_compiled_again(fresh_process):
-    double, traces = make_counted_function()
-    store = MemoryStore()
-    run_program(double, "double", store)
-    del store[next(name for name in store if name.startswith("lanes_code_"))]
-    fresh_process.reset_registry()
-    assert run_program(double, "double", store)[3] == 6.0
-    fresh_process.reset_registry()
-    assert run_program(double, "double", store)[3] == 6.0
-    assert len(traces) == 2
+def test_an_index_without_its_code_is_compiled_again(process, folder):
+    multiply(2.0)
+    next(folder.glob("lanes_code_*")).unlink()
+    process.reset_registry()
+    assert multiply(2.0)[3] == 6.0
+    process.reset_registry()
+    assert multiply(2.0)[3] == 6.0
+    assert process.n_traces == 2
 
 
-def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store():
-    traced = []
-
-    def double(x):
-        traced.append(1)
-        return 2.0 * x
-
-    call = simd.compile_lane_function(double, lambda x: x, "batches", None)
-    for n in (5, 8, 11):
-        np.testing.assert_array_equal(jax.jit(call)(jnp.arange(n) + 1.0), 2.0 * (np.arange(n) + 1))
-    assert len(traced) == 1
-    jax.jit(call)(jnp.ones(1))
-    assert len(traced) == 2  # a lone lane has code of its own
+def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store(process):
+    with use_cache_folder(None):
+        call = simd.compile_batch_function(lambda x: 2.0 * x)
+        for n in (5, 8, 11):
+            x = jnp.arange(n) + 1.0
+            np.testing.assert_array_equal(jax.jit(call)(x), 2.0 * x)
+        assert process.n_traces == 1
+        jax.jit(call)(jnp.ones(1))
+        assert process.n_traces == 2  # a lone lane has code of its own
 
 
-def test_code_is_loaded_by_its_name(fresh_process):
-    store = MemoryStore()
-    double = simd.compile_lane_function(lambda x: 2.0 * x, lambda x: x, "at hand", store)
-    jax.jit(double)(jnp.ones(3))
-    (name,) = fresh_process.names
-    assert not simd.load_saved_machine_code([name, "lanes_code_of_none"], store)
-    fresh_process.reset_registry()
-    assert not simd.load_saved_machine_code([name], None)
-    assert simd.load_saved_machine_code([name], store)
-    assert fresh_process.names == [name, name]
+def test_code_is_loaded_by_its_name(process):
+    jax.jit(simd.compile_batch_function(lambda x: 2.0 * x))(jnp.ones(3))
+    (name,) = process.names
+    assert not simd.load_saved_machine_code([name, "lanes_code_of_none"])
+    process.reset_registry()
+    with use_cache_folder(None):
+        assert not simd.load_saved_machine_code([name])
+    assert simd.load_saved_machine_code([name])
+    assert process.names == [name, name]
 
 
 def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
@@ -169,7 +132,7 @@ def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
             return {"loop": jax.lax.fori_loop(0, 9, turn, x[1]), **sums}
         table = jnp.arange(9.0, dtype=jnp.float32)
         shape = jax.ShapeDtypeStruct((9, 1021), jnp.float32)
-        closed = code_cache.trace_for_machine_code(lambda x: step(x, table), shape)
+        closed, _ = code_cache.trace_for_machine_code(lambda x: step(x, table), shape)
         print(kernel.write_llvm_kernel(closed, 8))
     """
     lines = "\n".join(line[8:] for line in result.splitlines())
@@ -191,7 +154,7 @@ def test_repeated_operations_along_an_axis_are_emitted_once():
 
     def length(n):
         shape = jax.ShapeDtypeStruct((1021,), jnp.float64)
-        closed = code.trace_for_machine_code(lambda x: sampled(n, x), shape)
+        closed, _ = code.trace_for_machine_code(lambda x: sampled(n, x), shape)
         return len(kernel.write_llvm_kernel(closed, 8))
 
     assert length(900) < 1.1 * length(100)

@@ -1,7 +1,5 @@
 """Loops that reuse memory in place compute what loops with copies compute."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +14,6 @@ from vrw_jax.simd.array_emitter import LANE_AXIS_SENTINEL
 from vrw_jax.simd.code_cache import trace_for_machine_code
 from vrw_jax.simd.kernel import write_llvm_kernel
 
-KEYS = itertools.count()
 N_ARRAYS = 3
 N_ROWS = 5
 
@@ -86,7 +83,7 @@ def run_as_machine_code(program, x, forces_copies):
                 "_find_overwriting_equations",
                 lambda jaxpr: dict.fromkeys(find_last_uses(jaxpr)),
             )
-        run = simd.compile_lane_function(program, program, ("copies", next(KEYS)), None, limits)
+        run = simd.compile_batch_function(program, register_limits=limits)
         return np.asarray(jax.jit(run)(x))
 
 
@@ -106,5 +103,5 @@ def test_a_loop_that_updates_an_array_allocates_it_once():
     program = lambda x: lax.fori_loop(0, N_ROWS, double_row, 3.0 * x)
     limits = simd.RegisterLimits(1, 1, max_register_entries=2, max_innermost_register_entries=2)
     shape = jax.ShapeDtypeStruct((N_ROWS, LANE_AXIS_SENTINEL), np.float64)
-    text = write_llvm_kernel(trace_for_machine_code(program, shape), 4, limits)
+    text = write_llvm_kernel(trace_for_machine_code(program, shape)[0], 4, limits)
     assert text.count(f"alloca <4 x double>, i64 {N_ROWS}") == 1

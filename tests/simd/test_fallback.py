@@ -31,13 +31,10 @@ def double_until_large(x):
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     is_available = simd.is_machine_code_available()
-    run = simd.compile_lane_function(double_until_large, double_until_large, "doubling", None)
+    run = simd.compile_batch_function(double_until_large, xla_block_size=4)
     x = jnp.linspace(1.0, 10.0, 9)
     in_jit = (jax.jit(run) if is_available else jax.jit(double_until_large))(x).tolist()
-    program = simd.compile_lane_program(
-        lambda _, x: (double_until_large(x[0]),), [], 1, np.dtype(float), "doubling", None
-    )
-    of_arrays = program([], [np.asarray(x)])[0].tolist()
+    of_arrays = run.run(np.asarray(x)).tolist()
 messages = [str(w.message) for w in caught if "machine code does not work" in str(w.message)]
 print(json.dumps([in_jit, of_arrays, messages, simd.is_machine_code_available()]))
 """
@@ -99,7 +96,7 @@ def test_the_library_computes_where_machine_code_cannot_be_called(tmp_path):
 
 def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
     """Structs of xla/ffi/api/c_api.h: a call frame, its extension, and the metadata."""
-    run = simd.compile_lane_function(lambda x: x + 1.0, lambda x: x, "version test", None)
+    run = simd.compile_batch_function(lambda x: x + 1.0)
     np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
     code = list(ffi_primitive.LOADED_CODE_BY_FFI_TARGET.values())[-1]
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(

@@ -1,7 +1,5 @@
 """Machine code for lanes computes what JAX computes with the same function."""
 
-import itertools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,16 +11,12 @@ from vrw_jax import simd
 from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.simd.rules import PRIMITIVE_RULES
 
-KEYS = itertools.count()
 RANDOM_GENERATOR = np.random.default_rng(0)
 
 
 def make_program(function, lanes, uniform=()):
-    """Return `function(uniform, lanes)`, compiled for inputs of these shapes."""
-    kinds = [np.asarray(x).dtype for x in uniform]
-    return simd.compile_lane_program(
-        function, kinds, len(lanes), lanes[0].dtype, ("simd", next(KEYS)), None
-    )
+    """Return `function(uniform, lanes)` as machine code."""
+    return simd.compile_batch_function(function).run
 
 
 def run_both_backends(function, lanes, uniform=()):
@@ -212,9 +206,7 @@ def overwrite_in_loops(x):
 
 def test_in_place_updates_of_loops_do_not_change_other_readers():
     x = RANDOM_GENERATOR.uniform(0.0, 6.0, (2, 12, 37))
-    call = simd.compile_lane_function(
-        overwrite_in_loops, overwrite_in_loops, ("simd", next(KEYS)), None
-    )
+    call = simd.compile_batch_function(overwrite_in_loops)
     for solution, expected in zip(jax.jit(call)(x), overwrite_in_loops(x), strict=True):
         np.testing.assert_allclose(solution, expected, rtol=1e-12, atol=1e-12)
 
@@ -248,7 +240,7 @@ def pick_rows(x, large):
 @pytest.mark.parametrize("n", [*mark_slow(1, 4), 1001])
 def test_array_functions_are_called_from_jax_programs(n):
     x = jnp.asarray(RANDOM_GENERATOR.normal(size=(20, 3, n)))
-    call = simd.compile_lane_function(use_arrays_in_loops, use_arrays_in_loops, "arrays", None)
+    call = simd.compile_batch_function(use_arrays_in_loops)
     # One lane after the other: no lane may see another.
     expected = jax.vmap(
         lambda one: jax.tree.map(lambda y: y[..., 0], use_arrays_in_loops(one[..., None])), -1, -1

@@ -144,13 +144,13 @@ def test_a_jacobian_within_jit_compiles_only_its_own_machine_code(monkeypatch):
     class AskedError(Exception):
         pass
 
-    def code_of(function, shapes, key, *rest):
-        raise AskedError(repr(key))
+    def get_lane_program(function, *rest):
+        raise AskedError(function.args[0].__qualname__)
 
-    monkeypatch.setattr("vrw_jax.simd.program.get_machine_code", code_of)
+    monkeypatch.setattr("vrw_jax.simd.lane_function.get_lane_program", get_lane_program)
     unknown = vrw.StepOptions(max_solver_steps=12_345)  # nothing is traced for it yet
     state = lambda x: vrw.step(vrw.WheelParams(), x, options=unknown).section_state
-    with pytest.raises(AskedError, match="gait step with derivatives"):
+    with pytest.raises(AskedError, match="build_step_jacobian"):
         jax.jit(jax.jacfwd(state)).lower(jnp.asarray(START))
 
 

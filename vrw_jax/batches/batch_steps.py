@@ -46,11 +46,12 @@ from vrw_jax.models import (
 from vrw_jax.numerics import (
     StepOptions,
     batch_sizes,
-    compile_batch_program,
+    compile_batch_function,
     map_in_batches,
     with_default_jax_settings,
 )
 from vrw_jax.runtime import announce_wait
+from vrw_jax.simd import CompiledBatchFunction
 from vrw_jax.simulation import convert_model_argument, convert_section_state, convert_step_options
 from vrw_jax.validation import (
     check_choice,
@@ -392,20 +393,28 @@ def _step_lanes_by_kernel(
 
     The results are those of `_BatchEngine.take_lane_steps`.
     """
-    step_option_leaves, options_structure = jax.tree.flatten(options)
-    scalar_kernel_arguments = [
-        np.asarray(step_option_leaf, parameter_matrix.dtype)
-        for step_option_leaf in step_option_leaves
-    ]
-    solver_tableau, n_parameters = load_explicit_tableau(options.solver), len(PARAMETER_NAMES)
-    assert solver_tableau is not None  # `_select_batch_engine` has checked the solver.
+    compiled_step = _compile_lane_step(stop_at_lift_off, n_legs, input_indices, len(next_slopes))
+    kernel_results = compiled_step.run(
+        jax.tree.map(lambda x: np.asarray(x, parameter_matrix.dtype), options),
+        (*parameter_matrix, *section_states, *next_slopes),
+    )
+    _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
+    return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
+
+
+@functools.cache
+def _compile_lane_step(
+    stop_at_lift_off: bool, n_legs: int, input_indices: tuple[int, ...], n_next_slopes: int
+) -> CompiledBatchFunction:
+    """Return a compiled gait step of lanes, a function of options and inputs."""
+    n_parameters = len(PARAMETER_NAMES)
 
     def step_lanes(
-        scalar_kernel_arguments: Any, lane_step_inputs: Any, straggler_count: Array | None = None
+        options: StepOptions, lane_step_inputs: Any, straggler_count: Array | None = None
     ) -> tuple:
-        traced_options = jax.tree.unflatten(options_structure, scalar_kernel_arguments)
-        if input_indices:
-            traced_options = traced_options.with_derivative_tolerances()
+        tableau = load_explicit_tableau(options.solver)
+        assert tableau is not None  # `_select_batch_engine` has checked the solver.
+        options = options.with_derivative_tolerances() if input_indices else options
 
         def compute_step_outputs(*lane_step_inputs: Array) -> tuple:
             params = make_wheel_from_parameters(
@@ -413,7 +422,7 @@ def _step_lanes_by_kernel(
             )
             x = lane_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
             step_result, is_unfinished = advance_gait_step(
-                params, x, traced_options, solver_tableau, stop_at_lift_off, straggler_count
+                params, x, options, tableau, stop_at_lift_off, straggler_count
             )
             step_diagnostics = is_unfinished, step_result.outcome, step_result.solver_steps
             return jnp.stack([*step_result.section_state, *step_result.durations]), step_diagnostics
@@ -431,32 +440,13 @@ def _step_lanes_by_kernel(
         )
         return (*step_diagnostics, step_outputs, step_jacobian)
 
-    program_cache_key = (
-        "gait step",
-        n_legs,
-        stop_at_lift_off,
-        options_structure,
-        input_indices,
-        *("uneven" for _ in next_slopes),
-    )
-    n_kernel_inputs = N_STEP_INPUTS + len(next_slopes)
-    register_limits = (
-        simd.RegisterLimits(n_kernel_inputs) if input_indices else simd.DEFAULT_REGISTER_LIMITS
-    )
-    lane_input_arrays = [*parameter_matrix, *section_states, *next_slopes]
-    batch_program = compile_batch_program(
+    n_kernel_inputs = N_STEP_INPUTS + n_next_slopes
+    return compile_batch_function(
         step_lanes,
-        [x.dtype for x in scalar_kernel_arguments],
-        len(lane_input_arrays),
-        parameter_matrix.dtype,
-        program_cache_key,
         batch_sizes.XLA_LANE_BATCH_SIZE,
-        register_limits,
-        can_leave_lanes_unfinished=True,
+        simd.RegisterLimits(n_kernel_inputs) if input_indices else simd.DEFAULT_REGISTER_LIMITS,
+        marks_unfinished_lanes=True,
     )
-    kernel_results = batch_program(scalar_kernel_arguments, lane_input_arrays)
-    _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
-    return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
 
 
 def _step_lanes_by_diffrax(

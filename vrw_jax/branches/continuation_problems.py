@@ -257,24 +257,8 @@ def make_trial_linearizer(
             lax.map(compute_quantity_tangent, tangent_directions),
         )
 
-    make_output_template = lambda parameters, is_phase_active, z: (
-        z,
-        z,
-        *(parameters,) * (1 if gait_quantity_function is None else 3),
-    )
-    cache_key = (
-        "followed",
-        collocation_system,
-        parameter_indices,
-        gait_quantity_function.__name__ if gait_quantity_function else "",
-    )
     return unbatch(
-        compile_batch_function(
-            linearize_trial,
-            make_output_template,
-            cache_key,
-            collocation_system.cycle_options.batch_size,
-        )
+        compile_batch_function(linearize_trial, collocation_system.cycle_options.batch_size)
     )
 
 

@@ -15,7 +15,6 @@ from vrw_jax.contact.batch_integrator import pack_coordinates
 from vrw_jax.contact.impacts import project_motion
 from vrw_jax.contact.section import (
     LOCKED_CODE_OFFSET,
-    compute_full_section_size,
     compute_section_units,
     embed_section_state,
     unpack_section_state,
@@ -24,14 +23,13 @@ from vrw_jax.contact.step_record import UnilateralStep
 from vrw_jax.contact.unilateral_wheel import UnilateralWheel
 from vrw_jax.contact.walk_kernel import (
     N_PARAMETERS,
-    N_UNEVEN_GROUND_COLUMNS,
     BatchWalkSettings,
-    make_result_template,
     run_walks,
 )
 from vrw_jax.contact.walk_tangents import walk_with_tangents
 from vrw_jax.integrator import load_explicit_tableau
-from vrw_jax.numerics import StepOptions, batch_sizes, compile_batch_program
+from vrw_jax.numerics import StepOptions, batch_sizes, compile_batch_function
+from vrw_jax.simd import CompiledBatchFunction
 from vrw_jax.wheel import (
     PARAMETER_NAMES,
     ContactMode,
@@ -92,12 +90,6 @@ def step_batch_with_jacobian(
     static_walk_settings = _make_static_walk_settings(
         model, options, n_legs, True, len(input_columns)
     )
-    if len(section_states):  # The longest compilation starts first.
-        _compile_walk(
-            static_walk_settings,
-            input_columns.dtype,
-            jax.tree.structure(eqx.filter(options, eqx.is_array)),
-        )
     contact_codes = np.round(section_states[:, 4 + 2 * n_legs :]).astype(int)
     step_inputs = np.concatenate([input_columns.T, section_states], 1)
     is_tangent_needed = np.ones(step_inputs.shape, bool)
@@ -269,42 +261,34 @@ def _project_start_rates(
     The result has the shape (wheels, projected rates, rates).
     """
 
-    def compute_projected_rates(s: Symbols, section_state: Array) -> Array:
-        motion, contact_state = unpack_section_state(s, section_state)
-        return pack_coordinates(project_motion(s, motion, *contact_state[:2]))[1]
-
     repeated_states = np.repeat(section_states, 3 + n_legs, 0)
     start_rates_by_unit = np.tile(np.eye(3 + n_legs), (len(section_states), 1))
     repeated_states[:, 1:4] = start_rates_by_unit[:, :3]
     repeated_states[:, 4 + n_legs : 4 + 2 * n_legs] = start_rates_by_unit[:, 3:]
-    lane_rows = [*np.repeat(input_columns[:N_PARAMETERS], 3 + n_legs, 1), *repeated_states.T]
-    rates = _evaluate_on_lane_rows(compute_projected_rates, n_legs, lane_rows).T
-    return np.swapaxes(rates.reshape(len(section_states), 3 + n_legs, 3 + n_legs), 1, 2)
+    repeated_columns = np.repeat(input_columns[:N_PARAMETERS], 3 + n_legs, 1)
+    compiled_function = _compile_section_function(_compute_projected_rates, n_legs)
+    rates = compiled_function.run(repeated_columns, repeated_states.T)
+    rates = rates.T.reshape(len(section_states), 3 + n_legs, 3 + n_legs)
+    return np.swapaxes(rates, 1, 2)
 
 
-def _evaluate_on_lane_rows(
-    section_function: Callable[[Symbols, Array], Array], n_legs: int, lane_rows: list[np.ndarray]
-) -> np.ndarray:
-    """Return the result of a function of wheel symbols and section states for all batch elements.
+def _compute_projected_rates(s: Symbols, section_state: Array) -> Array:
+    motion, contact_state = unpack_section_state(s, section_state)
+    return pack_coordinates(project_motion(s, motion, *contact_state[:2]))[1]
 
-    `lane_rows` contains the parameters and the section state, one array (batch,) per entry. One
-    program is compiled for any number of wheels. JAX alone would compile a new program for each
-    number. The name of the function identifies the program.
+
+@functools.cache
+def _compile_section_function(
+    section_function: Callable[[Symbols, Array], Array], n_legs: int
+) -> CompiledBatchFunction:
+    """Return a compiled function of parameters and section states, from one of wheel symbols.
+
+    The arrays have the batch on their last axis. One program is compiled for any number of wheels.
     """
-
-    def evaluate_section_function(_: tuple, lane_rows: tuple) -> tuple:
-        s = compute_symbols(n_legs, *lane_rows[:N_PARAMETERS])
-        return tuple(section_function(s, jnp.stack(lane_rows[N_PARAMETERS:])))
-
-    lane_program = compile_batch_program(
-        evaluate_section_function,
-        [],
-        len(lane_rows),
-        lane_rows[0].dtype,
-        ("with unilateral contact", section_function.__name__, n_legs),
-        batch_sizes.CONTACT_XLA_BATCH_SIZE,
+    evaluate_lanes = lambda parameters, section_states: section_function(
+        compute_symbols(n_legs, *parameters), section_states
     )
-    return np.stack(lane_program([], [np.ascontiguousarray(lane_row) for lane_row in lane_rows]))
+    return compile_batch_function(evaluate_lanes, batch_sizes.CONTACT_XLA_BATCH_SIZE)
 
 
 def _make_static_walk_settings(
@@ -328,21 +312,6 @@ def _make_static_walk_settings(
     )
 
 
-def _list_input_row_counts(static_walk_settings: BatchWalkSettings) -> tuple[int, ...]:
-    """Return the numbers of entries per wheel in the input columns and in the section state.
-
-    If tangents are requested, the number of indices of their inputs follows.
-    """
-    n_columns = (
-        N_PARAMETERS
-        + 1
-        + N_UNEVEN_GROUND_COLUMNS * static_walk_settings.has_uneven_ground
-        + static_walk_settings.has_restitution
-    )
-    n_state_entries = compute_full_section_size(static_walk_settings.n_legs)
-    return n_columns, n_state_entries, *[MAX_TANGENTS_PER_LANE] * static_walk_settings.is_detailed
-
-
 def _run_walk(
     static_walk_settings: BatchWalkSettings,
     input_arrays: list[np.ndarray],
@@ -357,43 +326,13 @@ def _run_walk(
     # Neighboring lanes run as long as the slowest of them. Lanes are sorted by damping, because
     # high damping limits the step size by stability.
     lane_order = np.argsort(-input_arrays[0][PARAMETER_NAMES.index("damping")], kind="stable")
-    traced_options, options_structure = jax.tree.flatten(eqx.filter(options, eqx.is_array))
-    scalar_arguments = [np.int32(n_steps), *(np.asarray(x, dtype) for x in traced_options)]
-    lane_rows = [input_row[lane_order] for input_array in input_arrays for input_row in input_array]
-    walk_result_leaves, result_tree_structure = _flatten_result_structure(
-        static_walk_settings, dtype
+    traced_options = jax.tree.map(lambda x: np.asarray(x, dtype), eqx.filter(options, eqx.is_array))
+    walk_results = _compile_walks(static_walk_settings).run(
+        np.int32(n_steps), traced_options, *(x[:, lane_order] for x in input_arrays)
     )
-    walk_result_rows = [np.zeros((*leaf.shape, 0), leaf.dtype) for leaf in walk_result_leaves]
-    if len(lane_order):
-        walk_program = _compile_walk(static_walk_settings, dtype, options_structure)
-        walk_result_rows = walk_program(scalar_arguments, lane_rows)
     inverse_lane_order = np.argsort(lane_order, kind="stable")
-    restore_order = lambda x: np.moveaxis(np.asarray(x), -1, 0)[inverse_lane_order]
-    return jax.tree.unflatten(result_tree_structure, map(restore_order, walk_result_rows))
-
-
-@functools.cache
-def _flatten_result_structure(
-    static_walk_settings: BatchWalkSettings, dtype: np.dtype
-) -> tuple[list[Any], Any]:
-    """Return the shapes of one batch element's results as leaves, and their tree structure.
-
-    If tangents are requested, the tangents of the results follow.
-    """
-    walk_result_shapes = jax.eval_shape(
-        lambda: make_result_template(
-            static_walk_settings.n_legs, dtype, static_walk_settings.is_detailed
-        )
-    )
-    if not static_walk_settings.is_detailed:
-        return jax.tree.flatten(walk_result_shapes)
-    float_leaves = eqx.filter(
-        walk_result_shapes.step_result, lambda leaf: jnp.issubdtype(leaf.dtype, jnp.inexact)
-    )
-    add_tangent_axis = lambda leaf: jax.ShapeDtypeStruct(
-        (MAX_TANGENTS_PER_LANE, *leaf.shape), leaf.dtype
-    )
-    return jax.tree.flatten((walk_result_shapes, jax.tree.map(add_tangent_axis, float_leaves)))
+    restore_order = lambda x: np.moveaxis(x, -1, 0)[inverse_lane_order]
+    return jax.tree.map(restore_order, walk_results)
 
 
 def embed_section_states(
@@ -405,60 +344,51 @@ def embed_section_states(
     """
     if section_states.shape[1] != 3:
         return section_states
-    return _evaluate_on_lane_rows(
-        embed_section_state, n_legs, [*input_columns[:N_PARAMETERS], *section_states.T]
-    ).T
+    compiled_function = _compile_section_function(embed_section_state, n_legs)
+    return compiled_function.run(input_columns[:N_PARAMETERS], section_states.T).T
 
 
-def _compile_walk(
-    static_walk_settings: BatchWalkSettings, dtype: np.dtype, options_structure: Any
-) -> Callable[..., Any]:
-    """Return the compiled program for walks, a function of common values and arrays (batch,).
+@functools.cache
+def _compile_walks(static_walk_settings: BatchWalkSettings) -> CompiledBatchFunction:
+    run_lane_walks = functools.partial(_run_lane_walks, static_walk_settings)
+    return compile_batch_function(run_lane_walks, batch_sizes.CONTACT_XLA_BATCH_SIZE)
 
-    The number of steps is one of the values that are common to the batch.
+
+def _run_lane_walks(
+    static_walk_settings: BatchWalkSettings,
+    n_steps: Array,
+    traced_options: StepOptions,
+    input_columns: Array,
+    section_state: Array,
+    tangent_input_indices: Array | None = None,
+) -> Any:
+    """Return the results of walks, with the batch on the last axis, and their tangents if
+    requested.
+
+    - `n_steps`, `traced_options`: number of steps and options, the same for the batch;
+    - `tangent_input_indices`: index of the input of each tangent, or -1.
     """
-
-    def run_compiled_walk(scalar_arguments: tuple, lane_rows: tuple) -> tuple:
-        n_steps, *traced_options = scalar_arguments
-        options = eqx.combine(
-            jax.tree.unflatten(options_structure, traced_options), static_walk_settings.step_options
-        )
-        tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # The caller has checked the solver.
-        walk_settings = static_walk_settings._replace(
-            n_steps=n_steps, step_options=options, tableau=tableau
-        )
-        row_iterator = iter(lane_rows)
-        walk_inputs = [
-            jnp.stack([next(row_iterator) for _ in range(n_rows)])
-            for n_rows in _list_input_row_counts(static_walk_settings)
-        ]
-        if not static_walk_settings.is_detailed:
-            return tuple(jax.tree.leaves(run_walks(walk_settings, *walk_inputs)))
-        input_columns, section_state, tangent_input_indices = walk_inputs
-        # Batches have no tangent of restitution, which is the last column.
-        n_columns = len(input_columns) - static_walk_settings.has_restitution
-        input_index = np.arange(n_columns + len(section_state), dtype=np.int32)
-        if static_walk_settings.has_restitution:
-            input_index = np.insert(input_index, n_columns, -2)
-        unit_tangents = lax.optimization_barrier(
-            (tangent_input_indices[:, None] == input_index[:, None]).astype(section_state.dtype)
-        )
-        walk_result_and_tangents = walk_with_tangents(
-            walk_settings,
-            input_columns,
-            section_state,
-            unit_tangents[:, : len(input_columns)],
-            unit_tangents[:, len(input_columns) :],
-            jnp.sum(tangent_input_indices >= 0, axis=0, dtype=jnp.int32),
-        )
-        return tuple(jax.tree.leaves(walk_result_and_tangents))
-
-    return compile_batch_program(
-        run_compiled_walk,
-        [np.dtype(np.int32), *[dtype] * options_structure.num_leaves],
-        sum(_list_input_row_counts(static_walk_settings)),
-        dtype,
-        ("walk with unilateral contact", static_walk_settings),
-        batch_sizes.CONTACT_XLA_BATCH_SIZE,
+    options = eqx.combine(traced_options, static_walk_settings.step_options)
+    tableau = load_explicit_tableau(options.solver)
+    assert tableau is not None  # The caller has checked the solver.
+    walk_settings = static_walk_settings._replace(
+        n_steps=n_steps, step_options=options, tableau=tableau
+    )
+    if tangent_input_indices is None:
+        return run_walks(walk_settings, input_columns, section_state)
+    # Batches have no tangent of restitution, which is the last column.
+    n_columns = len(input_columns) - static_walk_settings.has_restitution
+    input_index = np.arange(n_columns + len(section_state), dtype=np.int32)
+    if static_walk_settings.has_restitution:
+        input_index = np.insert(input_index, n_columns, -2)
+    unit_tangents = lax.optimization_barrier(
+        (tangent_input_indices[:, None] == input_index[:, None]).astype(section_state.dtype)
+    )
+    return walk_with_tangents(
+        walk_settings,
+        input_columns,
+        section_state,
+        unit_tangents[:, : len(input_columns)],
+        unit_tangents[:, len(input_columns) :],
+        jnp.sum(tangent_input_indices >= 0, axis=0, dtype=jnp.int32),
     )

@@ -38,7 +38,6 @@ from vrw_jax.contact.walk_kernel import (
     BatchWalkResult,
     BatchWalkSettings,
     init_lane_states,
-    make_result_template,
     process_and_integrate,
     run_walks,
 )
@@ -64,24 +63,15 @@ class ContactStepConfig(NamedTuple):
     engine_name: str = "lanes"  # name of the engine in the results
     measures_force_peaks: bool = False
 
-    def make_program_key(self, *program_name: Any) -> tuple[Any, ...]:
-        """Return the key of a program in the cache of compiled code."""
-        configuration_key = str(self.argument_tree_structure), self.is_detailed
-        return (*program_name, *configuration_key, self.measures_force_peaks)
-
     def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
         """Return the argument leaves with the tighter solver tolerances for derivatives."""
         *traced_settings, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
         return tuple(jax.tree.leaves((*traced_settings, options.with_derivative_tolerances())))
 
-    def compile_lane_function(
-        self, lane_function: Callable, make_template: Callable, program_name: tuple[Any, ...]
-    ) -> Callable:
+    def compile_lane_function(self, lane_function: Callable) -> Callable:
         """Return a compiled function of one wheel from a function of a batch.
 
-        - `lane_function`: function whose arrays have the batch on the last axis;
-        - `make_template`: function that returns zeros with the structure of one wheel's results;
-        - `program_name`: key of the program in the cache of compiled code.
+        The batch is on the last axis of the arrays of `lane_function`.
         """
 
         def evaluate_one_wheel(*arrays: Any) -> Any:
@@ -90,7 +80,7 @@ class ContactStepConfig(NamedTuple):
 
         if self.uses_diffrax:
             return evaluate_one_wheel
-        return unbatch(compile_batch_function(lane_function, make_template, program_name))
+        return unbatch(compile_batch_function(lane_function))
 
     def unpack_argument_leaves(
         self, leaves: tuple[Array, ...]
@@ -119,17 +109,6 @@ class ContactStepConfig(NamedTuple):
             self.measures_force_peaks,
         )
         return walk_settings, input_columns, x
-
-    def make_template(self, *leaves: Array) -> tuple:
-        """Return zeros with the structure of the results of `compute_walk_outputs` for one
-        wheel.
-        """
-        n_legs = self.unpack_argument_leaves(leaves)[0].n_legs
-        return _partition_walk_result(
-            make_result_template(
-                n_legs, leaves[0].dtype, self.is_detailed, self.measures_force_peaks
-            )
-        )
 
     def compute_walk_outputs(self, *leaves: Array) -> tuple:
         """Return the results of one step of all batch elements, divided by
@@ -185,11 +164,7 @@ def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFuncti
     The results are divided into floating-point arrays and other arrays. All AD modes are built from
     this function.
     """
-    return step_config.compile_lane_function(
-        step_config.compute_walk_outputs,
-        step_config.make_template,
-        step_config.make_program_key("step with unilateral contact"),
-    )
+    return step_config.compile_lane_function(step_config.compute_walk_outputs)
 
 
 def build_contact_step_jacobian(
@@ -201,14 +176,7 @@ def build_contact_step_jacobian(
     results), and the other results of `build_contact_step_function`.
     """
 
-    def make_template(leaves: tuple[Array, ...], _tangents: tuple[Array, ...]) -> tuple:
-        float_outputs, nonfloat_outputs = step_config.make_template(*leaves)
-        return float_outputs, float_outputs, nonfloat_outputs
-
-    program_key = step_config.make_program_key("step with unilateral contact along directions")
-    compute_walk_tangents = unbatch(
-        compile_batch_function(step_config.compute_walk_tangents, make_template, program_key)
-    )
+    compute_walk_tangents = unbatch(compile_batch_function(step_config.compute_walk_tangents))
 
     def evaluate_jacobian(*leaves: Array) -> tuple:
         leaves = step_config.tighten_tolerances(leaves)
@@ -400,25 +368,9 @@ def build_contact_step_sampler(
             )
         return contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
 
-    begin_compiled_walk = step_config.compile_lane_function(
-        init_lane_state,
-        init_lane_state,
-        step_config.make_program_key("start with unilateral contact"),
-    )
-    make_template = lambda leaves, lane_state: (
-        lane_state,
-        ContactIntervalLog(*(lane_state.contact_interval_state.time_since_event,) * 4),
-    )
-    advance_compiled_walk = step_config.compile_lane_function(
-        advance_to_event, make_template, step_config.make_program_key("to the next event")
-    )
-    sample_compiled_intervals = unbatch(
-        compile_batch_function(
-            sample_logged_interval,
-            lambda leaves, contact_interval_log: contact_interval_log.durations,
-            step_config.make_program_key("samples with unilateral contact", n_samples),
-        )
-    )
+    begin_compiled_walk = step_config.compile_lane_function(init_lane_state)
+    advance_compiled_walk = step_config.compile_lane_function(advance_to_event)
+    sample_compiled_intervals = unbatch(compile_batch_function(sample_logged_interval))
     return jax.jit(sample_whole_step)
 
 

@@ -45,7 +45,6 @@ from vrw_jax.contact.mechanics import (
     stop_gradients,
 )
 from vrw_jax.contact.section import (
-    compute_full_section_size,
     pack_section_state,
     replace_invalid_start,
     unpack_section_state,
@@ -101,30 +100,6 @@ class BatchWalkResult(NamedTuple):
     outcome: Array
     n_stepped: Array
     n_solver_steps: Array
-
-
-def make_result_template(
-    n_legs: int, dtype: Any, is_detailed: bool, measures_force_peaks: bool = False
-) -> BatchWalkResult:
-    """Return zeros with the structure of the walk result of one wheel with `n_legs` legs.
-
-    - `is_detailed`: whether the result contains a `UnilateralStep` instead of a `GaitStepSummary`;
-    - `measures_force_peaks`: whether the `UnilateralStep` contains force peaks.
-    """
-    float_zero, int_zero = jnp.zeros((), dtype), jnp.zeros((), jnp.int32)
-    step_result: Any = GaitStepSummary(
-        jnp.zeros(compute_full_section_size(n_legs), dtype), jnp.zeros(3, dtype), float_zero
-    )
-    if is_detailed:
-        step_result = make_unilateral_step(
-            step_result,
-            jnp.zeros(N_ACCUMULATOR_ROWS, dtype),
-            init_step_counters(float_zero),
-            init_step_details(float_zero, measures_force_peaks),
-            int_zero,
-            "lanes",
-        )
-    return BatchWalkResult(step_result, int_zero, int_zero, int_zero)
 
 
 class DifferentiableLaneState(NamedTuple):

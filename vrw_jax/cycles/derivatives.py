@@ -162,27 +162,19 @@ def _zero_without_cycle(collocation_state: CollocationState, tree_over_lanes: An
 
 
 def _make_derivative_compiler(
-    function_name: str,
-    make_output_templates: tuple[Callable, ...],
-    collocation_system: CollocationSystem,
+    n_compiled_orders: int, collocation_system: CollocationSystem
 ) -> ExecutionWrapper:
     """Return a function that compiles a batch function for a given order of derivatives.
 
-    If `make_output_templates` has an entry for the order, the function uses
-    `compile_batch_function`. For higher orders it uses XLA.
+    Orders below `n_compiled_orders` become machine code. XLA computes higher orders.
     """
     batch_size = collocation_system.cycle_options.batch_size
 
     def compile_function(
         function_of_element: BatchFunction, derivative_order: int
     ) -> BatchFunction:
-        if derivative_order < len(make_output_templates):
-            return compile_batch_function(
-                function_of_element,
-                make_output_templates[derivative_order],
-                (function_name, derivative_order, collocation_system),
-                batch_size,
-            )
+        if derivative_order < n_compiled_orders:
+            return compile_batch_function(function_of_element, batch_size)
         return apply_function_in_blocks(function_of_element, batch_size)
 
     return compile_function
@@ -192,17 +184,10 @@ def _make_tangent_function(collocation_system: CollocationSystem) -> Callable:
     """Return a differentiable function that computes `_compute_collocation_tangents`
     for one wheel.
     """
-    make_output_templates = (
-        (lambda parameters, collocation_state: collocation_state),
-        (lambda parameters, solution_and_tangents: solution_and_tangents[0]),
-    )
-    compile_function = _make_derivative_compiler(
-        "columns", make_output_templates, collocation_system
-    )
     compute_tangents = with_implicit_derivative(
         functools.partial(_compute_collocation_tangents, collocation_system),
         lambda *primal_arrays: compute_tangents(*primal_arrays),
-        compile_function,
+        _make_derivative_compiler(2, collocation_system),
     )
     return compute_tangents
 
@@ -262,11 +247,8 @@ def solve_cycle_with_derivatives(
 
     The state is differentiable with respect to the parameters. The guess has no derivatives.
     """
-    make_output_template = lambda parameters, search_start, *_: search_start
     batched_search = compile_batch_function(
         functools.partial(run_search_attempts, collocation_system),
-        make_output_template,
-        ("search", collocation_system),
         collocation_system.cycle_options.batch_size,
     )
     search_one_wheel = unbatch(
@@ -303,14 +285,10 @@ def attach_monodromy_derivatives(
     """Return `monodromy_value` with the derivatives of the monodromy matrix on the
     branch of cycles.
     """
-    make_output_template = lambda parameters, solution_and_tangents: parameters
-    compile_function = _make_derivative_compiler(
-        "monodromy", (make_output_template, make_output_template), collocation_system
-    )
     compute_parameter_jacobian = make_implicit_jacobian(
         functools.partial(_compute_masked_monodromy, collocation_system),
         _make_tangent_function(collocation_system),
-        compile_function,
+        _make_derivative_compiler(2, collocation_system),
         make_jacobian=functools.partial(_compute_monodromy_tangents, collocation_system),
     )
 

@@ -190,7 +190,6 @@ class LimitCycle(AbstractCycle):
     def _locate_force_peaks(self) -> dict[str, Array]:
         return evaluate_by_saved_trace(
             self.map_over_batch_axes(functools.partial(compute_force_peaks, self.system)),
-            ("force peaks", self.system, self.outcome.ndim),
             self.parameters,
             self.collocation_state.solution,
         )

@@ -11,7 +11,6 @@ from vrw_jax.hybrid.phase_integration import (
     VectorField,
     integrate_phase,
 )
-from vrw_jax.hybrid.program_cache import get_compiled_program
 from vrw_jax.hybrid.return_map import ReturnMap
 from vrw_jax.hybrid.saltation import flow_jacobian_determinant
 from vrw_jax.hybrid.scaled_integration import (
@@ -27,6 +26,7 @@ from vrw_jax.hybrid.simulation import (
     simulate_hybrid,
     time_errors,
 )
+from vrw_jax.simd.program_cache import get_compiled_program
 
 __all__ = (
     "Guard",

@@ -13,9 +13,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from vrw_jax.hybrid.phase_integration import sample_phase
-from vrw_jax.hybrid.program_cache import call_compiled_program
 from vrw_jax.hybrid.simulation import Guard, HybridSolution, Mode, convert_modes_to_tuple
 from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
+from vrw_jax.simd.program_cache import call_compiled_program
 from vrw_jax.validation import check_reals
 
 

@@ -17,8 +17,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from vrw_jax.hybrid.phase_integration import VectorField, sample_phase
-from vrw_jax.hybrid.program_cache import call_compiled_program
 from vrw_jax.numerics import Scalar, StepOptions, forbid_reverse_mode
+from vrw_jax.simd.program_cache import call_compiled_program
 
 
 class FlowSegments(NamedTuple):

@@ -20,7 +20,6 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.hybrid.minima import GuardsAndMargins, StateArray
 from vrw_jax.hybrid.phase_integration import VectorField, integrate_phase
-from vrw_jax.hybrid.program_cache import call_compiled_program
 from vrw_jax.numerics import (
     Scalar,
     StatusCode,
@@ -31,6 +30,7 @@ from vrw_jax.numerics import (
     with_default_jax_settings,
 )
 from vrw_jax.runtime import announce_wait
+from vrw_jax.simd.program_cache import call_compiled_program
 from vrw_jax.validation import check_callable, check_int, check_reals, check_type
 
 MAX_STORED_NUMBERS = 100_000_000

@@ -42,11 +42,6 @@ from vrw_jax.models.phase_sequence import (
 )
 from vrw_jax.models.step_results import (
     AdvanceResult,
-    DoubleSupportIndicators,
-    EnergyLoss,
-    Margins,
-    RequiredFriction,
-    StepResult,
     Trajectory,
 )
 from vrw_jax.numerics import (
@@ -287,62 +282,47 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
     return is_solver_explicit and simd.is_machine_code_available() and options.engine != "diffrax"
 
 
-class StepTraceConfig(NamedTuple):
-    """Static settings on which the traced program of a batch of walking steps depends."""
+def run_lane_phases(
+    argument_structure: Any,
+    stop_at_lift_off: bool,
+    records_margins: bool,
+    argument_leaves: Sequence[Array],
+) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
+    """Integrate the phases of one walking step for each batch element.
 
-    argument_structure: Any  # tree structure of the arguments, such as (params, x, options)
-    stop_at_lift_off: bool
-    friction: float | None = None  # friction of the margins; None for the minimal results
+    The leaves are those of (params, x, options), with the batch on their last axis. Return the
+    starts and ends of all phases, the Butcher tableau and the solver options.
+    """
+    params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
+    tableau = load_explicit_tableau(options.solver)
+    assert tableau is not None  # `can_use_batch_kernel` has checked the solver.
+    phase_sequence = run_batch_phases(
+        params,
+        tuple(x),
+        options,
+        tableau,
+        stop_at_lift_off,
+        records_margins,
+        is_compiled_separately=True,
+    )
+    return phase_sequence, tableau, options
 
-    def compile_for_one_wheel(
-        self,
-        batch_function: BatchFunction,
-        make_template: BatchFunction,
-        *trace_key: Any,
-        register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
-    ) -> BatchFunction:
-        """Compile a function of a batch of steps, and return it as a function of one wheel.
 
-        - `make_template`: function that returns arrays with the structure of the results;
-        - `trace_key`: objects whose `repr` identifies the function together with these settings.
-        """
-        settings_key = str(self.argument_structure), self.stop_at_lift_off, self.friction
-        return unbatch(
-            compile_batch_function(
-                batch_function,
-                make_template,
-                (*trace_key, *settings_key),
-                register_limits=register_limits,
-            )
+def make_step_outputs_function(
+    argument_structure: Any, stop_at_lift_off: bool, friction: float | None
+) -> BatchFunction:
+    """Return a function that computes the results of a batch of walking steps from the leaves of
+    (params, x, options).
+
+    The results are split into float arrays and other arrays.
+
+    - `friction`: friction coefficient of the margins; None for the minimal results.
+    """
+
+    def compute_step_outputs(*argument_leaves: Array) -> tuple:
+        phase_sequence, *_ = run_lane_phases(
+            argument_structure, stop_at_lift_off, friction is not None, argument_leaves
         )
-
-    def run_lane_phases(
-        self, *argument_leaves: Array
-    ) -> tuple[PhaseSequenceResult, ButcherTableau, StepOptions]:
-        """Integrate the phases of one walking step for each batch element.
-
-        The arrays in `argument_leaves` have the batch on their last axis. Return the starts and
-        ends of all phases, the Butcher tableau and the solver options.
-        """
-        params, x, options = jax.tree.unflatten(self.argument_structure, argument_leaves)
-        tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # `can_use_batch_kernel` has checked the solver.
-        phase_sequence = run_batch_phases(
-            params,
-            tuple(x),
-            options,
-            tableau,
-            self.stop_at_lift_off,
-            self.friction is not None,
-            is_compiled_separately=True,
-        )
-        return phase_sequence, tableau, options
-
-    def compute_step_outputs(self, *argument_leaves: Array) -> tuple:
-        """Return the results of a batch of walking steps, split into float arrays and other
-        arrays.
-        """
-        phase_sequence, friction = self.run_lane_phases(*argument_leaves)[0], self.friction
         if friction is None:
             return eqx.partition(make_advance_result(phase_sequence, "lanes"), eqx.is_inexact_array)
         phase_end_results = tuple(
@@ -357,56 +337,37 @@ class StepTraceConfig(NamedTuple):
         )(float_phase_sequence)
         return eqx.partition(step_result, eqx.is_inexact_array)
 
-    def make_output_template(self, *argument_leaves: Array) -> tuple:
-        """Return placeholder arrays for one wheel, with the structure of the results of
-        `compute_step_outputs`.
-        """
-        x = argument_leaves[0]
-        zero_codes = jnp.zeros_like(x, jnp.int32)
-        template: dict[str, Any] = {
-            "section_state": jnp.broadcast_to(x, (3, *x.shape)),
-            "durations": jnp.broadcast_to(x, (3, *x.shape)),
-            "outcome": zero_codes,
-            "solver_steps": zero_codes,
-            "engine": "lanes",
-        }
-        if self.friction is None:
-            return eqx.partition(AdvanceResult(**template), eqx.is_inexact_array)
-        make_group = lambda group: group(*(x for _ in dataclasses.fields(group)))
-        step_result_template = StepResult(
-            post_impact=jnp.broadcast_to(x, (2, *x.shape)),
-            step_length=x,
-            indicators=make_group(DoubleSupportIndicators),
-            margins=make_group(Margins),
-            required_friction=make_group(RequiredFriction),
-            energy=make_group(EnergyLoss),
-            **template,
-        )
-        return eqx.partition(step_result_template, eqx.is_inexact_array)
+    return compute_step_outputs
 
 
-def build_step_function(step_trace_config: StepTraceConfig) -> ForwardFunction:
+def build_step_function(
+    argument_structure: Any, stop_at_lift_off: bool, friction: float | None
+) -> ForwardFunction:
     """Return a function that computes the results of a walking step from the leaves of (params, x,
     options).
 
     The results are split into float arrays and other arrays. The function serves as a forward-mode
     rule, from which all AD modes are derived.
     """
-    return step_trace_config.compile_for_one_wheel(
-        step_trace_config.compute_step_outputs, step_trace_config.make_output_template, "gait step"
+    return unbatch(
+        compile_batch_function(
+            make_step_outputs_function(argument_structure, stop_at_lift_off, friction)
+        )
     )
 
 
-def build_step_finisher(step_trace_config: StepTraceConfig, phase_index: int) -> BatchFunction:
+def build_step_finisher(
+    argument_structure: Any, stop_at_lift_off: bool, phase_index: int
+) -> BatchFunction:
     """Return a function that computes the results of `finish_gait_step` from a list of leaves.
 
-    The leaves are those of (params, distance, state, options), whose pytree structure is that of
-    `step_trace_config`. The results are split into float arrays and other arrays.
+    The leaves are those of (params, distance, state, options), whose pytree structure is
+    `argument_structure`. The results are split into float arrays and other arrays.
     """
 
     def compute_finish_outputs(*argument_leaves: Array) -> tuple:
         params, foot_distance, phase_state, options = jax.tree.unflatten(
-            step_trace_config.argument_structure, argument_leaves
+            argument_structure, argument_leaves
         )
         tableau = load_explicit_tableau(options.solver)
         assert tableau is not None  # checked by `can_use_batch_kernel`
@@ -417,24 +378,26 @@ def build_step_finisher(step_trace_config: StepTraceConfig, phase_index: int) ->
             foot_distance,
             tuple(phase_state),
             options,
-            step_trace_config.stop_at_lift_off,
+            stop_at_lift_off,
             "lanes",
         )
         return eqx.partition(remaining_step_result, eqx.is_inexact_array)
 
-    return step_trace_config.compile_for_one_wheel(
-        compute_finish_outputs, step_trace_config.make_output_template, "end of a step", phase_index
-    )
+    return unbatch(compile_batch_function(compute_finish_outputs))
 
 
-def build_step_sampler(step_trace_config: StepTraceConfig, n_samples: int) -> BatchFunction:
+def build_step_sampler(
+    argument_structure: Any, stop_at_lift_off: bool, n_samples: int
+) -> BatchFunction:
     """Return a function that samples a walking step at `n_samples` equidistant times of each phase.
 
     The arguments of the function are the leaves of (params, x, options).
     """
 
     def sample_lane_steps(*argument_leaves: Array) -> Trajectory:
-        phase_sequence, tableau, options = step_trace_config.run_lane_phases(*argument_leaves)
+        phase_sequence, tableau, options = run_lane_phases(
+            argument_structure, stop_at_lift_off, False, argument_leaves
+        )
         phase_samples = [
             sample_batch_phase(
                 make_batch_phase(phase, False),
@@ -453,20 +416,14 @@ def build_step_sampler(step_trace_config: StepTraceConfig, n_samples: int) -> Ba
         ]
         return make_trajectory(phase_sequence, phase_samples)
 
-    def make_trajectory_template(x: Array, *_: Array) -> Trajectory:
-        n = n_samples
-        array_shapes = ((n,), (n, 6), (n, 4), (n, 3), (), ())
-        templates = [jnp.broadcast_to(x, (3, *shape, *x.shape)) for shape in array_shapes]
-        templates.append(jnp.zeros_like(x, jnp.int32))
-        return Trajectory(*templates)
-
-    return step_trace_config.compile_for_one_wheel(
-        sample_lane_steps, make_trajectory_template, "samples", n_samples
-    )
+    return unbatch(compile_batch_function(sample_lane_steps))
 
 
 def build_step_jacobian(
-    step_trace_config: StepTraceConfig, input_indices: tuple[int, ...]
+    argument_structure: Any,
+    stop_at_lift_off: bool,
+    friction: float | None,
+    input_indices: tuple[int, ...],
 ) -> ForwardFunction:
     """Return a function that computes a walking step and the Jacobian of its results.
 
@@ -474,30 +431,25 @@ def build_step_jacobian(
     the float results, the float results, and all other results. The Jacobian is with respect to the
     leaves at `input_indices`.
     """
-
-    def make_jacobian_template(*argument_leaves: Array) -> tuple:
-        float_outputs, nonfloat_outputs = step_trace_config.make_output_template(*argument_leaves)
-        return float_outputs, float_outputs, nonfloat_outputs
-
-    lane_jacobian_function = lambda *leaves: compute_jacobian_columns(
-        step_trace_config.compute_step_outputs, leaves, input_indices
+    compute_step_outputs = make_step_outputs_function(
+        argument_structure, stop_at_lift_off, friction
+    )
+    compute_lane_jacobian = lambda *leaves: compute_jacobian_columns(
+        compute_step_outputs, leaves, input_indices
     )
 
     def evaluate_step_jacobian(*argument_leaves: Array) -> tuple:
-        params, x, options = jax.tree.unflatten(
-            step_trace_config.argument_structure, argument_leaves
-        )
+        params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
         n_jacobian_columns = sum(math.prod(jnp.shape(argument_leaves[i])) for i in input_indices)
-        jacobian_column_function = step_trace_config.compile_for_one_wheel(
-            lane_jacobian_function,
-            make_jacobian_template,
-            "gait step with derivatives",
-            input_indices,
-            register_limits=simd.RegisterLimits(
-                N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
-            ),
+        compute_columns = unbatch(
+            compile_batch_function(
+                compute_lane_jacobian,
+                register_limits=simd.RegisterLimits(
+                    N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
+                ),
+            )
         )
-        jacobian_columns, float_outputs, nonfloat_outputs = jacobian_column_function(
+        jacobian_columns, float_outputs, nonfloat_outputs = compute_columns(
             *jax.tree.leaves((params, x, options.with_derivative_tolerances()))
         )
         return (

@@ -21,7 +21,6 @@ from vrw_jax.hybrid import (
     sample_phase_in_scaled_units,
 )
 from vrw_jax.models.batch_step import (
-    StepTraceConfig,
     build_step_finisher,
     build_step_function,
     build_step_jacobian,
@@ -150,8 +149,8 @@ class ViscoelasticWheel(AbstractWheel):
     ) -> Trajectory:
         if can_use_batch_kernel(options):
             argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
-            step_trace_config = StepTraceConfig(argument_structure, self.stop_at_lift_off)
-            return build_step_sampler(step_trace_config, n_samples)(*argument_leaves)
+            sample_step = build_step_sampler(argument_structure, self.stop_at_lift_off, n_samples)
+            return sample_step(*argument_leaves)
         phase_sequence = self._run_phases(params, x, options, records_margins=False)
         phase_samples = []
         for phase, phase_start, phase_end in zip(
@@ -192,8 +191,9 @@ class ViscoelasticWheel(AbstractWheel):
             argument_leaves, argument_structure = jax.tree.flatten(
                 (params, jnp.asarray(foot_distance), phase_state, options)
             )
-            step_trace_config = StepTraceConfig(argument_structure, self.stop_at_lift_off)
-            step_finisher = build_step_finisher(step_trace_config, phase_index)
+            step_finisher = build_step_finisher(
+                argument_structure, self.stop_at_lift_off, phase_index
+            )
             return eqx.combine(*step_finisher(*argument_leaves))
         return finish_gait_step(
             _make_diffrax_phase_runner(options, records_margins=False),
@@ -275,11 +275,13 @@ def _compile_step_function(
     )
     if engine_name == "diffrax":
         return enable_all_ad_modes(diffrax_step_function, tight_diffrax_step_function)
-    step_trace_config = StepTraceConfig(
-        argument_structure, model.stop_at_lift_off, model.friction if records_margins else None
+    settings = (
+        argument_structure,
+        model.stop_at_lift_off,
+        model.friction if records_margins else None,
     )
     return enable_all_ad_modes(
-        build_step_function(step_trace_config),
+        build_step_function(*settings),
         tight_diffrax_step_function,
-        functools.partial(build_step_jacobian, step_trace_config),
+        functools.partial(build_step_jacobian, *settings),
     )

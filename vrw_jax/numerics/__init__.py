@@ -3,17 +3,6 @@ automatic differentiation and for batches.
 """
 
 from vrw_jax.numerics import batch_sizes
-from vrw_jax.numerics.autodiff import (
-    ExecutionWrapper,
-    ForwardFunction,
-    apply_jacobian,
-    compute_square_root,
-    enable_all_ad_modes,
-    evaluate_with_jacobian,
-    make_implicit_jacobian,
-    make_zero_tangent,
-    with_implicit_derivative,
-)
 from vrw_jax.numerics.batch_algebra import (
     FusionBarrierFn,
     LaneArray,
@@ -26,8 +15,28 @@ from vrw_jax.numerics.batch_algebra import (
     solve_node_equations,
     sum_with_weights,
 )
-from vrw_jax.numerics.batch_programs import compile_batch_program
-from vrw_jax.numerics.batching import (
+from vrw_jax.numerics.cubic_minima import (
+    evaluate_cubic,
+    find_cubic_minimum,
+    refine_minimum_location,
+)
+from vrw_jax.numerics.forward_only import forbid_reverse_mode
+from vrw_jax.numerics.options import EngineName, SolverName, StepOptions, make_real_field
+from vrw_jax.numerics.status_codes import StatusCode, describe_step_ending
+from vrw_jax.numerics.trigonometry import compute_sine_cosine
+from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
+from vrw_jax.simd.autodiff import (
+    ExecutionWrapper,
+    ForwardFunction,
+    apply_jacobian,
+    compute_square_root,
+    enable_all_ad_modes,
+    evaluate_with_jacobian,
+    make_implicit_jacobian,
+    make_zero_tangent,
+    with_implicit_derivative,
+)
+from vrw_jax.simd.batching import (
     BatchFunction,
     apply_function_in_blocks,
     concatenate_tree_rows,
@@ -41,20 +50,6 @@ from vrw_jax.numerics.batching import (
     select_trees_by_condition,
     unbatch,
 )
-from vrw_jax.numerics.cached_programs import (
-    compile_batch_function,
-    compile_cached_lane_program,
-    compile_exported_function,
-    evaluate_by_saved_trace,
-)
-from vrw_jax.numerics.cubic_minima import (
-    evaluate_cubic,
-    find_cubic_minimum,
-    refine_minimum_location,
-)
-from vrw_jax.numerics.forward_only import forbid_reverse_mode
-from vrw_jax.numerics.options import EngineName, SolverName, StepOptions, make_real_field
-from vrw_jax.numerics.settings import with_default_jax_settings
-from vrw_jax.numerics.status_codes import StatusCode, describe_step_ending
-from vrw_jax.numerics.trigonometry import compute_sine_cosine
-from vrw_jax.numerics.types import Elementwise, RealInput, Scalar, Vector
+from vrw_jax.simd.lane_function import compile_batch_function
+from vrw_jax.simd.saved_traces import compile_exported_function, evaluate_by_saved_trace
+from vrw_jax.simd.settings import with_default_jax_settings

@@ -17,8 +17,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vrw_jax import simd
-from vrw_jax.numerics.settings import with_default_jax_settings
 from vrw_jax.numerics.types import Vector
+from vrw_jax.simd.settings import with_default_jax_settings
 
 LaneArray = Float[Array, "... lanes"]
 

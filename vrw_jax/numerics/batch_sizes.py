@@ -5,8 +5,6 @@ there are several sizes, a batch is padded to the smallest size that can contain
 compiled once.
 """
 
-import jax
-
 DIFFRAX_BATCH_SIZE = 256
 """Number of walking steps that one call with the diffrax engine computes. The value is chosen
 because the loop of this engine runs until the slowest element ends.
@@ -54,10 +52,6 @@ SCAN_BATCH_SIZE = 512
 """Number of samples of a scan that one call computes, fixed so that the results for a sample do not
 depend on other samples.
 """
-GPU_GAIT_BATCH_SIZE = 32_768
-"""Number of limit cycles of the paper's model that a GPU computes together. The value is chosen
-because an H100 GPU finds 40 times as many gaits per second as with batches of 64.
-"""
 GPU_SCAN_BATCH_SIZE = 4096
 """Number of samples of a scan that one call on a GPU computes, chosen because it is the default
 size of a chunk.
@@ -72,14 +66,3 @@ SCAN_CHUNK_SIZE = 4096
 """Default number of samples of a scan that are written together. A scan that is killed may lose as
 many samples.
 """
-
-
-def choose_batch_size(cpu_batch_size: int, gpu_batch_size: int) -> int:
-    """Return the batch size for JAX's default device.
-
-    - `cpu_batch_size`: batch size on a CPU, at which arrays stay in the processor's cache;
-    - `gpu_batch_size`: smallest batch size on another device, which needs many batch elements.
-    """
-    if jax.default_backend() == "cpu":
-        return cpu_batch_size
-    return max(cpu_batch_size, gpu_batch_size)

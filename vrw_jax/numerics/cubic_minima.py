@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.numerics.batching import select_trees_by_condition
+from vrw_jax.simd.batching import select_trees_by_condition
 
 MINIMUM_LOCATION_TOLERANCE = 1e-6
 """Accuracy of the location of a minimum, as a fraction of the solver step. The value is chosen

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.numerics.settings import with_default_jax_settings
 from vrw_jax.numerics.types import Elementwise
+from vrw_jax.simd.settings import with_default_jax_settings
 
 MAX_EXACT_ANGLE = 1.6
 """Largest angle for which the polynomials are accurate to round-off, rad. The value is chosen

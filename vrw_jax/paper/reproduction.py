@@ -13,8 +13,8 @@ import xarray as xr
 from jaxtyping import Array
 
 from vrw_jax import figures as plots
-from vrw_jax.paper import facts
 from vrw_jax.paper.facts.base import PaperEvidence, PaperFact
+from vrw_jax.paper.facts.table import compute_paper_facts, write_facts_files
 from vrw_jax.paper.gaits import (
     make_formally_continued_model,
     measure_gaits_along_parameter,
@@ -181,8 +181,8 @@ def reproduce_paper(
     on_progress(0.8, "figures")
     write_paper_figures(paper_evidence, folder)
     on_progress(0.98, "table of facts")
-    paper_facts = facts.compute_paper_facts(paper_evidence)
-    facts.write_facts_files(paper_facts, folder)
+    paper_facts = compute_paper_facts(paper_evidence)
+    write_facts_files(paper_facts, folder)
     indicator_table = paper_evidence.damping_branch.drop_dims(["leg", "component"]).to_dataframe()
     indicator_table.to_csv(folder / "indicators.csv", float_format="%.10g")
     on_progress(1.0, "done")

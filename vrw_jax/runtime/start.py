@@ -8,7 +8,8 @@ from pathlib import Path
 
 import jax
 
-from vrw_jax.runtime import disk_cache as store
+from vrw_jax.simd import disk_cache as store
+from vrw_jax.simd.settings import FUSION_EMITTERS_FLAG, accepts_fusion_emitters_flag
 from vrw_jax.validation import check_bool, check_path
 
 
@@ -61,27 +62,5 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     xla_flags = os.environ.get("XLA_FLAGS", "")
     # XLA reads the flags when the first array is created.
-    if _accepts_fusion_emitters_flag() and _FUSION_EMITTERS_FLAG not in xla_flags:
-        os.environ["XLA_FLAGS"] = f"{xla_flags} --{_FUSION_EMITTERS_FLAG}=false".strip()
-
-
-def make_fusion_emitter_options(are_fusion_emitters_enabled: bool) -> dict[str, str | bool]:
-    """Return options for `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
-
-    Without fusion emitters, XLA compiles in half to two thirds of the time. The compiled code is as
-    fast, except for events with unilateral contact, where it is slower by a seventh. Programs whose
-    digits must not depend on the process always set this option.
-    """
-    can_set_emitters_flag = _accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
-    return {_FUSION_EMITTERS_FLAG: are_fusion_emitters_enabled} if can_set_emitters_flag else {}
-
-
-_FUSION_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
-
-
-def _accepts_fusion_emitters_flag() -> bool:
-    """Return whether this version of XLA accepts the flag for fusion emitters.
-
-    A version that does not accept the flag may abort the process on receiving it.
-    """
-    return jax.__version_info__[:2] in ((0, 9), (0, 10))
+    if accepts_fusion_emitters_flag() and FUSION_EMITTERS_FLAG not in xla_flags:
+        os.environ["XLA_FLAGS"] = f"{xla_flags} --{FUSION_EMITTERS_FLAG}=false".strip()

@@ -33,6 +33,7 @@ from vrw_jax.scans.measure_catalog import (
     ValuesByVariable,
     parse_derivative,
 )
+from vrw_jax.simd.batching import choose_batch_size
 from vrw_jax.wheel import PARAMETER_NAMES, Outcome, WheelParams, make_wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
@@ -98,8 +99,9 @@ class CollocationScanEngine:
         differentiated_parameter_indices = np.asarray(
             list(map(PARAMETER_NAMES.index, differentiation_parameters)), int
         )
+        n_legs = base_wheel.n_legs
         gait_finder = make_finder(
-            wheel_model, base_wheel.n_legs, cycle_options=cycle_options, step_options=step_options
+            wheel_model, n_legs, cycle_options=cycle_options, step_options=step_options
         )
 
         def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
@@ -148,9 +150,7 @@ class CollocationScanEngine:
             state.
             """
             step_result = wheel_model.take_step(
-                make_wheel_from_parameters(parameter_values, base_wheel.n_legs),
-                section_state,
-                step_options,
+                make_wheel_from_parameters(parameter_values, n_legs), section_state, step_options
             )
             step_measures = {
                 measure_name: measure_value
@@ -164,11 +164,7 @@ class CollocationScanEngine:
         self._evaluate_step_batch: Callable = jax.vmap(
             evaluate_confirming_step, in_axes=(0, 0, None)
         )
-        # The repr of a model omits fields whose value is the default object itself, and a pickled
-        # copy is another object.
-        model_identity = (type(wheel_model).__name__, *vars(wheel_model).items())
-        self._program_cache_key = (measure_names, base_wheel.n_legs, model_identity, cycle_options)
-        self._batch_size = batch_sizes.choose_batch_size(
+        self._batch_size = choose_batch_size(
             batch_sizes.SCAN_BATCH_SIZE, batch_sizes.GPU_SCAN_BATCH_SIZE
         )
         self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
@@ -244,9 +240,8 @@ class CollocationScanEngine:
         compile_function = with_default_jax_settings(compile_exported_function)
         step_options = self._evaluation_request.step_options
         scan_program_specifications = (
-            ("cycle", self._evaluate_cycle_batch, (parameter_rows_shape,)),
+            (self._evaluate_cycle_batch, (parameter_rows_shape,)),
             (
-                "step",
                 self._evaluate_step_batch,
                 (parameter_rows_shape, section_states_shape, step_options),
             ),
@@ -254,14 +249,8 @@ class CollocationScanEngine:
         with ThreadPoolExecutor(2) as scan_thread_pool:
             futures_by_device = {
                 device: [
-                    scan_thread_pool.submit(
-                        compile_function,
-                        batch_function,
-                        arguments,
-                        (program_name, *self._program_cache_key),
-                        device,
-                    )
-                    for program_name, batch_function, arguments in scan_program_specifications
+                    scan_thread_pool.submit(compile_function, batch_function, arguments, device)
+                    for batch_function, arguments in scan_program_specifications
                 ]
                 for device in local_devices
             }

@@ -339,10 +339,10 @@ class PassageScanEngine:
                 )
             # Hardly any step of the walks succeeds if `first_passage` raises an error.
             with contextlib.suppress(ValueError):
-                # mypy takes the name for the module `robustness.first_passage`.
+                assert self._slope_standard_deviation is not None  # The measures need it.
                 passage_result = first_passage(
                     params, self._slope_standard_deviation, model=wheel_model
-                )  # type: ignore[operator]
+                )
                 measures_by_name = {
                     "mean_steps": passage_result.mean_steps,
                     "mean_steps_error": passage_result.error,

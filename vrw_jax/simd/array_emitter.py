@@ -521,22 +521,26 @@ def get_shape_without_lanes(aval: Any) -> tuple[int, ...]:
     return aval.shape[:-1] if has_lane_axis(aval) else aval.shape
 
 
-def make_lane_axis_error(error_subject: str, aval: Any) -> NotImplementedError:
+class LaneAxisError(NotImplementedError):
+    """Error of a function that is not elementwise over lanes, which XLA cannot compute either."""
+
+
+def make_lane_axis_error(error_subject: str, aval: Any) -> LaneAxisError:
     """Return the error for an axis that has the length of the lane axis without being the last
     axis.
 
     - `error_subject`: subject of the message, such as "An argument".
     """
-    return NotImplementedError(
+    return LaneAxisError(
         f"{error_subject} has the shape {aval.str_short()}: an axis of {LANE_AXIS_SENTINEL} is "
         "the lanes', which come from arguments and stay the last; keep them there, and give other "
         "axes another length."
     )
 
 
-def make_lane_mixing_error(primitive_name: str) -> NotImplementedError:
+def make_lane_mixing_error(primitive_name: str) -> LaneAxisError:
     """Return the error for a primitive that would combine lanes or move the lane axis."""
-    return NotImplementedError(
+    return LaneAxisError(
         f"{primitive_name} moves, joins or selects lanes: do the same to each lane; only `any` and "
         "`all` may combine them."
     )

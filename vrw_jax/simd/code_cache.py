@@ -11,17 +11,19 @@ import contextlib
 import gc
 import hashlib
 import json
+import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from threading import RLock
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
+from vrw_jax.simd import disk_cache
 from vrw_jax.simd.array_emitter import RegisterLimits
 from vrw_jax.simd.kernel import LANE_KERNEL_NAME, write_llvm_kernel
 from vrw_jax.simd.machine import (
@@ -29,23 +31,6 @@ from vrw_jax.simd.machine import (
     describe_compiler_settings,
     require_object_file,
 )
-
-
-@runtime_checkable
-class CodeStore(Protocol):
-    """Store of machine code that several processes share.
-
-    The store is an object or a module with two functions.
-    """
-
-    def load_cache_record(self, cache_record_name: str) -> bytes | None:
-        """Return the bytes that are saved under `cache_record_name`, or None if no undamaged record
-        has that name.
-        """
-
-    def save_cache_record(self, cache_record_name: str, cache_record_content: bytes) -> None:
-        """Save `cache_record_content` under the name `cache_record_name`."""
-
 
 ResultShapesAndDtypes = tuple[tuple[tuple[int, ...], np.dtype], ...]
 """For each result of machine code, the lengths of all axes before the lanes, and the dtype."""
@@ -59,82 +44,124 @@ class MachineCode(NamedTuple):
     object_code_future: Future[bytes]
 
 
-def get_machine_code(
+class LaneProgram(NamedTuple):
+    """Machine code of a function, and the tree structure of the function's results."""
+
+    machine_code: MachineCode
+    result_structure: Any
+
+
+def get_lane_program(
     lane_function: Callable,
     argument_shapes: Any,
-    trace_key: object,
+    function_key: str | None,
     lanes_per_group: int,
-    code_store: CodeStore | None,
     register_limits: RegisterLimits,
-) -> MachineCode:
-    """Return machine code for a function over lanes.
+) -> LaneProgram:
+    """Return machine code for a function of arrays with lanes on the last axis.
 
-    The code is taken from this process or from `code_store`. If neither contains it, the function
+    The code is taken from this process or from the disk cache. If neither contains it, the function
     is traced, and compiled in the background.
 
     - `argument_shapes`: shapes and dtypes of the arguments;
-    - `trace_key`: object whose `repr` identifies all other inputs of the trace;
+    - `function_key`: key of the function, see `keys.make_key`; None if it has none, so that it is
+      traced at each call and never saved;
     - `lanes_per_group`: number of lanes that the code computes at a time.
     """
-    code_index_key = (
-        trace_key,
-        argument_shapes,
+    if function_key is None:
+        return _compile_lane_program(
+            lane_function, argument_shapes, None, lanes_per_group, register_limits
+        )
+    index_key = (
+        function_key,
+        [(x.shape, x.dtype.name, bool(getattr(x, "weak_type", False))) for x in argument_shapes],
         lanes_per_group,
         register_limits,
-        jax.__version__,
+        disk_cache.describe_trace_environment(),
         describe_compiler_settings(),
     )
-    code_index_name = f"lanes_index_{hashlib.sha256(repr(code_index_key).encode()).hexdigest()}"
-    if code_index_name in _machine_code_by_record_name:
-        return _machine_code_by_record_name[code_index_name]
-    machine_code = None
-    encoded_ffi_target_name = (
-        code_store.load_cache_record(code_index_name) if code_store is not None else None
-    )
-    if encoded_ffi_target_name:
-        ffi_target_name = encoded_ffi_target_name.decode("ascii", "replace")
-        machine_code = load_machine_code(ffi_target_name, code_store)
-    if machine_code is None:
-        with _jax_tracing_lock, _pause_garbage_collection():
-            closed_jaxpr = trace_for_machine_code(lane_function, *argument_shapes)
-            llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
-        encoded_result_types = json.dumps(
-            [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
+    index_name = f"lanes_index_{hashlib.sha256(repr(index_key).encode()).hexdigest()}"
+    if index_name not in _lane_program_by_index_name:
+        _lane_program_by_index_name[index_name] = _load_lane_program(
+            index_name
+        ) or _compile_lane_program(
+            lane_function, argument_shapes, index_name, lanes_per_group, register_limits
         )
-        digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
-        ffi_target_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
-
-        def compile_and_save_code() -> bytes:
-            object_code = compile_llvm_for_processor(llvm_text)
-            if code_store is not None:
-                encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
-                code_store.save_cache_record(ffi_target_name, encoded_machine_code)
-                code_store.save_cache_record(code_index_name, ffi_target_name.encode())
-            return object_code
-
-        # Another trace may have given the same LLVM text.
-        machine_code = load_machine_code(ffi_target_name, code_store)
-        if machine_code is None:
-            machine_code = _machine_code_by_record_name[ffi_target_name] = MachineCode(
-                ffi_target_name,
-                _parse_result_shapes_and_dtypes(encoded_result_types),
-                _llvm_compiler_pool.submit(compile_and_save_code),
-            )
-        elif code_store is not None:
-            code_store.save_cache_record(code_index_name, ffi_target_name.encode())
-    _machine_code_by_record_name[code_index_name] = machine_code
-    return machine_code
+    return _lane_program_by_index_name[index_name]
 
 
-def load_machine_code(ffi_target_name: str, code_store: CodeStore | None) -> MachineCode | None:
-    """Return the machine code named `ffi_target_name` from this process or from `code_store`.
+def _load_lane_program(index_name: str) -> LaneProgram | None:
+    """Return the program that an index record names, or None."""
+    encoded_name, _, pickled_skeleton = (disk_cache.load_cache_record(index_name) or b"").partition(
+        b"\n"
+    )
+    if not pickled_skeleton:
+        return None
+    try:
+        skeleton = pickle.loads(pickled_skeleton)
+        machine_code = load_machine_code(encoded_name.decode("ascii"))
+    except Exception:  # Damaged bytes may raise any exception.
+        disk_cache.warn_of_unusable_cache_record(f"{index_name} is no index of code")
+        return None
+    return machine_code and LaneProgram(machine_code, jax.tree.structure(skeleton))
+
+
+def _compile_lane_program(
+    lane_function: Callable,
+    argument_shapes: Any,
+    index_name: str | None,
+    lanes_per_group: int,
+    register_limits: RegisterLimits,
+) -> LaneProgram:
+    """Trace a function, and compile it in the background unless its LLVM text is known."""
+    with _jax_tracing_lock, _pause_garbage_collection():
+        closed_jaxpr, result_structure = trace_for_machine_code(lane_function, *argument_shapes)
+        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
+    encoded_result_types = json.dumps(
+        [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
+    )
+    digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
+    code_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
+    is_saved = index_name is not None
+
+    def save_index() -> None:
+        skeleton = jax.tree.unflatten(result_structure, range(result_structure.num_leaves))
+        with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
+            if index_name is not None:  # A class inside a function cannot be pickled.
+                disk_cache.save_cache_record(
+                    index_name, code_name.encode() + b"\n" + pickle.dumps(skeleton)
+                )
+
+    def compile_and_save_code() -> bytes:
+        object_code = compile_llvm_for_processor(llvm_text)
+        if is_saved:
+            encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
+            disk_cache.save_cache_record(code_name, encoded_machine_code)
+            save_index()
+        return object_code
+
+    # Another trace may have given the same LLVM text.
+    machine_code = (
+        load_machine_code(code_name) if is_saved else _machine_code_by_name.get(code_name)
+    )
+    if machine_code is None:
+        machine_code = _machine_code_by_name[code_name] = MachineCode(
+            code_name,
+            _parse_result_shapes_and_dtypes(encoded_result_types),
+            _llvm_compiler_pool.submit(compile_and_save_code),
+        )
+    else:
+        save_index()
+    return LaneProgram(machine_code, result_structure)
+
+
+def load_machine_code(code_name: str) -> MachineCode | None:
+    """Return the machine code named `code_name` from this process or from the disk cache.
 
     Return None if neither contains the code.
     """
-    if ffi_target_name not in _machine_code_by_record_name:
-        cache_record_content = (
-            code_store.load_cache_record(ffi_target_name) if code_store is not None else None
-        )
+    if code_name not in _machine_code_by_name:
+        cache_record_content = disk_cache.load_cache_record(code_name)
         if cache_record_content is None:
             return None
         encoded_result_types, _, object_code = cache_record_content.partition(b"\n")
@@ -146,23 +173,22 @@ def load_machine_code(ffi_target_name: str, code_store: CodeStore | None) -> Mac
             TypeError,
         ) as damage_error:  # LLVM would end the process on such a file.
             warnings.warn(
-                f"{ffi_target_name} holds no machine code ({damage_error}): compiled again.",
+                f"{code_name} holds no machine code ({damage_error}): compiled again.",
                 stacklevel=2,
             )
             return None
         object_code_future: Future[bytes] = Future()
         object_code_future.set_result(object_code)
-        _machine_code_by_record_name[ffi_target_name] = MachineCode(
-            ffi_target_name, result_shapes_and_dtypes, object_code_future
+        _machine_code_by_name[code_name] = MachineCode(
+            code_name, result_shapes_and_dtypes, object_code_future
         )
-    return _machine_code_by_record_name[ffi_target_name]
+    return _machine_code_by_name[code_name]
 
 
-_machine_code_by_record_name: dict[str, MachineCode] = {}
-"""Machine code of this process, by the name of its index record and by its code name.
-
-Programs that are traced for several batch sizes share the code.
-"""
+_machine_code_by_name: dict[str, MachineCode] = {}
+"""Machine code of this process by its name. Programs with the same LLVM text share the code."""
+_lane_program_by_index_name: dict[str, LaneProgram] = {}
+"""Programs of this process by the name of their index record."""
 
 
 @contextlib.contextmanager
@@ -199,15 +225,21 @@ def _parse_result_shapes_and_dtypes(encoded_result_types: str | bytes) -> Result
     )
 
 
-def trace_for_machine_code(lane_function: Callable, *argument_shapes: Any) -> ClosedJaxpr:
-    """Return the jaxpr of a function for arguments with the shapes and dtypes `argument_shapes`.
+def trace_for_machine_code(
+    lane_function: Callable, *argument_shapes: Any
+) -> tuple[ClosedJaxpr, Any]:
+    """Return the jaxpr of a function for arguments with the shapes and dtypes `argument_shapes`,
+    and the tree structure of its results.
 
     During the trace, `targets_machine_code` returns True.
     """
     tracing_flag_token = _is_tracing_for_machine_code.set(True)
     try:  # The loops are traced in this mesh, so that JAX's trace cache finds them again.
         with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
-            return jax.make_jaxpr(lane_function)(*argument_shapes)
+            closed_jaxpr, result_shapes = jax.make_jaxpr(lane_function, return_shape=True)(
+                *argument_shapes
+            )
+            return closed_jaxpr, jax.tree.structure(result_shapes)
     finally:
         _is_tracing_for_machine_code.reset(tracing_flag_token)
 

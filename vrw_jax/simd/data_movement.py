@@ -152,6 +152,34 @@ def emit_unstacked_arrays(
     return [take_axis_slice(slice_position) for slice_position in range(len(equation.outvars))]
 
 
+def emit_split_arrays(
+    jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
+) -> list[LlvmArray]:
+    """Return the parts of an array that follow each other along one axis."""
+    (array,), split_axis = operands, equation.params["axis"]
+    if split_axis == len(array.shape):
+        raise make_lane_mixing_error("split")
+    array_emitter = jaxpr_lowering.array_emitter
+    part_starts = np.cumsum([0, *equation.params["sizes"]]).tolist()
+
+    def take_part(part_start: int, part_length: int) -> LlvmArray:
+        part_index = (*[slice(None)] * split_axis, slice(part_start, part_start + part_length))
+        if isinstance(array, np.ndarray):
+            return array[part_index]
+        part_shape = (*array.shape[:split_axis], part_length, *array.shape[split_axis + 1 :])
+        get_part_entry = lambda entry_index: array_emitter.get_array_entry(
+            array,
+            (
+                *entry_index[:split_axis],
+                array_emitter.emit_affine_index(entry_index[split_axis], part_start),
+                *entry_index[split_axis + 1 :],
+            ),
+        )
+        return LazyArray(part_shape, array.entry_type, get_part_entry)
+
+    return list(map(take_part, part_starts, equation.params["sizes"]))
+
+
 def emit_optimization_barrier(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:

@@ -10,6 +10,7 @@ from vrw_jax.simd.array_emitter import (
     DEFAULT_REGISTER_LIMITS,
     LANE_AXIS_SENTINEL,
     ArrayEmitter,
+    LaneAxisError,
     RegisterLimits,
     has_lane_axis,
     make_lane_axis_error,
@@ -155,7 +156,7 @@ class _LaneGroupAccess:
         Raise a NotImplementedError unless the last axis is the lane axis.
         """
         if not has_lane_axis(aval):
-            raise NotImplementedError(
+            raise LaneAxisError(
                 f"A result has the shape {aval.str_short()}, the same for all lanes: compute it "
                 "outside, or add zeros of the lanes."
             )

@@ -8,6 +8,7 @@ from typing import Any
 from vrw_jax.simd.array_emitter import (
     LANE_AXIS_SENTINEL,
     ArrayEmitter,
+    LaneAxisError,
     get_shape_without_lanes,
     split_into_entry_arrays,
 )
@@ -88,7 +89,7 @@ def emit_scan_loop(
     stacked_output_avals = [x.aval for x in equation.outvars[n_carried_arrays:]]
     scanned_operands = operands[n_loop_constants + n_carried_arrays :]
     if n_iterations == LANE_AXIS_SENTINEL and (stacked_output_avals or scanned_operands):
-        raise NotImplementedError(
+        raise LaneAxisError(
             f"scan reads or writes along an axis of {LANE_AXIS_SENTINEL}, which is the lanes': "
             "do the same to each lane, and give other axes another length."
         )

@@ -1,11 +1,4 @@
-"""Compilation of functions over lanes (elements of a batch) to machine code for CPUs.
-
-XLA on a CPU generates a loop over all lanes for every few operations, and stores intermediate
-results in memory. XLA's `while` loop runs until the slowest of hundreds of lanes ends. Here the
-trace of the whole function becomes one loop over groups of a few lanes, compiled by LLVM. The
-values of a group stay in registers, and the loops of a group end with its slowest lane. A later
-process neither traces nor compiles code that a store contains.
-"""
+"""Machine code that runs: on NumPy arrays by all cores, or called by saved JAX programs."""
 
 import ctypes
 import functools
@@ -21,9 +14,9 @@ import numpy as np
 from vrw_jax.simd import fallback
 from vrw_jax.simd.array_emitter import DEFAULT_REGISTER_LIMITS, LANE_AXIS_SENTINEL, RegisterLimits
 from vrw_jax.simd.code_cache import (
-    CodeStore,
+    LaneProgram,
     MachineCode,
-    get_machine_code,
+    get_lane_program,
     load_machine_code,
     trace_for_machine_code,
 )
@@ -40,8 +33,8 @@ from vrw_jax.simd.machine import (
     has_512_bit_vectors,
 )
 
-LANES_PER_256_BITS = {np.dtype(np.float64): 4, np.dtype(np.float32): 8}
-"""Number of lanes in 256 bits for each float type.
+LANES_PER_256_BITS = {8: 4, 4: 8}
+"""Number of lanes in 256 bits by the size of a number in bytes.
 
 A vector has 256 bits, or 512 bits on processors with such registers.
 """
@@ -50,6 +43,12 @@ LANE_GROUPS_PER_TASK = 64
 
 The value is chosen because the start of a task then takes a negligible time.
 """
+
+
+ArgumentTypes = tuple[tuple[tuple[int, ...] | None, np.dtype], ...]
+"""Shapes without lanes and dtypes of arguments. The shape of a number without lanes is None."""
+GetProgram = Callable[[ArgumentTypes, int], LaneProgram]
+"""Function that returns machine code for types of arguments and a number of lanes per group."""
 
 
 def is_machine_code_available() -> bool:
@@ -70,12 +69,17 @@ def is_machine_code_available() -> bool:
 @functools.cache
 def _can_xla_call_machine_code() -> bool:
     """Return whether XLA can call machine code: whether a small test succeeds."""
-    increment_program = compile_lane_function(
-        lambda x: x + 1.0, lambda x: x, "interface check", None
+    get_program = lambda argument_types, lanes_per_group: get_lane_program(
+        lambda x: x + 1.0,
+        make_argument_shapes(argument_types),
+        None,
+        lanes_per_group,
+        DEFAULT_REGISTER_LIMITS,
     )
+    increment = lambda x: call_machine_code(get_program, [x])
     with jax.ensure_compile_time_eval():
         try:
-            test_program_results = jax.jit(increment_program)(jnp.arange(3.0))
+            test_program_results = jax.jit(increment)(jnp.arange(3.0))
         except Exception as call_error:  # XLA and LLVM may raise any exception.
             fallback.disable_machine_code(call_error)
             return False
@@ -85,55 +89,127 @@ def _can_xla_call_machine_code() -> bool:
     return True
 
 
-def compile_lane_program(
-    lane_function: Callable[..., tuple],
-    scalar_dtypes: Sequence[np.dtype],
-    n_lane_arrays: int,
-    lane_dtype: np.dtype,
-    trace_key: object,
-    code_store: CodeStore | None,
-    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
-) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """Return a compiled program that computes `lane_function(scalars, lanes)`.
+def make_argument_shapes(argument_types: ArgumentTypes) -> list[jax.ShapeDtypeStruct]:
+    """Return the shapes and dtypes for which a function of lanes is traced."""
+    return [
+        jax.ShapeDtypeStruct(() if shape is None else (*shape, LANE_AXIS_SENTINEL), dtype)
+        for shape, dtype in argument_types
+    ]
 
-    The function must be elementwise over lanes, except for loops that end when no lane continues.
-    It returns a flat tuple of arrays whose last axis is the lane axis.
 
-    The program takes `n_lane_arrays` NumPy arrays of any equal length, and returns a list of
-    arrays. The results of a lane are bitwise the same whatever the other lanes are. The program
-    uses all cores available to the process.
+def count_lanes_per_256_bits(argument_leaves: Sequence[Any]) -> int:
+    """Return how many lanes of the widest floating-point argument fit into 256 bits."""
+    sizes = [x.dtype.itemsize for x in argument_leaves if x.dtype.kind == "f"]
+    return LANES_PER_256_BITS[max(sizes) if sizes else jnp.zeros(()).dtype.itemsize]
 
-    - `scalar_dtypes`: dtypes of the scalars;
-    - `lane_dtype`: float type of the arrays;
-    - `trace_key`: object whose `repr` identifies everything on which the trace depends except
-      shapes: the values in the function's closure, and its source;
-    - `code_store`: store that saves the code; None saves nothing;
-    - `register_limits`: limits that decide which arrays are in registers.
+
+def call_machine_code(get_program: GetProgram, argument_leaves: Sequence[Any]) -> Any:
+    """Return the results of a function, computed by machine code that a JAX program calls.
+
+    The last axis of the arguments is the lane axis. The first array must have lanes; scalars are
+    the same for all lanes. A single lane has separate code, which computes no
+    other lanes and gives the same bits. The call has no derivatives, works on CPUs only, and uses
+    one core.
+    """
+    n_lanes = argument_leaves[0].shape[-1]
+    for argument_shape in map(jnp.shape, argument_leaves):
+        if argument_shape and argument_shape[-1] != n_lanes:
+            raise ValueError(
+                f"An argument has the shape {argument_shape}, but the first one has {n_lanes} "
+                "lanes: give every array the same number on its last axis, or a number without "
+                "axes."
+            )
+    lanes_per_group = count_lanes_per_256_bits(argument_leaves)
+    if has_512_bit_vectors():
+        lanes_per_group *= 2
+    # A single lane has separate code, because a full group would compute lanes that are not
+    # needed.
+    if n_lanes == 1:
+        lanes_per_group = 1
+    n_padding_lanes = -n_lanes % lanes_per_group
+    argument_types = tuple((x.shape[:-1] if x.ndim else None, x.dtype) for x in argument_leaves)
+    lane_program = get_program(argument_types, lanes_per_group)
+    if n_padding_lanes:
+        pad_with_last_lane = lambda x: jnp.concatenate(
+            [x, jnp.repeat(x[..., -1:], n_padding_lanes, -1)], -1
+        )
+        argument_leaves = [pad_with_last_lane(x) if jnp.ndim(x) else x for x in argument_leaves]
+    padded_result_shapes = tuple(
+        jax.ShapeDtypeStruct((*shape_without_lanes, n_lanes + n_padding_lanes), result_dtype)
+        for shape_without_lanes, result_dtype in lane_program.machine_code.result_shapes_and_dtypes
+    )
+    padded_results = MACHINE_CODE_PRIMITIVE.bind(
+        *argument_leaves, machine_code=lane_program.machine_code, result_shapes=padded_result_shapes
+    )
+    return jax.tree.unflatten(
+        lane_program.result_structure, [x[..., :n_lanes] for x in padded_results]
+    )
+
+
+def run_machine_code(get_program: GetProgram, argument_leaves: Sequence[np.ndarray]) -> Any:
+    """Return the results of a function of NumPy arrays, computed on all cores of the process.
+
+    The last axis of the arrays is the lane axis; arrays without axes are the same for all lanes.
+    The results of a lane are bitwise the same whatever the other lanes are.
     """
     # The group has two vectors of 256 bits, so that one computes during the latency of the other.
-    lanes_per_group = 2 * LANES_PER_256_BITS[lane_dtype]
-    argument_shapes = (
-        tuple(jax.ShapeDtypeStruct((), scalar_dtype) for scalar_dtype in scalar_dtypes),
-        (jax.ShapeDtypeStruct((LANE_AXIS_SENTINEL,), lane_dtype),) * n_lane_arrays,
-    )
-    try:
-        return _LoadedLaneProgram(
-            get_machine_code(
-                lane_function,
-                argument_shapes,
-                trace_key,
-                lanes_per_group,
-                code_store,
-                register_limits,
-            ),
-            lanes_per_group,
-        )
-    except Exception as compilation_error:
-        _reraise_on_tested_release(compilation_error)
-    xla_program = jax.jit(lane_function)
-    return lambda scalar_arguments, lane_arrays: [
-        np.asarray(x) for x in xla_program(tuple(scalar_arguments), tuple(lane_arrays))
+    lanes_per_group = 2 * count_lanes_per_256_bits(argument_leaves)
+    n_lanes = next(x.shape[-1] for x in argument_leaves if x.ndim)
+    argument_types = tuple((x.shape[:-1] if x.ndim else None, x.dtype) for x in argument_leaves)
+    lane_program = get_program(argument_types, lanes_per_group)
+    machine_code = lane_program.machine_code
+    n_lane_groups = -(-n_lanes // lanes_per_group)
+    n_padded_lanes = n_lane_groups * lanes_per_group
+    pad_lanes = lambda x: [(0, 0)] * (x.ndim - 1) + [(0, n_padded_lanes - n_lanes)]
+    # The last lane is repeated until the last group is full.
+    padded_arguments = [
+        np.pad(x, pad_lanes(x), "edge")
+        if x.ndim and n_padded_lanes > n_lanes
+        else np.ascontiguousarray(x)
+        for x in argument_leaves
     ]
+    padded_results = [
+        np.empty((*shape_without_lanes, n_padded_lanes), result_dtype)
+        for shape_without_lanes, result_dtype in machine_code.result_shapes_and_dtypes
+    ]
+    run_lane_kernel = _load_lane_kernel(machine_code.ffi_target_name, machine_code)
+    input_pointer_table = _make_pointer_table(padded_arguments)
+    output_pointer_table = _make_pointer_table(padded_results)
+    compute_lane_groups_of_task = lambda first_lane_group: run_lane_kernel(
+        input_pointer_table,
+        output_pointer_table,
+        n_padded_lanes,
+        first_lane_group,
+        min(first_lane_group + LANE_GROUPS_PER_TASK, n_lane_groups),
+    )
+    first_lane_groups_of_tasks = range(0, n_lane_groups, LANE_GROUPS_PER_TASK)
+    if len(first_lane_groups_of_tasks) > 1 and count_available_cores() > 1:
+        with ThreadPoolExecutor(count_available_cores()) as thread_pool:
+            list(thread_pool.map(compute_lane_groups_of_task, first_lane_groups_of_tasks))
+    else:
+        for first_lane_group in first_lane_groups_of_tasks:
+            compute_lane_groups_of_task(first_lane_group)
+    return jax.tree.unflatten(
+        lane_program.result_structure, [x[..., :n_lanes] for x in padded_results]
+    )
+
+
+_lane_kernels: dict[str, tuple[Callable, LoadedMachineCode]] = {}
+"""Kernels that are loaded for calls with NumPy arrays, by the name of their code."""
+
+
+def _load_lane_kernel(code_name: str, machine_code: MachineCode) -> Callable:
+    if code_name not in _lane_kernels:
+        loaded_code = LoadedMachineCode(machine_code.object_code_future.result())
+        c_function_type = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, *[ctypes.c_int64] * 3)
+        run_lane_kernel = c_function_type(loaded_code.find_function_address(LANE_KERNEL_NAME))
+        _lane_kernels[code_name] = run_lane_kernel, loaded_code
+    return _lane_kernels[code_name][0]
+
+
+def _make_pointer_table(numpy_arrays: Sequence[np.ndarray]) -> Any:
+    """Return a C array of pointers to the data of the NumPy arrays."""
+    return (ctypes.c_void_p * len(numpy_arrays))(*(x.ctypes.data for x in numpy_arrays))
 
 
 def compile_wasm_object(
@@ -156,164 +232,24 @@ def compile_wasm_object(
         jax.ShapeDtypeStruct((n, LANE_AXIS_SENTINEL), np.float64) for n in n_rows_by_array
     ]
     argument_shapes = [jax.ShapeDtypeStruct((), np.float64)] * n_scalars + lane_array_shapes
+    closed_jaxpr, _ = trace_for_machine_code(lane_function, *argument_shapes)
     return compile_llvm_for_webassembly(
-        write_llvm_kernel(
-            trace_for_machine_code(lane_function, *argument_shapes), 2, register_limits
-        ),
+        write_llvm_kernel(closed_jaxpr, 2, register_limits),
         LANE_KERNEL_NAME,
         exported_function_name,
     )
 
 
-def compile_lane_function(
-    lane_function: Callable[..., Any],
-    result_shape_function: Callable[..., Any],
-    trace_key: object,
-    code_store: CodeStore | None,
-    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
-) -> Callable[..., Any]:
-    """Return a function that calls `lane_function`, compiled to machine code, from JAX programs.
-
-    The returned function takes trees of arrays whose last axis is the lane axis. The first array
-    must have lanes; scalars are the same for all lanes. The result is a tree of the structure that
-    `result_shape_function` returns, which should be fast to trace. `trace_key`, `code_store` and
-    `register_limits` are as in `compile_lane_program`. A single lane has separate code, which
-    computes no other lanes and gives the same bits. The call has no derivatives, works on CPUs
-    only, and uses one core.
-    """
-
-    def call_compiled_function(*argument_trees: Any) -> Any:
-        argument_leaves, argument_structure = jax.tree.flatten(argument_trees)
-        n_lanes = argument_leaves[0].shape[-1]
-        for argument_shape in map(jnp.shape, argument_leaves):
-            if argument_shape and argument_shape[-1] != n_lanes:
-                raise ValueError(
-                    f"An argument has the shape {argument_shape}, but the first one has {n_lanes} "
-                    "lanes: give every array the same number on its last axis, or a number without "
-                    "axes."
-                )
-        lanes_per_group = LANES_PER_256_BITS[np.dtype(argument_leaves[0].dtype)]
-        if has_512_bit_vectors():
-            lanes_per_group *= 2
-        # A single lane has separate code, because a full group would compute lanes that are not
-        # needed.
-        if n_lanes == 1:
-            lanes_per_group = 1
-        n_padding_lanes = -n_lanes % lanes_per_group
-        lane_argument_shapes = [
-            jax.ShapeDtypeStruct(
-                (*x.shape[:-1], LANE_AXIS_SENTINEL) if jnp.ndim(x) else (), jnp.result_type(x)
-            )
-            for x in argument_leaves
-        ]
-        flat_lane_function = lambda *argument_leaves: jax.tree.leaves(
-            lane_function(*jax.tree.unflatten(argument_structure, argument_leaves))
-        )
-        try:
-            machine_code = get_machine_code(
-                flat_lane_function,
-                lane_argument_shapes,
-                (trace_key, str(argument_structure)),
-                lanes_per_group,
-                code_store,
-                register_limits,
-            )
-        except Exception as compilation_error:
-            _reraise_on_tested_release(compilation_error)
-            return lane_function(*argument_trees)
-        if n_padding_lanes:
-            pad_with_last_lane = lambda x: jnp.concatenate(
-                [x, jnp.repeat(x[..., -1:], n_padding_lanes, -1)], -1
-            )
-            argument_leaves = [pad_with_last_lane(x) if jnp.ndim(x) else x for x in argument_leaves]
-        padded_result_shapes = tuple(
-            jax.ShapeDtypeStruct((*shape_without_lanes, n_lanes + n_padding_lanes), result_dtype)
-            for shape_without_lanes, result_dtype in machine_code.result_shapes_and_dtypes
-        )
-        padded_results = MACHINE_CODE_PRIMITIVE.bind(
-            *argument_leaves, machine_code=machine_code, result_shapes=padded_result_shapes
-        )
-        result_structure = jax.tree.structure(
-            jax.eval_shape(result_shape_function, *argument_trees)
-        )
-        return jax.tree.unflatten(result_structure, [x[..., :n_lanes] for x in padded_results])
-
-    return call_compiled_function
-
-
-def _reraise_on_tested_release(compilation_error: Exception) -> None:
-    """Raise the error on a tested release of JAX. On any other release, disable machine code
-    instead.
-    """
-    if fallback.is_tested_jax_release():
-        raise compilation_error
-    fallback.disable_machine_code(compilation_error)
-
-
-def load_saved_machine_code(ffi_target_names: Sequence[str], code_store: CodeStore | None) -> bool:
-    """Load the saved machine code of all `ffi_target_names`, so that JAX programs can call it.
+def load_saved_machine_code(code_names: Sequence[str]) -> bool:
+    """Load the saved machine code of all `code_names`, so that JAX programs can call it.
 
     Return whether the code of every name is available.
     """
-    for ffi_target_name in set(ffi_target_names) - LOADED_CODE_BY_FFI_TARGET.keys():
-        machine_code = load_machine_code(ffi_target_name, code_store)
+    for code_name in set(code_names) - LOADED_CODE_BY_FFI_TARGET.keys():
+        machine_code = load_machine_code(code_name)
         if machine_code is not None:
             register_machine_code(machine_code)
-    return LOADED_CODE_BY_FFI_TARGET.keys() >= set(ffi_target_names)
-
-
-class _LoadedLaneProgram:
-    """Callable that runs loaded machine code on NumPy arrays."""
-
-    def __init__(self, machine_code: MachineCode, lanes_per_group: int) -> None:
-        self.result_shapes_and_dtypes = machine_code.result_shapes_and_dtypes
-        self.lanes_per_group = lanes_per_group
-        self._loaded_code = LoadedMachineCode(machine_code.object_code_future.result())
-        c_function_type = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2, *[ctypes.c_int64] * 3)
-        self._run_lane_kernel = c_function_type(
-            self._loaded_code.find_function_address(LANE_KERNEL_NAME)
-        )
-
-    def __call__(
-        self, scalar_arguments: Sequence[Any], lane_arrays: Sequence[np.ndarray]
-    ) -> list[np.ndarray]:
-        n_lanes = len(lane_arrays[0])
-        n_lane_groups = -(-n_lanes // self.lanes_per_group)
-        n_padded_lanes = n_lane_groups * self.lanes_per_group
-        # The last lane is repeated until the last group is full.
-        padded_lane_arrays = [
-            np.concatenate([x, np.full(n_padded_lanes - n_lanes, x[-1])])
-            if n_padded_lanes > n_lanes
-            else np.ascontiguousarray(x)
-            for x in lane_arrays
-        ]
-        scalar_arrays = [np.asarray(x) for x in scalar_arguments]
-        padded_results = [
-            np.empty((*shape_without_lanes, n_padded_lanes), result_dtype)
-            for shape_without_lanes, result_dtype in self.result_shapes_and_dtypes
-        ]
-        input_pointer_table = _make_pointer_table([*scalar_arrays, *padded_lane_arrays])
-        output_pointer_table = _make_pointer_table(padded_results)
-        compute_lane_groups_of_task = lambda first_lane_group: self._run_lane_kernel(
-            input_pointer_table,
-            output_pointer_table,
-            n_padded_lanes,
-            first_lane_group,
-            min(first_lane_group + LANE_GROUPS_PER_TASK, n_lane_groups),
-        )
-        first_lane_groups_of_tasks = range(0, n_lane_groups, LANE_GROUPS_PER_TASK)
-        if len(first_lane_groups_of_tasks) > 1 and count_available_cores() > 1:
-            with ThreadPoolExecutor(count_available_cores()) as thread_pool:
-                list(thread_pool.map(compute_lane_groups_of_task, first_lane_groups_of_tasks))
-        else:
-            for first_lane_group in first_lane_groups_of_tasks:
-                compute_lane_groups_of_task(first_lane_group)
-        return [x[..., :n_lanes] for x in padded_results]
-
-
-def _make_pointer_table(numpy_arrays: Sequence[np.ndarray]) -> Any:
-    """Return a C array of pointers to the data of the NumPy arrays."""
-    return (ctypes.c_void_p * len(numpy_arrays))(*(x.ctypes.data for x in numpy_arrays))
+    return LOADED_CODE_BY_FFI_TARGET.keys() >= set(code_names)
 
 
 def count_available_cores() -> int:

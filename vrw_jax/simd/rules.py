@@ -94,6 +94,7 @@ PRIMITIVE_RULES: dict[str, PrimitiveRule] = {
     **dict.fromkeys(CALLED_JAXPR_PARAMETERS, emit_called_jaxpr),
     "optimization_barrier": data_movement.emit_optimization_barrier,
     "scan": loops.emit_scan_loop,
+    "split": data_movement.emit_split_arrays,
     "unstack": data_movement.emit_unstacked_arrays,
     "while": loops.emit_while_loop,
 }

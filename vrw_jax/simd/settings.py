@@ -8,6 +8,9 @@ import jax
 
 FunctionType = TypeVar("FunctionType", bound=Callable[..., Any])
 
+FUSION_EMITTERS_FLAG = "xla_cpu_use_fusion_emitters"
+"""Flag of XLA that switches its fusion emitters for CPUs."""
+
 
 def with_default_jax_settings(function: FunctionType) -> FunctionType:
     """Return a function that runs `function` with JAX's default settings.
@@ -42,3 +45,22 @@ def with_default_jax_settings(function: FunctionType) -> FunctionType:
             raise interruption.with_traceback(None) from None
 
     return call_with_default_settings  # type: ignore[return-value]
+
+
+def make_fusion_emitter_options(are_fusion_emitters_enabled: bool) -> dict[str, str | bool]:
+    """Return options for `jax.jit` that switch XLA's fusion emitters on or off on a CPU.
+
+    Without fusion emitters, XLA compiles in half to two thirds of the time. The compiled code is as
+    fast, except for events with unilateral contact, where it is slower by a seventh. Programs whose
+    digits must not depend on the process always set this option.
+    """
+    can_set_emitters_flag = accepts_fusion_emitters_flag() and jax.default_backend() == "cpu"
+    return {FUSION_EMITTERS_FLAG: are_fusion_emitters_enabled} if can_set_emitters_flag else {}
+
+
+def accepts_fusion_emitters_flag() -> bool:
+    """Return whether this version of XLA accepts the flag for fusion emitters.
+
+    A version that does not accept the flag may abort the process on receiving it.
+    """
+    return jax.__version_info__[:2] in ((0, 9), (0, 10))

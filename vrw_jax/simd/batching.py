@@ -17,11 +17,26 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-from vrw_jax.numerics.batch_sizes import GPU_GAIT_BATCH_SIZE, choose_batch_size
-from vrw_jax.numerics.settings import with_default_jax_settings
+from vrw_jax.simd.settings import with_default_jax_settings
 
 BatchFunction = Callable[..., PyTree[Array]]
 """Function of arrays whose last axis is the batch."""
+
+GPU_BLOCK_SIZE = 32_768
+"""Number of batch elements that one call on a GPU computes. The value is chosen because an H100 GPU
+finds 40 times as many gaits per second as with batches of 64.
+"""
+
+
+def choose_batch_size(cpu_batch_size: int, gpu_batch_size: int) -> int:
+    """Return the batch size for JAX's default device.
+
+    - `cpu_batch_size`: batch size on a CPU, at which arrays stay in the processor's cache;
+    - `gpu_batch_size`: smallest batch size on another device, which needs many batch elements.
+    """
+    if jax.default_backend() == "cpu":
+        return cpu_batch_size
+    return max(cpu_batch_size, gpu_batch_size)
 
 
 def unbatch(function: BatchFunction) -> BatchFunction:
@@ -63,10 +78,10 @@ def apply_function_in_blocks(function: BatchFunction, block_size: int) -> BatchF
     """Return a function that applies `function` to `block_size` batch elements at a time.
 
     The arrays of a block stay in the processor's cache. A GPU takes larger blocks, of
-    `GPU_GAIT_BATCH_SIZE` elements. The first array must have the batch axis. Scalars are the same
+    `GPU_BLOCK_SIZE` elements. The first array must have the batch axis. Scalars are the same
     for all elements.
     """
-    block_size = choose_batch_size(block_size, GPU_GAIT_BATCH_SIZE)
+    block_size = choose_batch_size(block_size, GPU_BLOCK_SIZE)
 
     def evaluate_blockwise(*arrays: PyTree) -> PyTree:
         n_lanes = jax.tree.leaves(arrays)[0].shape[-1]

@@ -19,8 +19,8 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from vrw_jax.numerics.batching import BatchFunction, unbatch
-from vrw_jax.numerics.settings import with_default_jax_settings
+from vrw_jax.simd.batching import BatchFunction, unbatch
+from vrw_jax.simd.settings import with_default_jax_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """Function of floating-point arrays that returns (float outputs, other outputs without
@@ -32,6 +32,8 @@ def enable_all_ad_modes(
     function: ForwardFunction,
     function_to_differentiate: ForwardFunction | None = None,
     make_jacobian: Callable[[tuple[int, ...]], ForwardFunction] | None = None,
+    compile_jacobian: Callable[[ForwardFunction, tuple], ForwardFunction] | None = None,
+    differentiated_arguments: tuple[tuple[int, ...], ...] = (),
 ) -> ForwardFunction:
     """Return `function` with derivatives in forward and reverse mode, to any order.
 
@@ -40,8 +42,11 @@ def enable_all_ad_modes(
     differentiated. If `function_to_differentiate` is given, derivatives are those of this function,
     which may for example use tighter tolerances. `make_jacobian(argnums)` may provide another
     function that returns (Jacobians with respect to the arguments `argnums`, float outputs), and
-    the other outputs. Function and Jacobians are compiled once each: outside of `jit`, forward
-    mode, reverse mode and single directions all call the same compiled Jacobian.
+    the other outputs. `compile_jacobian` compiles Jacobians of any order; its second argument are
+    the `argnums` of each order. Function and Jacobians are compiled once each: outside of `jit`,
+    forward mode, reverse mode and single directions all call the same compiled Jacobian.
+
+    - `differentiated_arguments`: `argnums` of the orders that `function` already has.
     """
     compiled_function = jax.jit(function)
     wrapped_function = jax.custom_jvp(compiled_function)
@@ -59,6 +64,14 @@ def enable_all_ad_modes(
             )
             return (argument_jacobians, float_outputs), nonfloat_outputs
 
+        if compile_jacobian is not None:
+            argnums_by_order = (*differentiated_arguments, argnums)
+            return enable_all_ad_modes(
+                compile_jacobian(compute_argument_jacobians, argnums_by_order),
+                compute_argument_jacobians,
+                compile_jacobian=compile_jacobian,
+                differentiated_arguments=argnums_by_order,
+            )
         if make_jacobian is None:
             return enable_all_ad_modes(compute_argument_jacobians)
         return enable_all_ad_modes(make_jacobian(argnums), compute_argument_jacobians)

@@ -7,36 +7,36 @@ contains traces. The key of a trace contains everything on which the trace depen
 library's source code.
 """
 
+import functools
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import export
 from jax.sharding import SingleDeviceSharding
 
-from vrw_jax import simd
-from vrw_jax.numerics.batching import BatchFunction, apply_function_in_blocks
-from vrw_jax.runtime import disk_cache as store
-from vrw_jax.runtime import make_fusion_emitter_options
+from vrw_jax.simd import disk_cache as store
+from vrw_jax.simd.ffi_primitive import MACHINE_CODE_PRIMITIVE
+from vrw_jax.simd.keys import UnresolvableFunctionError, make_key
+from vrw_jax.simd.machine import describe_processor
+from vrw_jax.simd.program import is_machine_code_available, load_saved_machine_code
+from vrw_jax.simd.settings import make_fusion_emitter_options
 
 
 def compile_exported_function(
     traced_function: Callable,
     example_arguments: tuple,
-    trace_key_settings: object,
     target_device: jax.Device,
 ) -> Callable:
     """Compile `traced_function` on `target_device` for the shapes of `example_arguments`.
 
-    The `repr` of `trace_key_settings` identifies the values in the function's closure. The program
-    is always compiled from the exported trace, whether it was loaded from disk or not. All runs
-    therefore compile the same program.
+    The program is always compiled from the exported trace, whether it was loaded from disk or not.
+    All runs therefore compile the same program.
     """
-    exported_trace = _load_or_export_trace(traced_function, example_arguments, trace_key_settings)
+    exported_trace = _load_or_export_trace(traced_function, example_arguments)
     device_sharding = SingleDeviceSharding(target_device)
     argument_shapes = [
         jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device_sharding)
@@ -50,19 +50,21 @@ def compile_exported_function(
     return lambda *arguments: compiled_program(*jax.tree.leaves(arguments))
 
 
-def wrap_with_saved_trace(traced_function: Callable, trace_key_settings: object) -> Callable:
+def wrap_with_saved_trace(
+    traced_function: Callable, find_key: Callable[..., str | None] | None = None
+) -> Callable:
     """Return a function that calls `traced_function` through its saved trace.
 
     If no trace exists yet, it is exported and saved. Without a cache folder, `traced_function` is
     called directly. The returned function is called while a program is traced, and it must not be
     mapped or differentiated. As with `compile_exported_function`, first and later runs use the
-    exported trace.
+    exported trace. `find_key` returns the key of the function and of further values.
     """
 
     def evaluate_saved_trace(*arguments: Any) -> Any:
         if _is_exporting_trace.get() or not store.find_cache_folder():
             return traced_function(*arguments)
-        return _load_or_export_trace(traced_function, arguments, trace_key_settings).call(
+        return _load_or_export_trace(traced_function, arguments, find_key).call(
             *jax.tree.leaves(arguments)
         )
 
@@ -70,12 +72,10 @@ def wrap_with_saved_trace(traced_function: Callable, trace_key_settings: object)
 
 
 _saved_programs: dict[str, Callable] = {}
-"""Functions compiled from their saved traces, by all settings on which the traces depend."""
+"""Functions compiled from their saved traces, by their keys."""
 
 
-def evaluate_by_saved_trace(
-    traced_function: Callable, trace_key_settings: object, *arguments: Any
-) -> Any:
+def evaluate_by_saved_trace(traced_function: Callable, *arguments: Any) -> Any:
     """Return `traced_function(*arguments)`, computed from the saved trace of the function.
 
     Arguments that JAX traces call the function itself, which may then be mapped or differentiated.
@@ -83,63 +83,19 @@ def evaluate_by_saved_trace(
     """
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
         return traced_function(*arguments)
-    program_key = repr((trace_key_settings, store.describe_trace_environment()))
+    try:
+        program_key = make_key(traced_function, store.describe_trace_environment())
+    except UnresolvableFunctionError:
+        return jax.jit(traced_function)(*arguments)
     if program_key not in _saved_programs:
-        _saved_programs[program_key] = jax.jit(
-            wrap_with_saved_trace(traced_function, trace_key_settings)
-        )
+        _saved_programs[program_key] = jax.jit(wrap_with_saved_trace(traced_function))
     return _saved_programs[program_key](*arguments)
 
 
-def compile_cached_lane_program(
-    lane_function: Callable,
-    scalar_dtypes: Sequence[np.dtype],
-    n_lane_arrays: int,
-    lane_dtype: np.dtype,
-    trace_key_settings: Any,
-    register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
-) -> Callable[[Sequence[Any], Sequence[np.ndarray]], list[np.ndarray]]:
-    """Compile a function with `simd.compile_lane_program`, and save the machine code in the disk
-    cache.
-
-    `trace_key_settings` has the same meaning as for `compile_exported_function`.
-    """
-    trace_key = (trace_key_settings, store.describe_trace_environment())
-    return simd.compile_lane_program(
-        lane_function, scalar_dtypes, n_lane_arrays, lane_dtype, trace_key, store, register_limits
-    )
-
-
-def compile_batch_function(
-    batch_function: BatchFunction,
-    make_output_template: Callable,
-    trace_key_settings: object,
-    xla_block_size: int = 1,
-    register_limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS,
-) -> BatchFunction:
-    """Compile a function of a batch that JAX programs can call, and return the compiled function.
-
-    If machine code is available, the function becomes machine code, which the disk cache contains.
-    Otherwise XLA compiles the function, which is then called for blocks of batch elements.
-
-    - `batch_function`: function of trees of arrays, which have the batch on the last axis;
-    - `make_output_template`: function that returns arrays with the structure of the outputs;
-    - `trace_key_settings`: as for `compile_exported_function`;
-    - `xla_block_size`: number of batch elements that one call of an XLA program computes;
-    - `register_limits`: as for `simd.compile_lane_function`.
-    """
-    if not simd.is_machine_code_available():
-        return wrap_with_saved_trace(
-            apply_function_in_blocks(batch_function, xla_block_size), trace_key_settings
-        )
-    trace_key = (trace_key_settings, store.describe_trace_environment())
-    return simd.compile_lane_function(
-        batch_function, make_output_template, trace_key, store, register_limits
-    )
-
-
 def _load_or_export_trace(
-    traced_function: Callable, example_arguments: tuple, trace_key_settings: object
+    traced_function: Callable,
+    example_arguments: tuple,
+    find_key: Callable[..., str | None] | None = None,
 ) -> export.Exported:
     """Return the exported trace of a function, as a function of the flattened arguments.
 
@@ -153,21 +109,25 @@ def _load_or_export_trace(
     # A trace calls the machine code of one processor, but several may share the folder.
     platform_and_processor = (
         jax.default_backend(),
-        simd.describe_processor() if simd.is_machine_code_available() else None,
+        describe_processor() if is_machine_code_available() else None,
     )
+    try:
+        find_key = find_key or functools.partial(make_key, traced_function)
+        function_key = find_key(argument_structure)
+    except UnresolvableFunctionError:
+        function_key = None
     trace_key_parts = (
-        trace_key_settings,
-        str(argument_structure),
-        argument_shapes,
+        function_key,
+        [(x.shape, x.dtype.name) for x in argument_shapes],
         platform_and_processor,
         store.describe_trace_environment(),
     )
     cache_record_name = f"vrw_trace_{hashlib.sha256(repr(trace_key_parts).encode()).hexdigest()}"
-    cache_record_content = store.load_cache_record(cache_record_name)
+    cache_record_content = store.load_cache_record(cache_record_name) if function_key else None
     if cache_record_content is not None:
         encoded_ffi_target_names, _, serialized_trace = cache_record_content.partition(b"\n")
         try:
-            if simd.load_saved_machine_code(encoded_ffi_target_names.decode().split(), store):
+            if load_saved_machine_code(encoded_ffi_target_names.decode().split()):
                 return export.deserialize(bytearray(serialized_trace))
         except Exception:  # JAX documents no type of error for bytes that are no trace.
             store.warn_of_unusable_cache_record(f"{cache_record_name} is no trace")
@@ -189,10 +149,11 @@ def _load_or_export_trace(
         )
     finally:
         _is_exporting_trace.reset(export_flag_token)
-    store.save_cache_record(
-        cache_record_name,
-        " ".join(ffi_target_names).encode() + b"\n" + bytes(exported_trace.serialize()),
-    )
+    if function_key:
+        store.save_cache_record(
+            cache_record_name,
+            " ".join(ffi_target_names).encode() + b"\n" + bytes(exported_trace.serialize()),
+        )
     return exported_trace
 
 
@@ -200,7 +161,7 @@ def _find_ffi_target_names(jaxpr: Any) -> set[str]:
     """Return the names of all machine-code functions that a traced program calls."""
     ffi_target_names: set[str] = set()
     for jaxpr_equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
-        if jaxpr_equation.primitive is simd.MACHINE_CODE_PRIMITIVE:
+        if jaxpr_equation.primitive is MACHINE_CODE_PRIMITIVE:
             ffi_target_names.add(jaxpr_equation.params["machine_code"].ffi_target_name)
         for equation_parameter in jax.tree.leaves(list(jaxpr_equation.params.values())):
             if hasattr(getattr(equation_parameter, "jaxpr", equation_parameter), "eqns"):

@@ -1,0 +1,221 @@
+"""`lanes.jit` of a function of one lane computes what `jax.vmap` computes, in every transform."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from support.machine_code import CodeRegistrySpy, disable_machine_code
+
+from vrw_jax import simd
+
+N = 21  # no multiple of the lanes in a group
+GENERATOR = np.random.default_rng(0)
+X, K = GENERATOR.normal(size=(N, 3)), GENERATOR.integers(0, 3, N)
+A = GENERATOR.normal(size=(N, 3, 4))
+
+
+def halve_until_small(x, k):
+    """A loop that each lane ends for itself, with a counter that all lanes share until then."""
+    state = lax.while_loop(
+        lambda s: jnp.any(jnp.abs(s[1]) > 0.1), lambda s: (s[0] + 1, 0.5 * s[1]), (0, x)
+    )
+    return {"count": state[0] + k, "x": state[1]}
+
+
+def sum_by_scan(x, k):
+    weights = jnp.arange(5.0)
+
+    def add(carry, weight):
+        total, i = carry
+        return (total + weight * x[i % 3], i + 1), total
+
+    (total, i), partial_sums = lax.scan(add, (0.0 * x[0], 0), weights)
+    return total, i, partial_sums[::-1]
+
+
+def choose(x, k):
+    branches = [lambda y: y, lambda y: -2.0 * y, lambda y: jnp.cumsum(y)]
+    return lax.switch(k, branches, x), lax.cond(x[0] > x[1], lambda: x[2], lambda: 0.0)
+
+
+def index_by_lane(x, k):
+    row = lax.dynamic_index_in_dim(x, k, keepdims=False)
+    part = lax.dynamic_slice(jnp.concatenate([x, x]), (k,), (2,))
+    changed = lax.dynamic_update_slice(jnp.zeros(6), part, (k + 1,))
+    return row, part, changed.at[2].set(1.0), jnp.zeros(4).at[3].add(row)
+
+
+def move_entries(x, k):
+    table = jnp.outer(x, x)[None]
+    return (
+        table.transpose(2, 0, 1)[:2, 0].reshape(-1),
+        jnp.pad(x, (1, 2)),
+        jnp.stack(jnp.split(jnp.concatenate([x, 2.0 * x]), 2)),
+        jnp.where(k > 1, x.max(), x.min()) + table.sum((0, 2)),
+        jnp.broadcast_to(x, (2, 3)) @ table[0],
+    )
+
+
+def loop_uniformly(x, k):
+    """A loop whose length all lanes share reads an array by its counter."""
+    return lax.fori_loop(0, 3, lambda i, y: y + x[i] * jnp.sin(y), 0.1 * x[0])
+
+
+def loop_within_loops(x, k):
+    inner = lambda i, y: lax.while_loop(lambda z: z > i, lambda z: 0.7 * z - 0.01, y + 3.0)
+    return lax.fori_loop(0, k, inner, x[0])
+
+
+def return_constants(x, k):
+    return jnp.float64(2.0), jnp.arange(3), x > 0.0, None
+
+
+FUNCTIONS = (
+    halve_until_small,
+    sum_by_scan,
+    choose,
+    index_by_lane,
+    move_entries,
+    loop_uniformly,
+    loop_within_loops,
+    return_constants,
+)
+
+
+def assert_equal_trees(actual, expected, tolerance=1e-13):
+    """Compare trees; sums of a few numbers of size one are rounded in another order."""
+    assert jax.tree.structure(actual) == jax.tree.structure(expected)
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
+        assert (a.dtype, a.shape) == (b.dtype, b.shape)
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_batches_agree_with_vmap(function):
+    compiled, expected = simd.jit(function), jax.vmap(function)(X, K)
+    batch = compiled.batch(X, K)
+    assert_equal_trees(batch, expected)
+    assert_equal_trees(jax.jit(jax.vmap(compiled))(X, K), expected)
+    # The results of a lane are bitwise the same in any batch.
+    assert_equal_trees(jax.tree.map(lambda x: x[5], batch), compiled(X[5], K[5]), 0.0)
+    assert_equal_trees(compiled.batch(X[3:8], K[3:8]), jax.tree.map(lambda x: x[3:8], batch), 0.0)
+
+
+def energy(x, law):
+    """A number whose derivatives go through a loop of unknown length."""
+    y, _ = lax.while_loop(
+        lambda s: s[1] < 4, lambda s: (s[0] + law["k"] * jnp.sin(s[0]), s[1] + 1), (x, 0)
+    )
+    return jnp.sum(y**2) + law["c"] * x[0] * x[1]
+
+
+LAW = {"k": jnp.asarray(0.3), "c": jnp.asarray(2.0)}
+
+
+def unroll(x, law):
+    """Return `energy` without a loop, so that JAX differentiates it in every mode."""
+    y = x
+    for _ in range(4):
+        y = y + law["k"] * jnp.sin(y)
+    return jnp.sum(y**2) + law["c"] * x[0] * x[1]
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        jax.grad,
+        jax.jacfwd,
+        jax.jacrev,
+        jax.hessian,
+        lambda f: jax.jit(jax.grad(f, (0, 1))),
+        lambda f: jax.jacrev(jax.jacfwd(f), argnums=1),
+        lambda f: lambda x, law: jax.jvp(lambda s: f(s * x, law), (1.0,), (2.0,)),
+        lambda f: lambda x, law: jax.vmap(jax.grad(f), (0, None))(jnp.stack([x, 2.0 * x]), law),
+    ],
+)
+def test_derivatives_of_every_mode_agree_with_an_unrolled_loop(transform):
+    actual = transform(simd.jit(energy))(jnp.asarray(X[0]), LAW)
+    assert_equal_trees(actual, transform(unroll)(jnp.asarray(X[0]), LAW))
+
+
+def test_other_numbers_in_closures_trace_nothing_anew(monkeypatch):
+    class Law(eqx.Module):
+        stiffness: float
+        table: np.ndarray
+
+        def force(self, x):
+            return self.stiffness * x + self.table[1]
+
+    def make(stiffness, shift):
+        law = Law(stiffness, np.array([0.0, shift]))
+        inner = lambda x: law.force(x) + shift
+        return lambda x: inner(x) * stiffness
+
+    spy = CodeRegistrySpy(monkeypatch)
+    for stiffness, shift in ((2.0, 1.0), (3.0, -1.0), (4.0, 0.5)):
+        compiled = simd.jit(make(stiffness, shift))
+        expected = stiffness * (stiffness * X + 2.0 * shift)
+        np.testing.assert_allclose(compiled.batch(X), expected, rtol=1e-14, atol=1e-14)
+    assert spy.n_traces == 1
+    # Derivatives with respect to a number of the closure.
+    slope = jax.grad(lambda k: simd.jit(make(k, 1.0))(0.5))(2.0)
+    assert slope == pytest.approx(2.0 * 2.0 * 0.5 + 2.0, rel=1e-14)
+
+
+def test_a_number_that_python_needs_is_part_of_the_code(monkeypatch):
+    make = lambda power: lambda x: x**2 if power > 1.5 else x * float(power)
+    for power in (2.0, 1.0, 0.5):
+        np.testing.assert_array_equal(
+            simd.jit(make(power)).batch(X), X**2 if power > 1.5 else X * power
+        )
+
+
+def test_static_and_shared_arguments():
+    def evaluate(x, table, kind, scale):
+        return scale * (x @ table if kind == "product" else x[0] + table.sum())
+
+    table, compiled = np.arange(12.0).reshape(3, 4), simd.jit(evaluate)
+    np.testing.assert_allclose(
+        compiled.batch(X, table, "product", 2.0, in_axes=(0, None, None, None)), 2.0 * X @ table
+    )
+    np.testing.assert_allclose(
+        compiled.batch(X, A, "product", 1.0, in_axes=(0, 0, None, None)),
+        np.einsum("ni,nij->nj", X, A),
+        rtol=1e-13, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_allclose(compiled(X[1], table, "sum", 1.0), X[1, 0] + 66.0)
+
+
+def test_batches_of_different_lengths_are_refused_in_one_sentence():
+    compiled = simd.jit(lambda x, y: x + y)
+    with pytest.raises(ValueError, match=r"lengths \[3, 4\]: give 0 or None for each argument"):
+        compiled.batch(np.ones(3), np.ones(4))
+    assert compiled.batch(np.ones((0, 2)), np.ones((0, 2))).shape == (0, 2)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_number_format_is_that_of_the_arguments(dtype):
+    result = simd.jit(lambda x: jnp.sin(2.0 * x) + 1).batch(X.astype(dtype))
+    assert result.dtype == dtype
+    np.testing.assert_allclose(result, np.sin(2.0 * X) + 1.0, atol=4.0 * np.finfo(dtype).eps)
+
+
+def test_xla_computes_where_a_primitive_has_no_machine_code():
+    """A sort is missing; one warning names it."""
+    compiled = simd.jit(lambda x: jnp.sort(x) * 2.0)
+    with pytest.warns(UserWarning, match="sort has no rule for lanes") as caught:
+        first = compiled.batch(X)
+    for _ in range(2):
+        np.testing.assert_array_equal(first, compiled.batch(X))
+    np.testing.assert_array_equal(first, 2.0 * np.sort(X))
+    assert len(caught) == 1
+
+
+def test_xla_computes_without_machine_code(monkeypatch):
+    expected = simd.jit(halve_until_small).batch(X, K)
+    disable_machine_code(monkeypatch)
+    compiled = simd.jit(halve_until_small, xla_block_size=8)
+    assert_equal_trees(compiled.batch(X, K), expected)
+    assert_equal_trees(compiled(X[0], K[0]), jax.tree.map(lambda x: x[0], expected))
