@@ -114,7 +114,7 @@ def trace_special_points(
         on_stage,
         measures_force_peaks=SECOND_PEAK_RATE_NAME in scan_dataset,
     )
-    curve_seeds = find_seeds_oN_PARALLEL_BRANCHES(curve_tracer, params)
+    curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params)
     traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [])
     sign_changes = find_sign_changes_in_scan(scan_dataset, curve_tracer.parameter_names)
     examined_sign_changes: list[ScanSignChange] = []
@@ -187,7 +187,7 @@ def _trace_curves_and_meetings(
     return traced_curves
 
 
-def find_seeds_oN_PARALLEL_BRANCHES(
+def find_seeds_on_parallel_lines(
     curve_tracer: CurveTracer,
     params: WheelParams,
 ) -> list[CurveSeed]:
