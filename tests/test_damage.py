@@ -61,7 +61,7 @@ class Canary:
 OPEN_PROGRAM = """
 import sys, warnings
 import vrw_jax as vrw
-from vrw_jax.cli.config import load_config
+from vrw_jax.app.config import load_config
 warnings.simplefilter("ignore")
 intact, config, log, *hostile_stores = sys.argv[1:]
 vrw.open_scan(intact).load()  # imports what opening needs

@@ -24,7 +24,7 @@ NAMES = [name for name in vrw.__all__ if name not in ("MEASURES", "parameter_set
 FIGURE_FUNCTIONS = [
     f"plot.{name}"
     for name, thing in vars(vrw.plot).items()
-    if inspect.isfunction(thing) and thing.__module__.startswith("vrw_jax.figures")
+    if inspect.isfunction(thing) and thing.__module__.startswith("vrw_jax.plot")
 ]
 SLOW_EXAMPLES = {
     "plot.branch_figure", "plot.scan_figures", "plot.map_figure", "plot.tuning_figure",

@@ -5,7 +5,7 @@ import pytest
 from jaxtyping import TypeCheckError
 from support import shape_checks
 
-from vrw_jax.numerics.batch_algebra import invert_small_matrices
+from vrw_jax.base.batch_algebra import invert_small_matrices
 
 SQUARE = 2.0 * jnp.eye(3)[:, :, None]
 NOT_SQUARE = jnp.ones((3, 2, 1))

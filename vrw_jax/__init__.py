@@ -4,86 +4,60 @@ import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
-from vrw_jax.batches import StepBatchResult, step_batch
-from vrw_jax.branches import (
-    Branch,
-    SpecialPoint,
-    SpecialPointCurve,
-    continue_branch,
-    continue_branches,
-    continue_map,
-    continue_special_point,
-)
-from vrw_jax.contact import UnilateralStep, UnilateralWheel
-from vrw_jax.continuation import ArclengthOptions, FixedPointResult, solve_fixed_point
-from vrw_jax.cycles import (
-    CycleOptions,
-    LimitCycle,
-    ReturnMapCycle,
-    default_margins,
-    limit_cycle,
-    limit_cycles,
-    sensitivities,
-)
-from vrw_jax.measures import MEASURES
-from vrw_jax.models import (
-    AbstractWheel,
+from vrw_jax.app.explorer import explore
+from vrw_jax.base.checks import format_name_suggestion
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.start import start_jax
+from vrw_jax.branches.arclength import ArclengthOptions
+from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
+from vrw_jax.branches.continuation import continue_branch, continue_branches, continue_map
+from vrw_jax.branches.special_point_curves import continue_special_point
+from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point
+from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles
+from vrw_jax.gaits.limit_cycle_result import LimitCycle
+from vrw_jax.gaits.margin_defaults import default_margins
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.return_map_finder import ReturnMapCycle
+from vrw_jax.gaits.sensitivity import sensitivities
+from vrw_jax.gaits.step_force_peaks import force_peaks
+from vrw_jax.models.contact_record import UnilateralStep
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
+from vrw_jax.models.measures import MEASURES
+from vrw_jax.models.rigid import RigidWheel
+from vrw_jax.models.step_batch import step_batch
+from vrw_jax.models.step_results import (
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
     RequiredFriction,
-    RigidWheel,
     StepResult,
-    ViscoelasticWheel,
 )
-from vrw_jax.numerics import StepOptions
-from vrw_jax.robustness import (
-    BasinShare,
-    FirstPassage,
-    GaitSensitivity,
-    SmallestDisturbance,
-    basin_share,
-    first_passage,
-    gait_sensitivity,
-    measure_basins,
-    measure_gait_sensitivity,
-    smallest_disturbance,
-)
-from vrw_jax.runtime import start_jax
-from vrw_jax.scans import (
-    SpecialPointMap,
-    grid,
-    map_special_points,
-    open_scan,
-    saltelli,
-    samples,
-    scan,
-    sobol,
-    sobol_indices,
-    uniform,
-)
-from vrw_jax.selection import LadderStep, LadderWheel, ModelChoice
-from vrw_jax.simulation import (
-    Walk,
-    basin,
-    choose_model,
-    force_peaks,
-    paper_start,
-    return_map,
-    simulate,
-    step,
-    walk,
-)
-from vrw_jax.tolerance import (
-    MeasureResult,
-    MultifidelityMean,
-    measure_to_tolerance,
-    multifidelity_mean,
-)
-from vrw_jax.tuning import TuneResult, WheelObjective, tune
-from vrw_jax.validation import format_name_suggestion
-from vrw_jax.web import explore
-from vrw_jax.wheel import Outcome, ParameterSet, WheelParams, parameter_sets
+from vrw_jax.models.stepping import Walk, choose_model, paper_start, return_map, step, walk
+from vrw_jax.models.trajectory import simulate
+from vrw_jax.models.unilateral_wheel import UnilateralWheel
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.models.walk_batch import StepBatchResult
+from vrw_jax.studies.basin_share import BasinShare, basin_share
+from vrw_jax.studies.basins import basin
+from vrw_jax.studies.branch_robustness import measure_basins, measure_gait_sensitivity
+from vrw_jax.studies.first_passage import FirstPassage, first_passage
+from vrw_jax.studies.gait_sensitivity import GaitSensitivity, gait_sensitivity
+from vrw_jax.studies.measure_result import MeasureResult
+from vrw_jax.studies.multifidelity import MultifidelityMean, multifidelity_mean
+from vrw_jax.studies.scan_design import grid, saltelli, samples, sobol, uniform
+from vrw_jax.studies.scan_execution import scan
+from vrw_jax.studies.scan_store import open_scan
+from vrw_jax.studies.sensitivity_indices import sobol_indices
+from vrw_jax.studies.smallest_disturbance import SmallestDisturbance, smallest_disturbance
+from vrw_jax.studies.special_point_map import SpecialPointMap, map_special_points
+from vrw_jax.studies.tolerance_request import measure_to_tolerance
+from vrw_jax.studies.tune_objective import WheelObjective
+from vrw_jax.studies.tune_problem import tune
+from vrw_jax.studies.tune_result import TuneResult
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.parameter_sets import ParameterSet, parameter_sets
+from vrw_jax.wheel.params import WheelParams
 
 __all__ = (
     "MEASURES",
@@ -166,7 +140,7 @@ __all__ = (
 )  # fmt: skip
 
 if TYPE_CHECKING:
-    from vrw_jax import figures as plot
+    from vrw_jax import plot
 
     __version__: str
 
@@ -176,7 +150,7 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return importlib.metadata.version("vrw-jax")
     if name == "plot":  # imports matplotlib only if figures are drawn
-        return importlib.import_module("vrw_jax.figures")
+        return importlib.import_module("vrw_jax.plot")
     raise AttributeError(
         f"vrw_jax has no {name!r}{format_name_suggestion(name, __all__)}: dir(vrw_jax) lists "
         "what it has."

@@ -1,5 +1,5 @@
 """Entry point of `python -m vrw_jax`, which is the command `vrw`."""
 
-from vrw_jax.cli import main
+from vrw_jax.app.commands import main
 
 main()

@@ -12,7 +12,7 @@ from markdown import Markdown
 from markdown.extensions import Extension
 from markdown.inlinepatterns import InlineProcessor
 
-from vrw_jax.measures import format_mathtext
+from vrw_jax.base import format_mathtext
 
 DISPLAYED = r"(?s)\$\$(.+?)\$\$"
 INLINE = r"(?<![\\$\w])\$(?=[^\s$])([^$]+?)(?<=[^\s\\])\$(?![\w$])"

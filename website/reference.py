@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from typing import Any
 
-from vrw_jax.cli.config import (
+from vrw_jax.app.config import (
     RANDOM_DESIGN_FUNCTIONS,
     BranchConfig,
     FigureConfig,
@@ -15,7 +15,9 @@ from vrw_jax.cli.config import (
     ScanConfig,
     TuneConfig,
 )
-from vrw_jax.measures.table import (
+from vrw_jax.base import StepOptions, format_markdown_table
+from vrw_jax.models import find_model_class, list_model_config_names
+from vrw_jax.models.measures import (
     CONTACT_MEASURES,
     FORCE_PEAK_MEASURES,
     GAIT_SENSITIVITY_MEASURES,
@@ -29,10 +31,7 @@ from vrw_jax.measures.table import (
     UNILATERAL_STEP_MEASURES,
     Measure,
 )
-from vrw_jax.numerics import StepOptions
-from vrw_jax.printing import format_markdown_table
-from vrw_jax.scans import design as designs
-from vrw_jax.selection import find_model_class, list_model_config_names
+from vrw_jax.studies import scan_design as designs
 from vrw_jax.wheel import PARAMETER_DOMAINS, WheelParams
 
 FIELD = re.compile(r"^ *- ((?:`\w+`(?:, )?)+): (.*(?:\n +[^ -].*)*)", re.MULTILINE)

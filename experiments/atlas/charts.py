@@ -20,8 +20,12 @@ from experiments.shared.tables import (
     read_table,
     replace_block,
 )
-from vrw_jax.figures import PAGE_FIGURE_WIDTH_INCHES, figure_style, save
-from vrw_jax.figures.style import OUTCOME_LABELS_AND_COLORS
+from vrw_jax.app.figure_style import (
+    OUTCOME_LABELS_AND_COLORS,
+    PAGE_FIGURE_WIDTH_INCHES,
+    figure_style,
+    save,
+)
 from vrw_jax.wheel import Outcome
 
 STYLES = {  # of Okabe and Ito, a marker each

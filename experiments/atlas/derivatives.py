@@ -23,7 +23,7 @@ from tests.reference_code import multiprecision
 from tests.reference_code.hub_form import HubForm
 from tests.reference_code.multiprecision import Flow, Number, Vector
 from vrw_jax import Outcome
-from vrw_jax.continuation import floquet
+from vrw_jax.gaits import floquet
 from vrw_jax.wheel import transitions
 
 

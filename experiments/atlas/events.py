@@ -16,7 +16,7 @@ import vrw_jax as vrw
 from experiments.speed import peers
 from experiments.speed.peers import hy
 from vrw_jax import Outcome
-from vrw_jax.numerics import select_tree_rows
+from vrw_jax.lanes import select_tree_rows
 from vrw_jax.wheel import Motion, Symbols, dynamics, geometry, transitions
 
 Rows = Iterator[dict[str, object]]

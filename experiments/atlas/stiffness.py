@@ -10,7 +10,7 @@ from experiments.atlas.events import START, Rows
 from experiments.atlas.limits import light_wheel
 from experiments.speed import peers
 from vrw_jax import Outcome
-from vrw_jax.integrator import compute_real_stability_limit, load_explicit_tableau
+from vrw_jax.flow import compute_real_stability_limit, load_explicit_tableau
 from vrw_jax.wheel import transitions
 
 STIFFNESS = np.logspace(2.0, 6.0, 9)  # c/m or k/m, 1/s or 1/s^2

@@ -12,8 +12,8 @@ import xarray as xr
 
 import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
-from vrw_jax import figures as plots
-from vrw_jax.figures.style import format_value_label
+from vrw_jax import plot as plots
+from vrw_jax.app.figure_style import format_value_label
 
 DAMPINGS = (100.0, 200.0)  # N s/m
 ANGULAR_RATES = np.linspace(0.4, 3.2, 57)  # rad/s

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
-from vrw_jax import figures as plots
-from vrw_jax.figures.style import draw_panel_letter, format_axis_label
+from vrw_jax import plot as plots
+from vrw_jax.app.figure_style import draw_panel_letter, format_axis_label
 
 DAMPING_BOUNDS = (100.0, 219.0)
 N_POINTS = 25

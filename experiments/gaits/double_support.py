@@ -46,7 +46,7 @@ from experiments.shared.tables import (
     shorten_number,
     write_named_rows,
 )
-from vrw_jax import figures as plots
+from vrw_jax import plot as plots
 from vrw_jax.wheel import transitions
 
 BOX = {

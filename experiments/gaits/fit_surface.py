@@ -16,10 +16,10 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from vrw_jax.collocation import N_GAUSS_NODES, CollocationSolution
-from vrw_jax.cycles import collocation_search as search
-from vrw_jax.cycles import gait_surface as surface
-from vrw_jax.numerics import apply_function_in_blocks
+from vrw_jax.gaits import N_GAUSS_NODES, CollocationSolution
+from vrw_jax.gaits import collocation_search as search
+from vrw_jax.gaits import gait_surface as surface
+from vrw_jax.lanes import apply_function_in_blocks
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters, stack_parameters
 
 PARAMETER_BOX = {

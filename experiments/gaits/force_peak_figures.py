@@ -26,12 +26,8 @@ from experiments.gaits.force_peak_wheels import (
     compute_stiffness_number,
 )
 from experiments.shared.tables import FIGURES, Row, group_rows, read_column, read_table
-from vrw_jax import figures as plots
-from vrw_jax.figures.style import (
-    OKABE_ITO_BLUE,
-    OKABE_ITO_ORANGE,
-    draw_panel_letter,
-)
+from vrw_jax import plot as plots
+from vrw_jax.app.figure_style import OKABE_ITO_BLUE, OKABE_ITO_ORANGE, draw_panel_letter
 
 PEAK_COLORS = {0: "#56B4E9", 1: "#0072B2", 2: "#E69F00", 3: "#D55E00"}
 """Colors of Okabe and Ito by number of peaks."""

@@ -65,7 +65,7 @@ from experiments.shared.tables import (
     replace_block,
     write_named_rows,
 )
-from vrw_jax import figures as plots
+from vrw_jax import plot as plots
 
 MARKED_SETS = {"two_peaks": ("*", "two-peak wheel"), "table_1": ("D", "Table 1")}
 """Marker and label of the parameter sets that the maps show."""

@@ -21,7 +21,7 @@ import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.failure_counts import NORMAL_QUANTILE, count_failures
-from vrw_jax import figures as plots
+from vrw_jax import plot as plots
 
 PAGE = tables.DOCS / "benchmarks" / "first_passage.md"
 SLOPE_SDS = (0.015, 0.007, 0.004)

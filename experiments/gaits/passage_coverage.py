@@ -21,8 +21,8 @@ import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.failure_counts import NORMAL_QUANTILE, count_failures
-from vrw_jax.robustness.first_passage import PassageStatus
-from vrw_jax.robustness.sampled_passage import PassageSamplingOptions, WalkerGroups, sample_passage
+from vrw_jax.studies.first_passage import PassageStatus
+from vrw_jax.studies.sampled_passage import PassageSamplingOptions, WalkerGroups, sample_passage
 
 PAGE = tables.DOCS / "benchmarks" / "first_passage.md"
 DATA = tables.FIGURES / "passage_coverage.csv"

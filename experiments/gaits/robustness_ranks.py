@@ -15,7 +15,7 @@ from scipy import stats
 import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
-from vrw_jax.robustness.first_passage import PassageStatus
+from vrw_jax.studies.first_passage import PassageStatus
 
 PAGE = tables.DOCS / "howto" / "robustness.md"
 N_WHEELS = 32

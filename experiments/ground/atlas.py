@@ -18,8 +18,8 @@ from matplotlib.patches import Patch
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, Row, read_column, read_table, write_named_rows
-from vrw_jax import figures as plots
-from vrw_jax.cycles import find_attracting_gaits, make_finder
+from vrw_jax import plot as plots
+from vrw_jax.gaits import find_attracting_gaits, make_finder
 
 FRICTION = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0, 1.1, 1.2,
             1.3, 1.4, 1.5, 1.6)  # fmt: skip

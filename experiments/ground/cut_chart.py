@@ -22,7 +22,7 @@ from experiments.shared.tables import (
     show_table,
     write_table,
 )
-from vrw_jax import figures as plots
+from vrw_jax import plot as plots
 
 N_FIRST, SEED, SOLVER = 10, 0, "Tsit5"
 DAMPING, FRICTION = (150.0, 350.0), (0.5, 1.2)

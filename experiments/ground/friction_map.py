@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_table, write_table
-from vrw_jax import figures as plots
+from vrw_jax import plot as plots
 
 FRICTION = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.4, 1.7, 2.0, 2.5, 3.0)
 DAMPING = tuple(float(c) for c in range(20, 401, 20))

@@ -14,9 +14,9 @@ from matplotlib.colors import ListedColormap
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_table, write_table
-from vrw_jax import figures as plots
-from vrw_jax.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES
-from vrw_jax.scans import plan_scan
+from vrw_jax import plot as plots
+from vrw_jax.models import MARGIN_MEASURES, SELECTION_MARGIN_NAMES
+from vrw_jax.studies import plan_scan
 
 DAMPING = np.linspace(20.0, 400.0, 77)
 FRICTION = (0.7, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 50.0, np.inf)

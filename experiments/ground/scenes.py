@@ -19,8 +19,8 @@ from matplotlib.patches import Patch
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_column, read_table, write_table
-from vrw_jax import figures as plots
-from vrw_jax.contact import compute_foot_heights, compute_leg_directions, unpack_state
+from vrw_jax import plot as plots
+from vrw_jax.models import compute_foot_heights, compute_leg_directions, unpack_state
 
 NO_SLIP, FINITE_FRICTION = math.inf, 0.7
 GAIT_RANGE = (8.0, 215.0)

@@ -170,15 +170,17 @@ def compute() -> list[list[float]]:
     import jax
     import jax.numpy as jnp
 
-    from vrw_jax import simd
+    from vrw_jax import lanes
 
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     x, results = np.arange(4.0), []
     for factor in (2.0, 3.0):
-        times = simd.compile_batch_function(lambda y, f=factor: f * y)
+        times = lanes.compile_batch_function(lambda y, f=factor: f * y)
         results.append(times.run(x))
         call = lambda y, g=times: jnp.sin(g(y))
-        results.append(simd.compile_exported_function(call, (jnp.asarray(x),), jax.devices()[0])(x))
+        results.append(
+            lanes.compile_exported_function(call, (jnp.asarray(x),), jax.devices()[0])(x)
+        )
     return [np.asarray(values).tolist() for values in results]
 
 
@@ -247,7 +249,7 @@ def run_cache_row(place: Path, cache: Path, fault: str, pattern: str) -> str:
 
 def run_config_row(place: Path, folder: Path, fault: str, pattern: str) -> str:
     """Return the ending of a damaged config: rejected, or read as written."""
-    from vrw_jax.cli.config import load_config
+    from vrw_jax.app.config import load_config
 
     (folder / "second.toml").write_text("[wheel]\ndamping = 120.0\n")
     (folder / "first.toml").write_text(CONFIG)

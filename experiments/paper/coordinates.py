@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Arc
 
 from experiments.shared.command import parse_folder_and_start_jax
-from vrw_jax.figures import (
+from vrw_jax.app import paper_reproduction as reproduction
+from vrw_jax.app.figure_style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
@@ -20,7 +21,6 @@ from vrw_jax.figures import (
     figure_style,
     save,
 )
-from vrw_jax.paper import reproduction
 
 METERS_PER_NEWTON = 1.0 / 280.0
 """Length of a force arrow per force."""

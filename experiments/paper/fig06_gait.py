@@ -7,8 +7,8 @@ command writes `fig06_gait.svg` and `.png` to `results/` or the given folder.
 """
 
 from experiments.shared.command import parse_folder_and_start_jax
-from vrw_jax import figures as plots
-from vrw_jax.paper import reproduction
+from vrw_jax import plot as plots
+from vrw_jax.app import paper_reproduction as reproduction
 
 N_STEPS = 3
 

@@ -7,8 +7,8 @@ Foot 2 scuffs at c = 50 and slightly at c = 100. It does not scuff at c = 200. T
 """
 
 from experiments.shared.command import parse_folder_and_start_jax
-from vrw_jax import figures as plots
-from vrw_jax.paper import reproduction
+from vrw_jax import plot as plots
+from vrw_jax.app import paper_reproduction as reproduction
 
 DAMPINGS = (50.0, 100.0, 200.0)  # N s/m
 

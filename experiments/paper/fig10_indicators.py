@@ -7,8 +7,8 @@
 """
 
 from experiments.shared.command import parse_folder_and_start_jax
-from vrw_jax import figures as plots
-from vrw_jax.paper import reproduction
+from vrw_jax import plot as plots
+from vrw_jax.app import paper_reproduction as reproduction
 
 SYMBOL_INTERVAL = 4
 """Number of gaits per plotted symbol."""

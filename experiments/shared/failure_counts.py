@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.robustness.first_passage import SAMPLED_STEP_TOLERANCE
+from vrw_jax.studies.first_passage import SAMPLED_STEP_TOLERANCE
 
 NORMAL_QUANTILE = 2.576
 """Half width of a 99 % confidence interval, in standard deviations of a normal distribution."""

@@ -22,7 +22,7 @@ from experiments.shared.tables import DOCS, describe_run, format_markdown, repla
 from experiments.shared.timing import measure_cpu_seconds, use_one_core
 from experiments.shared.wheels import WIDE_BOX, draw_parameter_rows
 from experiments.shared.wheels import make_wheels as wheels_of_rows
-from vrw_jax.cycles import CYCLE_MEASURE_FUNCTIONS
+from vrw_jax.gaits import CYCLE_MEASURE_FUNCTIONS
 from vrw_jax.wheel import make_wheel_from_parameters, stack_parameters
 
 N_SETS, N_STAGES, LANES = 2048, 48, 1024

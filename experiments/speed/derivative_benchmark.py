@@ -29,7 +29,7 @@ from experiments.shared.timing import describe_processor, measure_cpu_seconds, u
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.derivative_peers import HeyokaVariations, numba_differences
 from experiments.work_precision.charts import COLOURS
-from vrw_jax import figures as plots
+from vrw_jax import plot as plots
 from vrw_jax.wheel import PARAMETER_NAMES
 
 COLUMNS = {

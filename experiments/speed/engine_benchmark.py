@@ -35,8 +35,8 @@ from experiments.shared.timing import describe_processor, start_without_cache, u
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed import peers
 from experiments.work_precision.charts import COLOURS
-from vrw_jax import figures as plots
-from vrw_jax.batches.batch_steps import order_wheels_by_work
+from vrw_jax import plot as plots
+from vrw_jax.models.step_batch import order_wheels_by_work
 from vrw_jax.wheel import PARAMETER_NAMES, transitions
 
 LABELS = {

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from experiments.shared.command import require_extra
-from vrw_jax.integrator import load_explicit_tableau
+from vrw_jax.flow import load_explicit_tableau
 
 hy, numba = require_extra("heyoka"), require_extra("numba")
 

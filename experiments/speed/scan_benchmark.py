@@ -28,7 +28,7 @@ from experiments.shared.tables import (
     show_table,
     write_named_rows,
 )
-from vrw_jax.scans import ScanPlan, ScanProgress, plan_scan, run_scan
+from vrw_jax.studies import ScanPlan, ScanProgress, plan_scan, run_scan
 
 ROOT = Path(__file__).parents[2]
 STORES = ROOT / "results" / "scan_benchmark"
@@ -136,7 +136,7 @@ def draw(rows: list[Any]) -> None:
     measured."""
     from matplotlib.figure import Figure
 
-    from vrw_jax import figures as plots
+    from vrw_jax import plot as plots
 
     cold, warm = (
         rows[:1],
@@ -202,8 +202,8 @@ def main() -> None:
     draw(rows)
     compare(sizes[-1])
 
-    from vrw_jax import figures as plots
-    from vrw_jax.figures import scan_figures
+    from vrw_jax import plot as plots
+    from vrw_jax.app._scan_figures import scan_figures
 
     for name, figure in scan_figures(vrw.open_scan(STORES / f"{sizes[-1]}.zarr")).items():
         plots.save(figure, FIGURES, f"{name}_of_{sizes[-1]}")

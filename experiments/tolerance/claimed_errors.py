@@ -29,8 +29,8 @@ from experiments.shared.tables import (
     write_table,
 )
 from experiments.shared.wheels import WIDE_BOX
-from vrw_jax import figures as plots
-from vrw_jax.cycles import make_finder
+from vrw_jax import plot as plots
+from vrw_jax.gaits import make_finder
 from vrw_jax.wheel import PARAMETER_NAMES
 
 N_BOX_WHEELS, N_HOSTILE_WHEELS, N_PARTS = 400, 100, 8

@@ -35,12 +35,12 @@ from experiments.shared.tables import (
     replace_block,
     write_named_rows,
 )
-from vrw_jax import figures as plots
-from vrw_jax.cli.config import load_config
-from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
-from vrw_jax.tuning import tune
-from vrw_jax.tuning.objective import compute_slack_scales
-from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem
+from vrw_jax import plot as plots
+from vrw_jax.app.config import load_config
+from vrw_jax.gaits import STATE_AGREEMENT_TOLERANCE
+from vrw_jax.studies import tune
+from vrw_jax.studies.tune_objective import compute_slack_scales
+from vrw_jax.studies.tune_problem import TuneProblem, make_tune_problem
 from vrw_jax.wheel import make_wheel_from_parameters
 
 cma = require_extra("cma")

@@ -32,15 +32,13 @@ from experiments.web.programs import (
     make_shared_programs,
     programs,
 )
-from vrw_jax.measures import (
+from vrw_jax.models import (
     LIMIT_CYCLE_MEASURES,
     MARGIN_MEASURES,
+    PAPER_START_STATE,
     STEP_MEASURES,
     STOPPER_MARGIN_MEASURES,
     UNILATERAL_STEP_MEASURES,
-)
-from vrw_jax.models import (
-    PAPER_START_STATE,
     DoubleSupportIndicators,
     EnergyLoss,
     RequiredFriction,

@@ -12,28 +12,33 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax import simd
-from vrw_jax.contact import UnilateralWheel
-from vrw_jax.contact.batch_integrator import N_ACCUMULATOR_ROWS, ContactIntervalPoint, unpack_motion
-from vrw_jax.contact.contact_state import ContactState
-from vrw_jax.contact.mechanics import compute_kinetic_energy, compute_potential_energy
-from vrw_jax.contact.section import compute_full_section_size, embed_section_state
-from vrw_jax.contact.single_step import sample_contact_interval
-from vrw_jax.contact.walk_kernel import BatchWalkSettings, init_lane_states, process_and_integrate
-from vrw_jax.integrator import load_explicit_tableau, sample_batch_phase
-from vrw_jax.measures import MARGIN_MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax import lanes
+from vrw_jax.base import StepOptions, compute_sine_cosine
+from vrw_jax.flow import load_explicit_tableau, sample_batch_phase
 from vrw_jax.models import (
+    MARGIN_MEASURES,
     N_STEP_INPUTS,
+    STOPPER_MARGIN_MEASURES,
     RequiredFriction,
     RigidWheel,
     StepResult,
+    UnilateralWheel,
     advance_gait_step,
     compute_jacobian_columns,
 )
 from vrw_jax.models.batch_step import make_batch_phase, run_batch_phases
+from vrw_jax.models.contact_integrator import (
+    N_ACCUMULATOR_ROWS,
+    ContactIntervalPoint,
+    unpack_motion,
+)
+from vrw_jax.models.contact_kernel import BatchWalkSettings, init_lane_states, process_and_integrate
+from vrw_jax.models.contact_mechanics import compute_kinetic_energy, compute_potential_energy
+from vrw_jax.models.contact_section import compute_full_section_size, embed_section_state
+from vrw_jax.models.contact_state import ContactState
+from vrw_jax.models.contact_step import sample_contact_interval
 from vrw_jax.models.phase_sequence import evaluate_phase_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
-from vrw_jax.numerics import StepOptions, compute_sine_cosine
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, make_wheel_from_parameters
 
 LEGS = (6, 8, 10)
@@ -41,7 +46,7 @@ LEGS = (6, 8, 10)
 SAMPLES = 24
 """Times of each phase that the animation knows, ends included."""
 
-UNSPLIT_LIMITS = simd.RegisterLimits(max_unrolled_entries=64)
+UNSPLIT_LIMITS = lanes.RegisterLimits(max_unrolled_entries=64)
 """Limits with which small arrays stay whole in a walk with unilateral contact: for ten legs the
 code is five times as long otherwise."""
 
@@ -53,13 +58,13 @@ class Program(NamedTuple):
 
     function: Callable[..., tuple]
     numbers: int
-    limits: simd.RegisterLimits = simd.DEFAULT_REGISTER_LIMITS
+    limits: lanes.RegisterLimits = lanes.DEFAULT_REGISTER_LIMITS
     section: int = 3
 
     def object(self, name: str) -> bytes:
         """Return the program as object code for WebAssembly."""
         rows = len(PARAMETER_NAMES), self.section
-        return simd.compile_wasm_object(self.function, self.numbers, rows, name, self.limits)
+        return lanes.compile_wasm_object(self.function, self.numbers, rows, name, self.limits)
 
 
 PAGE_MARGINS = {name: m for name, m in MARGIN_MEASURES.items() if name != "takeoff_acceleration"}
@@ -108,7 +113,7 @@ def make_shared_programs() -> dict[str, Program]:
         columns, numbers, codes = compute_jacobian_columns(shift, tuple(x), range(3))
         return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
-    return {"linearised": Program(linearised, 2, simd.RegisterLimits(N_STEP_INPUTS))}
+    return {"linearised": Program(linearised, 2, lanes.RegisterLimits(N_STEP_INPUTS))}
 
 
 def programs(n_legs: int) -> dict[str, Program]:
@@ -316,7 +321,7 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
         return _numbers_of(step), codes, rows
 
     return {
-        "rigid_linearised": Program(linearised, 1, simd.RegisterLimits(N_STEP_INPUTS)),
+        "rigid_linearised": Program(linearised, 1, lanes.RegisterLimits(N_STEP_INPUTS)),
         "rigid_told": Program(told, 2),
     }
 

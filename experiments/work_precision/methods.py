@@ -25,7 +25,7 @@ import optimistix as optx
 import vrw_jax as vrw
 from experiments.shared.wheels import PARAMETER_BOX, make_wheels
 from experiments.speed import peers
-from vrw_jax.integrator import load_explicit_tableau
+from vrw_jax.flow import load_explicit_tableau
 from vrw_jax.models.viscoelastic import make_diffrax_phase
 from vrw_jax.wheel import make_paper_phases, transitions
 

@@ -16,21 +16,22 @@ from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax import Outcome, simd
-from vrw_jax.batches import batch_steps as lane_batch
-from vrw_jax.batches.stiffness import select_cheapest_solver
-from vrw_jax.integrator.integrate import BatchPhase, integrate_batch_phase
-from vrw_jax.integrator.tableaus import (
+from vrw_jax import Outcome, lanes
+from vrw_jax.base import batch_sizes
+from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.flow.integrate import integrate_batch_phase
+from vrw_jax.flow.tableaus import (
     StageAccelerations,
     StageState,
     compute_real_stability_limit,
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.numerics import batch_sizes
-from vrw_jax.numerics.trigonometry import compute_sine_cosine
-from vrw_jax.simd import lane_function
-from vrw_jax.simd.batching import choose_batch_size
+from vrw_jax.flow.tangents import BatchPhase
+from vrw_jax.lanes import lane_function
+from vrw_jax.lanes.batching import choose_batch_size
+from vrw_jax.models import step_batch as lane_batch
+from vrw_jax.models.batch_stiffness import select_cheapest_solver
 
 STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(
@@ -200,7 +201,7 @@ def test_xla_blocks_agree_with_machine_code(monkeypatch):
 
 def test_an_xla_program_without_lanes_returns_empty_arrays(monkeypatch):
     disable_machine_code(monkeypatch)
-    program = simd.compile_batch_function(lambda x, y: (x + y, x > 0.0), 4)
+    program = lanes.compile_batch_function(lambda x, y: (x + y, x > 0.0), 4)
     total, is_positive = program.run(np.empty(0), np.empty(0))
     assert total.shape == is_positive.shape == (0,)
     assert (total.dtype, is_positive.dtype) == (np.dtype(float), np.dtype(bool))

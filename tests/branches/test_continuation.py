@@ -10,19 +10,15 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
+from vrw_jax.app._branch_figures import branch_figure
+from vrw_jax.app.config import FigureConfig
+from vrw_jax.app.reports import write_branch_report
+from vrw_jax.branches.arclength import AbstractContinuationProblem, FixedPointProblem, continue_from
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation import MapContinuation
-from vrw_jax.cli.config import FigureConfig
-from vrw_jax.cli.reports import write_branch_report
-from vrw_jax.continuation.arclength import (
-    AbstractContinuationProblem,
-    FixedPointProblem,
-    continue_from,
-)
-from vrw_jax.continuation.sign_changes import locate_function_roots
-from vrw_jax.figures._branches import branch_figure
-from vrw_jax.hybrid.minima import GuardsAndMargins
-from vrw_jax.hybrid.phase_integration import integrate_phase
+from vrw_jax.branches.sign_changes import locate_function_roots
+from vrw_jax.flow.diffrax_minima import GuardsAndMargins
+from vrw_jax.flow.phase_integration import integrate_phase
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
 LOCATION_TOLERANCE = 1e-9

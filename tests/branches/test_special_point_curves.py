@@ -11,14 +11,11 @@ import pytest
 
 import vrw_jax as vrw
 from experiments.gaits.both_sides import judge_curve
+from vrw_jax.branches.arclength import ArclengthOptions, ContinuationStatus
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation import MapContinuation
-from vrw_jax.branches.special_point_curves import (
-    _check_parameter_plane,
-    continue_special_points,
-)
-from vrw_jax.continuation.arclength import ArclengthOptions, ContinuationStatus
-from vrw_jax.continuation.test_functions import (
+from vrw_jax.branches.special_point_curves import _check_parameter_plane, continue_special_points
+from vrw_jax.branches.test_functions import (
     AbstractTestFunction,
     TestFunctionCurve,
     TestFunctionNewtonStep,

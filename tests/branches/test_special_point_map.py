@@ -10,8 +10,8 @@ from vrw_jax.branches.special_point_map import (
     find_sign_changes_in_scan,
     find_unexplained_sign_changes,
 )
-from vrw_jax.measures import MARGIN_MEASURES
-from vrw_jax.scans import follow_special_points
+from vrw_jax.models import MARGIN_MEASURES
+from vrw_jax.studies import follow_special_points
 
 MAP_PARAMETERS = ("damping", "stiffness")
 C, K = np.linspace(50.0, 150.0, 11), np.linspace(400.0, 600.0, 9)
@@ -126,7 +126,7 @@ def test_a_map_scans_what_the_curves_need_and_follows_them(monkeypatch):
         followed.update(scan=scan, base=base, model=model)
         return (curve,), ()
 
-    monkeypatch.setattr("vrw_jax.scans.special_point_map.trace_special_points", trace)
+    monkeypatch.setattr("vrw_jax.studies.special_point_map.trace_special_points", trace)
     stages, base = [], vrw.WheelParams(slope=0.29)
     grid = vrw.grid(damping=[150.0, 160.0], stiffness=[495.0, 505.0])
     special_points = vrw.map_special_points(grid, "speed", base=base, on_stage=stages.append)

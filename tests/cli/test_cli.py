@@ -22,17 +22,18 @@ from support.slow_variants import mark_slow
 from typer.testing import CliRunner, Result
 
 import vrw_jax as vrw
+from vrw_jax.app import commands as cli
+from vrw_jax.app import scanning
+from vrw_jax.app.commands import app
+from vrw_jax.app.config import parse_config
+from vrw_jax.app.console import make_scan_progress_reporter
+from vrw_jax.app.encoding import replace_unencodable_characters
 from vrw_jax.branches.branch import Branch
-from vrw_jax.cli import commands as cli
-from vrw_jax.cli import scanning
-from vrw_jax.cli.commands import app
-from vrw_jax.cli.config import parse_config
-from vrw_jax.cli.console import make_scan_progress_reporter
-from vrw_jax.cli.encoding import replace_unencodable_characters
-from vrw_jax.scans import SpecialPointMap, forecast
-from vrw_jax.scans.execution import ScanProgress
-from vrw_jax.scans.planning import ScanPlan
-from vrw_jax.scans.store import open_scan
+from vrw_jax.studies import SpecialPointMap
+from vrw_jax.studies import scan_forecast as forecast
+from vrw_jax.studies.scan_execution import ScanProgress
+from vrw_jax.studies.scan_planning import ScanPlan
+from vrw_jax.studies.scan_store import open_scan
 from vrw_jax.wheel.outcomes import Outcome
 
 SCAN_CONFIG = """
@@ -151,7 +152,7 @@ def test_characters_that_a_terminal_lacks_are_spelled(
     encoding: str, words: list[str], sentence: str
 ) -> None:
     code = (
-        "from vrw_jax.cli import console, encoding\n"
+        "from vrw_jax.app import console, encoding\n"
         "encoding.replace_unencodable_output()\n"
         'headings = ("quantity", "symbol", "unit")\n'
         'console.print_text_table("λ", [("θ̇⁻", "λ4⁺", "N·s²")], headings)\n'
@@ -204,7 +205,7 @@ def test_a_map_prints_its_stages_after_the_scan(
         on_stage("following special points: fold")
         return SpecialPointMap(scan, (), ())
 
-    monkeypatch.setattr("vrw_jax.cli.commands.follow_special_points", follow)
+    monkeypatch.setattr("vrw_jax.app.commands.follow_special_points", follow)
     result = run_command("map", config)
     assert result.exit_code == 0, result.output
     stages = [line for line in result.stderr.splitlines() if line.endswith(" ...")]
@@ -226,7 +227,7 @@ def test_a_map_of_force_peaks_has_those_of_each_gait_on_the_mesh_of_the_config(
         "mesh_intervals = [40, 32, 16]\n"
     )
     monkeypatch.setattr(
-        "vrw_jax.cli.commands.follow_special_points", lambda scan, *_: SpecialPointMap(scan, (), ())
+        "vrw_jax.app.commands.follow_special_points", lambda scan, *_: SpecialPointMap(scan, (), ())
     )
     result = run_command("map", config, "--out", tmp_path)
     assert result.exit_code == 0, result.output
@@ -466,7 +467,7 @@ def test_a_branch_without_a_gait_is_reported_and_writes_nothing(
 ) -> None:
     none = Branch("damping", xr.Dataset(coords={"damping": ("point", np.zeros(0))}), (),
                   ("", ""), Outcome.NO_CYCLE_FOUND)  # fmt: skip
-    monkeypatch.setattr("vrw_jax.cli.commands.continue_branch", lambda *_, **__: none)
+    monkeypatch.setattr("vrw_jax.app.commands.continue_branch", lambda *_, **__: none)
     config.write_text('[branch]\nparameter = "damping"\nbounds = [290.0, 300.0]\n')
     result = run_command("continue", config)
     assert result.exit_code == 1
@@ -532,7 +533,7 @@ def test_a_gait_of_the_simplest_model_names_the_model_and_the_reason(
 INTERRUPTED_SCAN_SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})
-from vrw_jax.scans.planning import ScanPlan
+from vrw_jax.studies.scan_planning import ScanPlan
 def wait_for_signal():
     for _ in range(600):  # Python handles a signal that arrives just before a sleep after it.
         time.sleep(0.1)
@@ -546,7 +547,7 @@ def slow(columns):
             wait_for_signal()
 ScanPlan.build_scan_engine = lambda _: slow
 sys.argv = ["vrw", "scan", {config!r}]
-from vrw_jax.cli.commands import main
+from vrw_jax.app.commands import main
 main()
 """
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vrw_jax.cli.config import Config, load_config, parse_assignment, parse_config
+from vrw_jax.app.config import Config, load_config, parse_assignment, parse_config
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 CONFIG_FOLDER = Path(__file__).parents[2] / "configs"

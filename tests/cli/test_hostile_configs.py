@@ -6,8 +6,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from vrw_jax.cli import config
-from vrw_jax.selection import list_model_config_names
+from vrw_jax.app import config
+from vrw_jax.models import list_model_config_names
 
 SWEPT = (*config.PARAMETER_NAMES, config.FRICTION_NAME)
 RANGES = dict.fromkeys(config.RANDOM_DESIGN_FUNCTIONS, ("n", "seed", *SWEPT))

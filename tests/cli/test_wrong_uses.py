@@ -11,8 +11,8 @@ import pytest
 from support.scanning import evaluate_arithmetically
 from typer.testing import CliRunner
 
-from vrw_jax.cli.commands import app
-from vrw_jax.scans.planning import ScanPlan
+from vrw_jax.app.commands import app
+from vrw_jax.studies.scan_planning import ScanPlan
 
 WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "not TOML": ("[wheel", "not valid TOML"),
@@ -394,7 +394,7 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
 def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A place with a letter, and with what is no store; a second is enough for a scheduler."""
     monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: evaluate_arithmetically)
-    monkeypatch.setattr("vrw_jax.scans.dask.DASK_SCHEDULER_TIMEOUT", "1s")
+    monkeypatch.setattr("vrw_jax.studies.scan_dask.DASK_SCHEDULER_TIMEOUT", "1s")
     monkeypatch.chdir(tmp_path)
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)

@@ -9,7 +9,7 @@ from numpy.polynomial import Chebyshev
 from reference_code import five_coordinates
 
 import vrw_jax as vrw
-from vrw_jax.measures import FORCE_PEAK_MEASURES
+from vrw_jax.models import FORCE_PEAK_MEASURES
 
 TABLE_1 = vrw.WheelParams()
 TWO_PEAKS = vrw.WheelParams(stiffness=2500.0, damping=100.0, natural_length=1.0, slope=0.075)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.cycles import gait_walks
+from vrw_jax.gaits import gait_walks
 
 N_COORDINATES = 3
 FIXED_POINT = np.array([0.1, 1.5, -0.1])

@@ -13,16 +13,16 @@ from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.contact import batch_walks as ground_lanes
-from vrw_jax.contact import embed_section_states, step_batch_with_jacobian
-from vrw_jax.continuation.arclength import ArclengthOptions
-from vrw_jax.continuation.floquet import (
+from vrw_jax.branches.arclength import ArclengthOptions
+from vrw_jax.gaits import unilateral_finder as on_ground
+from vrw_jax.gaits.floquet import (
     compute_bifurcation_margins,
     compute_jury_margins,
     floquet_multipliers,
 )
-from vrw_jax.cycles import unilateral_finder as on_ground
-from vrw_jax.selection.ladder import ModelCode
+from vrw_jax.models import contact_walks as ground_lanes
+from vrw_jax.models import embed_section_states, step_batch_with_jacobian
+from vrw_jax.models.ladder import ModelCode
 from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)

@@ -14,8 +14,8 @@ from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax import simd
-from vrw_jax.continuation import floquet, solve_fixed_point_implicit
+from vrw_jax import lanes
+from vrw_jax.gaits import floquet, solve_fixed_point_implicit
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, make_wheel_from_parameters
 
@@ -124,7 +124,7 @@ def test_first_derivatives_agree_with_the_reference(options, allowed):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not simd.is_machine_code_available(), reason="machine code is for CPUs")
+@pytest.mark.skipif(not lanes.is_machine_code_available(), reason="machine code is for CPUs")
 def test_gradients_of_multipliers_use_machine_code_throughout():
     radius = lambda vector: vrw.limit_cycle(reference_values.make_wheel(vector)).spectral_radius
     program = (

@@ -11,8 +11,8 @@ from reference_code.contact_force_extrema import find_step_extrema, make_start
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.measures import FORCE_PEAK_MEASURES
-from vrw_jax.selection.ladder import ModelCode
+from vrw_jax.models import FORCE_PEAK_MEASURES
+from vrw_jax.models.ladder import ModelCode
 
 TWO_PEAKS = vrw.WheelParams(stiffness=2500.0, damping=100.0, natural_length=1.0, slope=0.075)
 TABLE_1 = vrw.WheelParams()

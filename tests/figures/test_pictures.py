@@ -12,13 +12,14 @@ from PIL import Image
 
 import vrw_jax as vrw
 from experiments.shared.color_vision import simulate_color_vision
-from vrw_jax.figures import _branches as branch
-from vrw_jax.figures import indicators, save_animation, style
-from vrw_jax.figures._branches import basin_figure
-from vrw_jax.figures._tuning import tuning_figure
-from vrw_jax.tuning import TrialKind
-from vrw_jax.tuning.maximization import TuneStatus
-from vrw_jax.tuning.tune_result import ActiveConstraint, WalkValidation
+from vrw_jax.app import _branch_figures as branch
+from vrw_jax.app import figure_style as style
+from vrw_jax.app._branch_figures import basin_figure
+from vrw_jax.app._tuning_figures import tuning_figure
+from vrw_jax.app._walk_figures import indicators, save_animation
+from vrw_jax.studies import TrialKind
+from vrw_jax.studies.tune_maximization import TuneStatus
+from vrw_jax.studies.tune_result import ActiveConstraint, WalkValidation
 from vrw_jax.wheel import Outcome
 
 ROOT = Path(__file__).parents[2]

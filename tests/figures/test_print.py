@@ -19,9 +19,11 @@ from PIL import Image
 import vrw_jax as vrw
 import vrw_jax.continuation
 import vrw_jax.hybrid
+from vrw_jax.app import _contact_figures as _contact
+from vrw_jax.app import figure_style as style
+from vrw_jax.app._walk_figures import ground_forces
 from vrw_jax.branches import Branch, SpecialPoint
 from vrw_jax.branches.branch import FixedPoint
-from vrw_jax.figures import _contact, ground_forces, style
 from vrw_jax.wheel import ContactMode, Outcome
 
 ROOT = Path(__file__).parents[2]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vrw_jax.figures import scan_figures
-from vrw_jax.figures.style import OUTCOME_LABELS_AND_COLORS, format_axis_label
+from vrw_jax.app._scan_figures import scan_figures
+from vrw_jax.app.figure_style import OUTCOME_LABELS_AND_COLORS, format_axis_label
 from vrw_jax.wheel import Outcome
 
 

@@ -6,9 +6,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.mathtext import MathTextParser
 
-from vrw_jax import figures
-from vrw_jax.figures import style
-from vrw_jax.measures import MEASURES
+from vrw_jax import plot
+from vrw_jax.app import figure_style as style
+from vrw_jax.models import MEASURES
 from vrw_jax.wheel import Outcome
 
 MATHTEXT_PARSER = MathTextParser("path")
@@ -66,7 +66,7 @@ def test_cells_have_the_colors_of_their_outcomes_and_others_stay_empty(known):
 
 def test_a_style_ends_with_its_figure():
     before = dict(mpl.rcParams)
-    with figures.figure_style():
+    with plot.figure_style():
         assert mpl.rcParams["font.serif"] == ["STIXGeneral"]
     assert dict(mpl.rcParams) == before
 

@@ -9,20 +9,20 @@ import pytest
 from reference_code import moreau_jean
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_modes import (
-    ALL_MODES_MASK,
-    AllowedContactModes,
-    ContactSignTolerances,
-    choose_combination,
-    solve_combination,
-)
-from vrw_jax.contact.mechanics import (
+from vrw_jax.models.contact_mechanics import (
     WheelMotion,
     compute_free_acceleration,
     compute_free_velocity,
     find_contact_slots,
     make_inverse_inertia,
     select_slot_friction,
+)
+from vrw_jax.models.contact_modes import (
+    ALL_MODES_MASK,
+    AllowedContactModes,
+    ContactSignTolerances,
+    choose_combination,
+    solve_combination,
 )
 from vrw_jax.wheel import ContactMode
 

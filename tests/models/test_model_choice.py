@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.measures import SELECTION_MARGIN_NAMES
-from vrw_jax.selection.ladder import (
-    ModelCode,
-    describe_selection_reason,
-)
+from vrw_jax.models import SELECTION_MARGIN_NAMES
+from vrw_jax.models.ladder import ModelCode, describe_selection_reason
 
 START = (0.1, 1.6, -0.1)
 

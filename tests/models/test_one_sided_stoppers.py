@@ -9,10 +9,14 @@ import pytest
 from reference_code import moreau_jean
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_state import ContactState, make_guard_layout
-from vrw_jax.contact.impacts import ContactLaw, classify_event, resolve_event
-from vrw_jax.contact.mechanics import WheelMotion, compute_kinetic_energy, compute_potential_energy
-from vrw_jax.contact.section import unpack_section_state
+from vrw_jax.models.contact_impacts import ContactLaw, classify_event, resolve_event
+from vrw_jax.models.contact_mechanics import (
+    WheelMotion,
+    compute_kinetic_energy,
+    compute_potential_energy,
+)
+from vrw_jax.models.contact_section import unpack_section_state
+from vrw_jax.models.contact_state import ContactState, make_guard_layout
 from vrw_jax.wheel import ContactMode
 
 START = (0.1, 1.6, -0.1)

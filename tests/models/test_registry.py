@@ -5,9 +5,13 @@ from typing import ClassVar
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.cli.config import parse_config
-from vrw_jax.models import GaitMethod, ModelCapabilities
-from vrw_jax.selection import REGISTERED_MODEL_CLASSES, describe_accepted_models
+from vrw_jax.app.config import parse_config
+from vrw_jax.models import (
+    REGISTERED_MODEL_CLASSES,
+    GaitMethod,
+    ModelCapabilities,
+    describe_accepted_models,
+)
 from vrw_jax.wheel import PARAMETER_NAMES
 
 
@@ -57,7 +61,7 @@ def test_a_new_model_in_the_registry_is_known_to_configurations_and_messages(mon
     with pytest.raises(ValueError, match="viscoelastic"):
         parse_config(text)
     monkeypatch.setattr(
-        "vrw_jax.selection.registry.REGISTERED_MODEL_CLASSES",
+        "vrw_jax.models.registry.REGISTERED_MODEL_CLASSES",
         [*REGISTERED_MODEL_CLASSES, PointFeetWheel],
     )
     assert isinstance(parse_config(text).make_model(), PointFeetWheel)

@@ -7,9 +7,13 @@ import pytest
 from reference_code import complementarity
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_state import ContactState, make_guard_layout
-from vrw_jax.contact.impacts import ContactLaw, classify_event, project_motion, resolve_event
-from vrw_jax.contact.mechanics import WheelMotion, compute_kinetic_energy, compute_leg_directions
+from vrw_jax.models.contact_impacts import ContactLaw, classify_event, project_motion, resolve_event
+from vrw_jax.models.contact_mechanics import (
+    WheelMotion,
+    compute_kinetic_energy,
+    compute_leg_directions,
+)
+from vrw_jax.models.contact_state import ContactState, make_guard_layout
 from vrw_jax.wheel import ContactMode
 
 N_IMPACTS, RNG_SEED = 400, 3

@@ -13,7 +13,18 @@ from scipy.optimize import brentq
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.contact.contact_state import (
+from vrw_jax.flow.diffrax_minima import GuardsAndMargins
+from vrw_jax.flow.phase_integration import integrate_phase
+from vrw_jax.models.contact_impacts import ContactLaw, classify_event, resolve_event
+from vrw_jax.models.contact_mechanics import (
+    WheelMotion,
+    compute_foot_heights,
+    compute_kinetic_energy,
+    compute_leg_directions,
+    compute_potential_energy,
+)
+from vrw_jax.models.contact_section import unpack_section_state
+from vrw_jax.models.contact_state import (
     ContactState,
     EnergyLossAccumulators,
     compute_forces,
@@ -24,17 +35,6 @@ from vrw_jax.contact.contact_state import (
     pack_state,
     unpack_state,
 )
-from vrw_jax.contact.impacts import ContactLaw, classify_event, resolve_event
-from vrw_jax.contact.mechanics import (
-    WheelMotion,
-    compute_foot_heights,
-    compute_kinetic_energy,
-    compute_leg_directions,
-    compute_potential_energy,
-)
-from vrw_jax.contact.section import unpack_section_state
-from vrw_jax.hybrid.minima import GuardsAndMargins
-from vrw_jax.hybrid.phase_integration import integrate_phase
 from vrw_jax.wheel import ContactMode
 
 START = (0.1, 1.6, -0.1)

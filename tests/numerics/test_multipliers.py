@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vrw_jax.continuation import floquet
+from vrw_jax.gaits import floquet
 
 RANDOM_GENERATOR = np.random.default_rng(3)
 

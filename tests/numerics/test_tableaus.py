@@ -9,8 +9,8 @@ import diffrax
 import numpy as np
 import pytest
 
-from vrw_jax.integrator import load_explicit_tableau, tableaus
-from vrw_jax.numerics.options import SOLVER_NAMES
+from vrw_jax.base.options import SOLVER_NAMES
+from vrw_jax.flow import load_explicit_tableau, tableaus
 
 
 def read_tableau(name):

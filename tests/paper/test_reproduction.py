@@ -13,11 +13,11 @@ import xarray as xr
 from PIL import Image
 from typer.testing import CliRunner
 
-from vrw_jax import figures as plots
-from vrw_jax.cli import commands as cli
-from vrw_jax.paper import reproduction as reproduce
-from vrw_jax.paper.facts import table as facts
-from vrw_jax.paper.facts.base import PaperEvidence
+from vrw_jax import plot as plots
+from vrw_jax.app import commands as cli
+from vrw_jax.app import paper_reproduction as reproduce
+from vrw_jax.app import paper_table as facts
+from vrw_jax.app.paper_fact import PaperEvidence
 from vrw_jax.wheel.outcomes import Outcome
 
 FIGURE_NAMES = (
@@ -88,7 +88,7 @@ def test_a_failed_fact_is_printed_and_sets_the_exit_code(
     broken = dataclasses.replace(evidence, damping_branch=branch)
     monkeypatch.setattr(reproduce, "collect_paper_evidence", lambda on_progress: broken)
     monkeypatch.setattr(reproduce, "write_paper_figures", lambda evidence, folder: [])
-    monkeypatch.setattr("vrw_jax.cli.commands.start_jax", lambda: None)
+    monkeypatch.setattr("vrw_jax.app.commands.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
     assert result.exit_code == cli.ExitCode.CHECK_FAILED
     table = facts.compute_paper_facts(broken)

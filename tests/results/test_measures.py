@@ -2,15 +2,19 @@
 
 import pytest
 
-from vrw_jax.measures import (
+from vrw_jax.base import (
+    format_heading_and_rows,
+    format_html_table,
+    format_markdown_table,
+    format_mathtext,
+)
+from vrw_jax.models import (
     MARGIN_MEASURES,
     SELECTION_MARGIN_NAMES,
     STEP_MEASURES,
     describe_violation,
-    format_mathtext,
 )
-from vrw_jax.printing import format_heading_and_rows, format_html_table, format_markdown_table
-from vrw_jax.selection.ladder import describe_selection_reason
+from vrw_jax.models.ladder import describe_selection_reason
 
 INDICATORS = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 

@@ -8,8 +8,8 @@ from scipy.special import ndtr
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.robustness.passage_gradient import differentiate_log_mean_steps
-from vrw_jax.robustness.sampled_passage import (
+from vrw_jax.studies.passage_gradient import differentiate_log_mean_steps
+from vrw_jax.studies.sampled_passage import (
     PASSAGE_SAMPLING_OPTIONS,
     PassageSamplingOptions,
     WalkerGroups,

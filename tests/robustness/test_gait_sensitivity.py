@@ -7,8 +7,8 @@ import pytest
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.cycles import compute_sensitivity_norms, make_finder, slope_response
-from vrw_jax.simulation import walk
+from vrw_jax.gaits import compute_sensitivity_norms, make_finder, slope_response
+from vrw_jax.models import walk
 
 TABLE_1 = vrw.WheelParams()
 PERIOD_NORM = 3.509

@@ -8,7 +8,7 @@ from support.slow_variants import mark_slow
 from typer.testing import CliRunner
 
 import vrw_jax as vrw
-from vrw_jax.cli.commands import app
+from vrw_jax.app.commands import app
 
 SLOPE_SD = 0.02
 MEASURES = ["mean_steps", "mean_steps_error", "failure_probability"]

@@ -15,8 +15,8 @@ from support.machine_code import CodeRegistrySpy, use_cache_folder
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax import simd
-from vrw_jax.simd import disk_cache as store
+from vrw_jax import lanes
+from vrw_jax.lanes import disk_cache as store
 
 X = np.arange(4.0)
 FACTORS = (2.0, 3.0)
@@ -43,10 +43,12 @@ def multiples():
     """Return the numbers of X times each factor, by machine code and by a trace that calls it."""
     results = []
     for factor in FACTORS:
-        times = simd.compile_batch_function(functools.partial(multiply, factor))
+        times = lanes.compile_batch_function(functools.partial(multiply, factor))
         results.append(times.run(X))
         call = lambda x, g=times: g(x) + 0.0
-        results.append(simd.compile_exported_function(call, (jnp.asarray(X),), jax.devices()[0])(X))
+        results.append(
+            lanes.compile_exported_function(call, (jnp.asarray(X),), jax.devices()[0])(X)
+        )
     return results
 
 
@@ -157,7 +159,7 @@ def test_another_users_records_are_not_used(folder, process, monkeypatch):
 
 def test_a_trace_of_other_versions_is_not_used(folder, monkeypatch):
     spy = CodeRegistrySpy(monkeypatch)
-    run = lambda: simd.compile_batch_function(lambda x: 2.0 * x).run(X)
+    run = lambda: lanes.compile_batch_function(lambda x: 2.0 * x).run(X)
     run(), run()
     assert spy.n_traces == 1
     monkeypatch.setattr(store, "find_library_version", lambda library_name: "0.0")
@@ -189,7 +191,7 @@ def started(code="", **environment):
 def test_folders_of_code_are_the_users_alone_whatever_the_umask(tmp_path):
     code = (
         "vrw.start_jax(); import numpy as np; "
-        "from vrw_jax import simd; simd.compile_batch_function(lambda x: 2.0 * x).run(np.ones(4))"
+        "from vrw_jax import lanes; lanes.compile_batch_function(lambda x: 2.0 * x).run(np.ones(4))"
     )
     made = started(code, XDG_CACHE_HOME=str(tmp_path / "a" / "b"))
     assert made.returncode == 0, made.stderr

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.machine_code import CodeRegistrySpy, use_cache_folder
 
-from vrw_jax import simd
-from vrw_jax.simd import code_cache as code
-from vrw_jax.simd import disk_cache as store
-from vrw_jax.simd import saved_traces
+from vrw_jax import lanes
+from vrw_jax.lanes import code_cache as code
+from vrw_jax.lanes import disk_cache as store
+from vrw_jax.lanes import saved_traces
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9)))
 
@@ -28,9 +28,9 @@ def fresh_process(monkeypatch):
 
 def run_saved_program():
     """Return the results of a saved JAX program that calls machine code."""
-    double = simd.compile_batch_function(lambda x: 2.0 * x)
+    double = lanes.compile_batch_function(lambda x: 2.0 * x)
     run = lambda x: double(x) + 1.0
-    return simd.compile_exported_function(run, (X,), jax.devices()[0])(X)
+    return lanes.compile_exported_function(run, (X,), jax.devices()[0])(X)
 
 
 def test_a_cached_program_finds_the_machine_code_that_it_calls(cache_folder, fresh_process):
@@ -72,7 +72,7 @@ def test_a_program_cached_by_another_processor_is_traced_again(cache_folder, mon
     original_export = saved_traces.export.export
     spy = lambda *a, **k: exports.append(1) or original_export(*a, **k)
     monkeypatch.setattr(saved_traces.export, "export", spy)
-    run = lambda: simd.compile_exported_function(lambda x: 2.0 * x, (X,), jax.devices()[0])(X)
+    run = lambda: lanes.compile_exported_function(lambda x: 2.0 * x, (X,), jax.devices()[0])(X)
     run(), run()
     assert len(exports) == 1
     monkeypatch.setattr(saved_traces, "describe_processor", lambda: ("x86_64", "another", ""))
@@ -81,7 +81,7 @@ def test_a_program_cached_by_another_processor_is_traced_again(cache_folder, mon
 
 
 def test_damaged_files_are_compiled_again(cache_folder, fresh_process):
-    run = lambda: simd.compile_batch_function(lambda x: 2.0 * x).run(np.arange(4.0))
+    run = lambda: lanes.compile_batch_function(lambda x: 2.0 * x).run(np.arange(4.0))
     assert run()[3] == 6.0
     for place in cache_folder.glob("lanes_*"):
         content = bytearray(place.read_bytes())

@@ -9,7 +9,7 @@ import time
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.runtime import progress
+from vrw_jax.base import progress
 
 QUICK_FUNCTIONS = {
     "default_margins", "explore", "grid", "open_scan", "paper_start", "saltelli",

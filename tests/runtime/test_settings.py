@@ -10,7 +10,7 @@ from support.slow_variants import make_params_with_slow_marks
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
-from vrw_jax.numerics import with_default_jax_settings
+from vrw_jax.lanes import with_default_jax_settings
 
 STRICT_SETTINGS = (
     ("jax_disable_jit", True),

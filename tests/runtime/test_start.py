@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.simd import saved_traces
-from vrw_jax.simd.settings import make_fusion_emitter_options
+from vrw_jax.lanes import saved_traces
+from vrw_jax.lanes.settings import make_fusion_emitter_options
 
 
 def read_output_lines(code, **environment):

@@ -16,7 +16,7 @@ sys.modules["llvmlite"] = sys.modules["llvmlite.ir"] = sys.modules["llvmlite.bin
 import jax
 import numpy as np
 import vrw_jax as vrw
-from vrw_jax import simd
+from vrw_jax import lanes
 vrw.start_jax(sys.argv[1])
 params, start = vrw.WheelParams(), vrw.paper_start()
 wheels = vrw.WheelParams(damping=np.array([150.0, 200.0]))
@@ -25,11 +25,11 @@ results = {
     "period": float(vrw.limit_cycle(params).period),
     "section_states": vrw.step_batch(wheels, np.tile(start, (2, 1))).section_state.tolist(),
     "branch": vrw.continue_branch(params, "damping", (199.5, 200.5)).dataset.speed.values.tolist(),
-    "is_available": simd.is_machine_code_available(),
+    "is_available": lanes.is_machine_code_available(),
 }
 for name, call in {
     "engine": lambda: vrw.step(params, start, engine="lanes"),
-    "program": lambda: simd.kernel.write_llvm_kernel(jax.make_jaxpr(lambda x: x)(1.0), 4),
+    "program": lambda: lanes.kernel.write_llvm_kernel(jax.make_jaxpr(lambda x: x)(1.0), 4),
 }.items():
     try:
         call()
@@ -41,8 +41,8 @@ print(json.dumps(results))
 
 def test_the_library_is_imported_without_llvmlite():
     hide = "import sys; sys.modules.update(dict.fromkeys(('llvmlite', 'llvmlite.ir', "
-    check = hide + "'llvmlite.binding'))); import vrw_jax.simd as simd; "
-    check += "assert not simd.is_machine_code_available()"
+    check = hide + "'llvmlite.binding'))); import vrw_jax.lanes as lanes; "
+    check += "assert not lanes.is_machine_code_available()"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", check], env=environment, check=True)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.cli import config
+from vrw_jax.app import config
 
 REFERENCE_MODEL = vrw.UnilateralWheel(friction=20.0)
 TOLERANCE_DESIGN = vrw.grid(damping=[150.0, 300.0], friction=[4.0, 60.0])

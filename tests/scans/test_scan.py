@@ -28,23 +28,24 @@ from support.scanning import (
 )
 
 import vrw_jax as vrw
-from vrw_jax.cycles import finder
-from vrw_jax.numerics.batch_sizes import SCAN_BATCH_SIZE
-from vrw_jax.scans import dask, planning
-from vrw_jax.scans import design as designs
-from vrw_jax.scans import store as scan_store
-from vrw_jax.scans.collocation_engine import CollocationScanEngine
-from vrw_jax.scans.dask import connect_dask_workers
-from vrw_jax.scans.execution import ScanProgress
-from vrw_jax.scans.measure_catalog import ALWAYS_INCLUDED_VARIABLES
-from vrw_jax.scans.planning import (
+from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
+from vrw_jax.gaits import finder
+from vrw_jax.lanes.keys import make_key
+from vrw_jax.studies import scan_dask as dask
+from vrw_jax.studies import scan_design as designs
+from vrw_jax.studies import scan_planning as planning
+from vrw_jax.studies import scan_store
+from vrw_jax.studies.measure_catalog import ALWAYS_INCLUDED_VARIABLES
+from vrw_jax.studies.scan_collocation import CollocationScanEngine
+from vrw_jax.studies.scan_dask import connect_dask_workers
+from vrw_jax.studies.scan_execution import ScanProgress
+from vrw_jax.studies.scan_planning import (
     ChunkResult,
     ScanPlan,
     describe_settings_difference,
     plan_scan,
 )
-from vrw_jax.scans.store import choose_chunk_shape, open_scan
-from vrw_jax.simd.keys import make_key
+from vrw_jax.studies.scan_store import choose_chunk_shape, open_scan
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
@@ -511,8 +512,8 @@ import os, sys
 os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 import jax, numpy as np
 import vrw_jax
-from vrw_jax.numerics.batch_sizes import SCAN_BATCH_SIZE
-from vrw_jax.scans.collocation_engine import CollocationScanEngine
+from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
+from vrw_jax.studies.scan_collocation import CollocationScanEngine
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.arm import run_compiled_lanes
 
-from vrw_jax.simd import code_cache as code
-from vrw_jax.simd import kernel, machine
+from vrw_jax.lanes import code_cache as code
+from vrw_jax.lanes import kernel, machine
 
 ARM_TARGET = ("aarch64-unknown-linux-gnu", "generic", "+neon")
 LANES_PER_REGISTER = 2

@@ -12,9 +12,9 @@ import pytest
 from jax import lax
 from support.machine_code import CodeRegistrySpy, use_cache_folder
 
-from vrw_jax import simd
-from vrw_jax.simd import code_cache as code
-from vrw_jax.simd import kernel
+from vrw_jax import lanes
+from vrw_jax.lanes import code_cache as code
+from vrw_jax.lanes import kernel
 
 X = np.arange(4.0)
 
@@ -34,7 +34,7 @@ def multiply(factor):
     """Return multiples of X by machine code of a function that is defined anew."""
     scope = {}
     exec(f"def times(x):\n    return {factor} * x", scope)  # its number is part of the code
-    return simd.compile_batch_function(scope["times"]).run(X).tolist()
+    return lanes.compile_batch_function(scope["times"]).run(X).tolist()
 
 
 def test_a_later_start_neither_traces_nor_compiles(monkeypatch, process):
@@ -57,7 +57,7 @@ def test_the_same_trace_of_another_function_is_not_compiled(monkeypatch, process
 
 
 def add_two_programs(x, *functions):
-    return sum(simd.compile_batch_function(function)(x) for function in functions)
+    return sum(lanes.compile_batch_function(function)(x) for function in functions)
 
 
 def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch, process, folder):
@@ -101,7 +101,7 @@ def test_an_index_without_its_code_is_compiled_again(process, folder):
 
 def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store(process):
     with use_cache_folder(None):
-        call = simd.compile_batch_function(lambda x: 2.0 * x)
+        call = lanes.compile_batch_function(lambda x: 2.0 * x)
         for n in (5, 8, 11):
             x = jnp.arange(n) + 1.0
             np.testing.assert_array_equal(jax.jit(call)(x), 2.0 * x)
@@ -111,20 +111,20 @@ def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store(proc
 
 
 def test_code_is_loaded_by_its_name(process):
-    jax.jit(simd.compile_batch_function(lambda x: 2.0 * x))(jnp.ones(3))
+    jax.jit(lanes.compile_batch_function(lambda x: 2.0 * x))(jnp.ones(3))
     (name,) = process.names
-    assert not simd.load_saved_machine_code([name, "lanes_code_of_none"])
+    assert not lanes.load_saved_machine_code([name, "lanes_code_of_none"])
     process.reset_registry()
     with use_cache_folder(None):
-        assert not simd.load_saved_machine_code([name])
-    assert simd.load_saved_machine_code([name])
+        assert not lanes.load_saved_machine_code([name])
+    assert lanes.load_saved_machine_code([name])
     assert process.names == [name, name]
 
 
 def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
     result = """
         import jax, jax.numpy as jnp
-        from vrw_jax.simd import code_cache, kernel
+        from vrw_jax.lanes import code_cache, kernel
         def step(x, table):
             f = lambda k: {name: jnp.sin(k * x[0]) for name in ("beta", "alpha", "gamma")}
             sums = jax.tree.map(lambda y: y + jnp.sum(x * table[:, None], 0), f(2.0) | f(0.5))

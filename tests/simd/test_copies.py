@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
 
-from vrw_jax import simd
-from vrw_jax.simd import lowering
-from vrw_jax.simd.array_emitter import LANE_AXIS_SENTINEL
-from vrw_jax.simd.code_cache import trace_for_machine_code
-from vrw_jax.simd.kernel import write_llvm_kernel
+from vrw_jax import lanes
+from vrw_jax.lanes import lowering
+from vrw_jax.lanes.array_emitter import LANE_AXIS_SENTINEL
+from vrw_jax.lanes.code_cache import trace_for_machine_code
+from vrw_jax.lanes.kernel import write_llvm_kernel
 
 N_ARRAYS = 3
 N_ROWS = 5
@@ -74,7 +74,7 @@ def make_program(operations, reads_again):
 
 def run_as_machine_code(program, x, forces_copies):
     """Return the results; without room in registers, so that arrays are in memory."""
-    limits = simd.RegisterLimits(1, 1, max_register_entries=2, max_innermost_register_entries=2)
+    limits = lanes.RegisterLimits(1, 1, max_register_entries=2, max_innermost_register_entries=2)
     with pytest.MonkeyPatch.context() as patch:
         if forces_copies:
             find_last_uses = lowering._find_overwriting_equations
@@ -83,7 +83,7 @@ def run_as_machine_code(program, x, forces_copies):
                 "_find_overwriting_equations",
                 lambda jaxpr: dict.fromkeys(find_last_uses(jaxpr)),
             )
-        run = simd.compile_batch_function(program, register_limits=limits)
+        run = lanes.compile_batch_function(program, register_limits=limits)
         return np.asarray(jax.jit(run)(x))
 
 
@@ -101,7 +101,7 @@ def test_loops_in_place_compute_what_loops_with_copies_compute(operations, reads
 def test_a_loop_that_updates_an_array_allocates_it_once():
     double_row = lambda i, y: lax.dynamic_update_index_in_dim(y, 2.0 * y[i], i, 0)
     program = lambda x: lax.fori_loop(0, N_ROWS, double_row, 3.0 * x)
-    limits = simd.RegisterLimits(1, 1, max_register_entries=2, max_innermost_register_entries=2)
+    limits = lanes.RegisterLimits(1, 1, max_register_entries=2, max_innermost_register_entries=2)
     shape = jax.ShapeDtypeStruct((N_ROWS, LANE_AXIS_SENTINEL), np.float64)
     text = write_llvm_kernel(trace_for_machine_code(program, shape)[0], 4, limits)
     assert text.count(f"alloca <4 x double>, i64 {N_ROWS}") == 1

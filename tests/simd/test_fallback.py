@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax import simd
-from vrw_jax.simd import ffi_handler, ffi_primitive
+from vrw_jax import lanes
+from vrw_jax.lanes import ffi_handler, ffi_primitive
 
 PROGRAM = """
 import json, sys, warnings
@@ -20,23 +20,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from vrw_jax.simd import fallback, ffi_handler, rules
+from vrw_jax.lanes import fallback, ffi_handler, rules
 fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
 {change}
 import vrw_jax as vrw
-from vrw_jax import simd
+from vrw_jax import lanes
 vrw.start_jax(sys.argv[1])
 def double_until_large(x):
     return lax.while_loop(lambda y: jnp.any(y < 9.0), lambda y: jnp.where(y < 9.0, 2.0 * y, y), x)
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
-    is_available = simd.is_machine_code_available()
-    run = simd.compile_batch_function(double_until_large, xla_block_size=4)
+    is_available = lanes.is_machine_code_available()
+    run = lanes.compile_batch_function(double_until_large, xla_block_size=4)
     x = jnp.linspace(1.0, 10.0, 9)
     in_jit = (jax.jit(run) if is_available else jax.jit(double_until_large))(x).tolist()
     of_arrays = run.run(np.asarray(x)).tolist()
 messages = [str(w.message) for w in caught if "machine code does not work" in str(w.message)]
-print(json.dumps([in_jit, of_arrays, messages, simd.is_machine_code_available()]))
+print(json.dumps([in_jit, of_arrays, messages, lanes.is_machine_code_available()]))
 """
 
 CHANGES = {
@@ -72,7 +72,7 @@ def test_xla_computes_where_an_untested_jax_differs(change, tmp_path):
 WHEEL_PROGRAM = """
 import json, sys, warnings
 import numpy as np
-from vrw_jax.simd import fallback, ffi_handler
+from vrw_jax.lanes import fallback, ffi_handler
 fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
 ffi_handler.read_ffi_api_version = lambda: (7, 0)
 import vrw_jax as vrw
@@ -96,7 +96,7 @@ def test_the_library_computes_where_machine_code_cannot_be_called(tmp_path):
 
 def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
     """Structs of xla/ffi/api/c_api.h: a call frame, its extension, and the metadata."""
-    run = simd.compile_batch_function(lambda x: x + 1.0)
+    run = lanes.compile_batch_function(lambda x: x + 1.0)
     np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
     code = list(ffi_primitive.LOADED_CODE_BY_FFI_TARGET.values())[-1]
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(

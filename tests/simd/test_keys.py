@@ -14,16 +14,16 @@ import pytest
 from support.machine_code import CodeRegistrySpy, use_cache_folder
 
 import vrw_jax as vrw
-from vrw_jax import simd
+from vrw_jax import lanes
 from vrw_jax.branches.continuation_problems import make_trial_linearizer
-from vrw_jax.contact.batch_walks import _make_static_walk_settings
-from vrw_jax.contact.single_step import ContactStepConfig, sample_contact_interval
-from vrw_jax.contact.walk_kernel import run_walks
-from vrw_jax.cycles.collocation_search import CollocationSystem, run_search_attempts
-from vrw_jax.cycles.limit_cycle_result import solve_limit_cycle
+from vrw_jax.gaits.collocation_search import CollocationSystem, run_search_attempts
+from vrw_jax.gaits.limit_cycle_result import solve_limit_cycle
+from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.models.batch_step import make_step_outputs_function
+from vrw_jax.models.contact_kernel import run_walks
+from vrw_jax.models.contact_step import ContactStepConfig, sample_contact_interval
+from vrw_jax.models.contact_walks import _make_static_walk_settings
 from vrw_jax.models.phase_sequence import make_step_result
-from vrw_jax.simd.keys import UnresolvableFunctionError, make_key
 
 GRAVITY = 9.81
 moon = types.ModuleType("moon")
@@ -245,9 +245,9 @@ def test_a_function_without_a_key_is_traced_at_each_call_and_never_saved(tmp_pat
     with use_cache_folder(tmp_path):
         for gravity in (9.81, 1.62):
             monkeypatch.setattr(moon, "gravity", gravity)
-            result = simd.compile_batch_function(read_by_name).run(np.ones(3))
+            result = lanes.compile_batch_function(read_by_name).run(np.ones(3))
             np.testing.assert_array_equal(result, np.full(3, gravity))
-            np.testing.assert_array_equal(simd.jit(read_by_name).batch(np.ones(3)), result)
+            np.testing.assert_array_equal(lanes.jit(read_by_name).batch(np.ones(3)), result)
         assert spy.n_traces == 4
         assert not list(tmp_path.iterdir())
 
@@ -256,7 +256,7 @@ def test_keys_are_the_same_in_every_process():
     lines = """
         import jax, jax.numpy as jnp, numpy as np
         import vrw_jax as vrw
-        from vrw_jax.simd.keys import make_key
+        from vrw_jax.lanes.keys import make_key
         law = lambda x, c={"b": {1, 2}, "a": np.arange(2.0)}: jnp.sin(x) + len(c)
         model = vrw.UnilateralWheel(friction=0.5)
         structure = jax.tree.structure(vrw.WheelParams())

@@ -8,7 +8,7 @@ import pytest
 from jax import lax
 from support.machine_code import CodeRegistrySpy, disable_machine_code
 
-from vrw_jax import simd
+from vrw_jax import lanes
 
 N = 21  # no multiple of the lanes in a group
 GENERATOR = np.random.default_rng(0)
@@ -94,7 +94,7 @@ def assert_equal_trees(actual, expected, tolerance=1e-13):
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_batches_agree_with_vmap(function):
-    compiled, expected = simd.jit(function), jax.vmap(function)(X, K)
+    compiled, expected = lanes.jit(function), jax.vmap(function)(X, K)
     batch = compiled.batch(X, K)
     assert_equal_trees(batch, expected)
     assert_equal_trees(jax.jit(jax.vmap(compiled))(X, K), expected)
@@ -136,7 +136,7 @@ def unroll(x, law):
     ],
 )
 def test_derivatives_of_every_mode_agree_with_an_unrolled_loop(transform):
-    actual = transform(simd.jit(energy))(jnp.asarray(X[0]), LAW)
+    actual = transform(lanes.jit(energy))(jnp.asarray(X[0]), LAW)
     assert_equal_trees(actual, transform(unroll)(jnp.asarray(X[0]), LAW))
 
 
@@ -155,12 +155,12 @@ def test_other_numbers_in_closures_trace_nothing_anew(monkeypatch):
 
     spy = CodeRegistrySpy(monkeypatch)
     for stiffness, shift in ((2.0, 1.0), (3.0, -1.0), (4.0, 0.5)):
-        compiled = simd.jit(make(stiffness, shift))
+        compiled = lanes.jit(make(stiffness, shift))
         expected = stiffness * (stiffness * X + 2.0 * shift)
         np.testing.assert_allclose(compiled.batch(X), expected, rtol=1e-14, atol=1e-14)
     assert spy.n_traces == 1
     # Derivatives with respect to a number of the closure.
-    slope = jax.grad(lambda k: simd.jit(make(k, 1.0))(0.5))(2.0)
+    slope = jax.grad(lambda k: lanes.jit(make(k, 1.0))(0.5))(2.0)
     assert slope == pytest.approx(2.0 * 2.0 * 0.5 + 2.0, rel=1e-14)
 
 
@@ -168,7 +168,7 @@ def test_a_number_that_python_needs_is_part_of_the_code(monkeypatch):
     make = lambda power: lambda x: x**2 if power > 1.5 else x * float(power)
     for power in (2.0, 1.0, 0.5):
         np.testing.assert_array_equal(
-            simd.jit(make(power)).batch(X), X**2 if power > 1.5 else X * power
+            lanes.jit(make(power)).batch(X), X**2 if power > 1.5 else X * power
         )
 
 
@@ -176,7 +176,7 @@ def test_static_and_shared_arguments():
     def evaluate(x, table, kind, scale):
         return scale * (x @ table if kind == "product" else x[0] + table.sum())
 
-    table, compiled = np.arange(12.0).reshape(3, 4), simd.jit(evaluate)
+    table, compiled = np.arange(12.0).reshape(3, 4), lanes.jit(evaluate)
     np.testing.assert_allclose(
         compiled.batch(X, table, "product", 2.0, in_axes=(0, None, None, None)), 2.0 * X @ table
     )
@@ -189,7 +189,7 @@ def test_static_and_shared_arguments():
 
 
 def test_batches_of_different_lengths_are_refused_in_one_sentence():
-    compiled = simd.jit(lambda x, y: x + y)
+    compiled = lanes.jit(lambda x, y: x + y)
     with pytest.raises(ValueError, match=r"lengths \[3, 4\]: give 0 or None for each argument"):
         compiled.batch(np.ones(3), np.ones(4))
     assert compiled.batch(np.ones((0, 2)), np.ones((0, 2))).shape == (0, 2)
@@ -197,14 +197,14 @@ def test_batches_of_different_lengths_are_refused_in_one_sentence():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_number_format_is_that_of_the_arguments(dtype):
-    result = simd.jit(lambda x: jnp.sin(2.0 * x) + 1).batch(X.astype(dtype))
+    result = lanes.jit(lambda x: jnp.sin(2.0 * x) + 1).batch(X.astype(dtype))
     assert result.dtype == dtype
     np.testing.assert_allclose(result, np.sin(2.0 * X) + 1.0, atol=4.0 * np.finfo(dtype).eps)
 
 
 def test_xla_computes_where_a_primitive_has_no_machine_code():
     """A sort is missing; one warning names it."""
-    compiled = simd.jit(lambda x: jnp.sort(x) * 2.0)
+    compiled = lanes.jit(lambda x: jnp.sort(x) * 2.0)
     with pytest.warns(UserWarning, match="sort has no rule for lanes") as caught:
         first = compiled.batch(X)
     for _ in range(2):
@@ -214,8 +214,8 @@ def test_xla_computes_where_a_primitive_has_no_machine_code():
 
 
 def test_xla_computes_without_machine_code(monkeypatch):
-    expected = simd.jit(halve_until_small).batch(X, K)
+    expected = lanes.jit(halve_until_small).batch(X, K)
     disable_machine_code(monkeypatch)
-    compiled = simd.jit(halve_until_small, xla_block_size=8)
+    compiled = lanes.jit(halve_until_small, xla_block_size=8)
     assert_equal_trees(compiled.batch(X, K), expected)
     assert_equal_trees(compiled(X[0], K[0]), jax.tree.map(lambda x: x[0], expected))

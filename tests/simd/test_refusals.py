@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from jax import lax
 
-from vrw_jax import simd
-from vrw_jax.simd.array_emitter import LANE_AXIS_SENTINEL
+from vrw_jax import lanes
+from vrw_jax.lanes.array_emitter import LANE_AXIS_SENTINEL
 
 X = np.random.default_rng(0).normal(size=(2, 9))
 
 
 def call_program(function, *arrays):
     """Return the results of a function as machine code."""
-    run = simd.compile_batch_function(function)
+    run = lanes.compile_batch_function(function)
     return jax.jit(run)(*map(jnp.asarray, arrays))
 
 
@@ -57,7 +57,7 @@ def test_xla_computes_operations_without_machine_code_and_one_warning_names_them
 ):
     for _ in range(2):
         np.testing.assert_array_equal(call_program(function, X), function(X))
-        np.testing.assert_array_equal(simd.compile_batch_function(function).run(X), function(X))
+        np.testing.assert_array_equal(lanes.compile_batch_function(function).run(X), function(X))
     assert len(recwarn) == 1
     assert re.search(sentence, str(recwarn[0].message))
 
@@ -119,7 +119,7 @@ def test_a_uniform_number_is_broadcast_to_all_lanes():
 
 
 def test_vmap_and_derivatives_of_calls_are_refused():
-    double = simd.compile_batch_function(lambda x: 2.0 * x)
+    double = lanes.compile_batch_function(lambda x: 2.0 * x)
     with pytest.raises(NotImplementedError, match="vmap"):
         jax.vmap(double)(jnp.asarray(X))
     with pytest.raises(NotImplementedError, match="nor differentiated"):

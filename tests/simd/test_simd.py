@@ -7,16 +7,16 @@ import pytest
 from jax import lax
 from support.slow_variants import mark_slow
 
-from vrw_jax import simd
-from vrw_jax.simd.arithmetic import ELEMENTWISE_RULES
-from vrw_jax.simd.rules import PRIMITIVE_RULES
+from vrw_jax import lanes
+from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
+from vrw_jax.lanes.rules import PRIMITIVE_RULES
 
 RANDOM_GENERATOR = np.random.default_rng(0)
 
 
 def make_program(function, lanes, uniform=()):
     """Return `function(uniform, lanes)` as machine code."""
-    return simd.compile_batch_function(function).run
+    return lanes.compile_batch_function(function).run
 
 
 def run_both_backends(function, lanes, uniform=()):
@@ -112,9 +112,9 @@ def test_scans_run_over_their_constants():
 def test_a_lane_gives_the_same_bits_in_any_batch_and_on_any_number_of_cores(monkeypatch, n):
     lanes = [RANDOM_GENERATOR.normal(size=5_003) for _ in range(2)]
     run = make_program(evaluate_arithmetic, lanes, [np.float64(0.7)])
-    monkeypatch.setattr(simd.program, "count_available_cores", lambda: 1)
+    monkeypatch.setattr(lanes.program, "count_available_cores", lambda: 1)
     results_of_all_lanes = run([np.float64(0.7)], lanes)
-    monkeypatch.setattr(simd.program, "count_available_cores", lambda: 3)
+    monkeypatch.setattr(lanes.program, "count_available_cores", lambda: 3)
     selection = RANDOM_GENERATOR.permutation(5_003)[:n]
     for part, all_ in zip(
         run([np.float64(0.7)], [x[selection] for x in lanes]), results_of_all_lanes, strict=True
@@ -206,7 +206,7 @@ def overwrite_in_loops(x):
 
 def test_in_place_updates_of_loops_do_not_change_other_readers():
     x = RANDOM_GENERATOR.uniform(0.0, 6.0, (2, 12, 37))
-    call = simd.compile_batch_function(overwrite_in_loops)
+    call = lanes.compile_batch_function(overwrite_in_loops)
     for solution, expected in zip(jax.jit(call)(x), overwrite_in_loops(x), strict=True):
         np.testing.assert_allclose(solution, expected, rtol=1e-12, atol=1e-12)
 
@@ -240,7 +240,7 @@ def pick_rows(x, large):
 @pytest.mark.parametrize("n", [*mark_slow(1, 4), 1001])
 def test_array_functions_are_called_from_jax_programs(n):
     x = jnp.asarray(RANDOM_GENERATOR.normal(size=(20, 3, n)))
-    call = simd.compile_batch_function(use_arrays_in_loops)
+    call = lanes.compile_batch_function(use_arrays_in_loops)
     # One lane after the other: no lane may see another.
     expected = jax.vmap(
         lambda one: jax.tree.map(lambda y: y[..., 0], use_arrays_in_loops(one[..., None])), -1, -1
@@ -264,7 +264,7 @@ def test_noinline_functions_are_called_and_give_the_same():
         return run
 
     lanes = [RANDOM_GENERATOR.normal(size=11) for _ in range(2)]
-    called = make_program(cubes(simd.mark_noinline), lanes)([], lanes)
+    called = make_program(cubes(lanes.mark_noinline), lanes)([], lanes)
     for called_result, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
         np.testing.assert_allclose(called_result, expected, rtol=1e-13, atol=1e-13)
 

@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 from experiments.web.build import link_module
-from vrw_jax import simd
+from vrw_jax import lanes
 
 
 def halve_until(minimum, x):
@@ -29,7 +29,7 @@ def test_two_functions_in_one_module_agree_with_jax():
     }
     code = link_module(
         {
-            name: simd.compile_wasm_object(function, 1, [2], name)
+            name: lanes.compile_wasm_object(function, 1, [2], name)
             for name, function in by_input.items()
         }
     )

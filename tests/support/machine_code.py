@@ -5,9 +5,9 @@ import contextlib
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from vrw_jax.simd import code_cache as code
-from vrw_jax.simd import fallback, program
-from vrw_jax.simd import ffi_primitive as ffi
+from vrw_jax.lanes import code_cache as code
+from vrw_jax.lanes import fallback, program
+from vrw_jax.lanes import ffi_primitive as ffi
 
 _REGISTERED = ffi.LOADED_CODE_BY_FFI_TARGET  # XLA never releases code and accepts one code per name
 

@@ -66,7 +66,7 @@ def import_with_checks(packages: list[str]) -> None:
         patch.object(jaxtyping, "jaxtyped", check_first_calls),
         jaxtyping.install_import_hook(packages, "beartype.beartype"),
     ):
-        from vrw_jax.simd import keys
+        from vrw_jax.lanes import keys
 
     # What a checked function computes is what the function itself computes.
     checked = check_first_calls(typechecker=lambda target: target)(lambda: None)

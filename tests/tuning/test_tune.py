@@ -10,19 +10,19 @@ from support.files import assert_netcdf_round_trip
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.cli.reports import format_tuning_summary
-from vrw_jax.cycles import make_finder
-from vrw_jax.cycles.margin_defaults import DEFAULT_MARGIN_NAMES, default_margins
-from vrw_jax.measures.table import MARGIN_MEASURES
-from vrw_jax.tuning.maximization import MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
-from vrw_jax.tuning.objective import (
+from vrw_jax.app.reports import format_tuning_summary
+from vrw_jax.gaits import make_finder
+from vrw_jax.gaits.margin_defaults import DEFAULT_MARGIN_NAMES, default_margins
+from vrw_jax.models.measures import MARGIN_MEASURES
+from vrw_jax.studies.tune_maximization import MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
+from vrw_jax.studies.tune_objective import (
     compute_max_violation,
     compute_slack_scales,
     parse_constraint_margins,
     restore_sign_of_bound,
 )
-from vrw_jax.tuning.tune_problem import TuneProblem, make_tune_problem, tune
-from vrw_jax.tuning.tune_result import TuneResult
+from vrw_jax.studies.tune_problem import TuneProblem, make_tune_problem, tune
+from vrw_jax.studies.tune_result import TuneResult
 from vrw_jax.wheel import PARAMETER_NAMES
 
 PARAMETER_BOX = {

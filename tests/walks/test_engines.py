@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax import simd
-from vrw_jax.numerics import batch_sizes
+from vrw_jax import lanes
+from vrw_jax.base import batch_sizes
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, make_wheel_from_parameters
 
 N = 96
@@ -139,7 +139,7 @@ def test_the_result_names_its_engine():
     assert would(options=vrw.StepOptions(solver="Kvaerno5")) == "diffrax"
 
 
-@pytest.mark.skipif(not simd.is_machine_code_available(), reason="machine code is for CPUs")
+@pytest.mark.skipif(not lanes.is_machine_code_available(), reason="machine code is for CPUs")
 def test_a_jacobian_within_jit_compiles_only_its_own_machine_code(monkeypatch):
     class AskedError(Exception):
         pass
@@ -147,7 +147,7 @@ def test_a_jacobian_within_jit_compiles_only_its_own_machine_code(monkeypatch):
     def get_lane_program(function, *rest):
         raise AskedError(function.args[0].__qualname__)
 
-    monkeypatch.setattr("vrw_jax.simd.lane_function.get_lane_program", get_lane_program)
+    monkeypatch.setattr("vrw_jax.lanes.lane_function.get_lane_program", get_lane_program)
     unknown = vrw.StepOptions(max_solver_steps=12_345)  # nothing is traced for it yet
     state = lambda x: vrw.step(vrw.WheelParams(), x, options=unknown).section_state
     with pytest.raises(AskedError, match="build_step_jacobian"):

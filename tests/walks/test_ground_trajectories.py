@@ -12,7 +12,7 @@ import xarray as xr
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.selection.ladder import ModelCode
+from vrw_jax.models.ladder import ModelCode
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ import xarray as xr
 from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
-from vrw_jax.contact import embed_section_states
+from vrw_jax.models import embed_section_states
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import xarray as xr
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.measures.table import MEASURES, TRAJECTORY_MEASURES
+from vrw_jax.models.measures import MEASURES, TRAJECTORY_MEASURES
 from vrw_jax.wheel.dynamics import compute_momentum
 from vrw_jax.wheel.geometry import Motion
 

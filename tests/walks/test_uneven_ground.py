@@ -11,8 +11,8 @@ from reference_code.five_coordinates import TABLE_1
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.contact.mechanics import find_contact_slots, select_slot_friction
-from vrw_jax.contact.section import pack_section_state, unpack_section_state
+from vrw_jax.models.contact_mechanics import find_contact_slots, select_slot_friction
+from vrw_jax.models.contact_section import pack_section_state, unpack_section_state
 from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)

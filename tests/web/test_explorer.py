@@ -12,8 +12,8 @@ import xarray as xr
 from typer.testing import CliRunner
 
 import vrw_jax as vrw
-from vrw_jax.cli.commands import app
-from vrw_jax.web import make_page_address
+from vrw_jax.app.commands import app
+from vrw_jax.app.explorer import make_page_address
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_invalid_arguments_of_explore_are_refused_in_one_sentence(wrong, sentenc
 
 
 def test_a_missing_anywidget_is_reported_with_the_install_command(monkeypatch):
-    from vrw_jax.web import explorer
+    from vrw_jax.app import explorer
 
     monkeypatch.setitem(sys.modules, "anywidget", None)
     explorer._make_widget_class.cache_clear()

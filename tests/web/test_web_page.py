@@ -10,7 +10,7 @@ import pytest
 from support.web_code import PAGE_PATH
 
 import vrw_jax as vrw
-from vrw_jax.web import explorer
+from vrw_jax.app import explorer
 
 pytestmark = pytest.mark.slow
 BROWSER_SWITCHES = [

@@ -3,7 +3,7 @@
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.cli.config import parse_config
+from vrw_jax.app.config import parse_config
 
 # Period, s, and share of double support by an independent code of five constrained coordinates;
 # it printed seven and five digits.

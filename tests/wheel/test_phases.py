@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.collocation import PhasePoint
-from vrw_jax.cycles import phase_sequence as sequence
+from vrw_jax.flow import integrate_batch_phase, load_explicit_tableau
+from vrw_jax.gaits import PhasePoint
+from vrw_jax.gaits import phase_sequence as sequence
 from vrw_jax.hybrid import integrate_phase
-from vrw_jax.integrator import integrate_batch_phase, load_explicit_tableau
 from vrw_jax.models import batch_step as lane_step
 from vrw_jax.models.viscoelastic import make_diffrax_phase
 from vrw_jax.wheel import (

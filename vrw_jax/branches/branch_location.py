@@ -18,6 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax.base import batch_sizes
+from vrw_jax.branches import arclength
+from vrw_jax.branches.arclength import (
+    AbstractContinuationProblem,
+    ArclengthOptions,
+    ContinuationPoint,
+    ContinuationResult,
+    ContinuationSetup,
+    ContinuationStatus,
+    CorrectorPlane,
+)
+from vrw_jax.branches.batched_continuation import continue_branches_uncompiled, solve_on_planes
 from vrw_jax.branches.branch import FixedPoint, SpecialPoint
 from vrw_jax.branches.branch_points import (
     ADMISSIBILITY_COLUMN,
@@ -40,31 +52,16 @@ from vrw_jax.branches.multiplicity import (
     are_multipliers_off_circle,
     sort_multiplier_moduli,
 )
-from vrw_jax.continuation import (
+from vrw_jax.branches.sign_changes import (
     BIFURCATION_NAMES,
-    AbstractContinuationProblem,
-    ArclengthOptions,
-    ContinuationPoint,
-    ContinuationResult,
-    ContinuationSetup,
-    ContinuationStatus,
-    CorrectorPlane,
-    arclength,
-    continue_branches_uncompiled,
     evaluate_bifurcation_functions,
     find_sign_changes,
     has_unit_circle_pair,
     locate_function_roots,
-    solve_on_planes,
 )
-from vrw_jax.cycles import STATE_AGREEMENT_TOLERANCE
-from vrw_jax.numerics import (
-    batch_sizes,
-    concatenate_tree_rows,
-    map_in_numpy_batches,
-    select_tree_rows,
-)
-from vrw_jax.wheel import Outcome
+from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE
+from vrw_jax.lanes.batching import concatenate_tree_rows, map_in_numpy_batches, select_tree_rows
+from vrw_jax.wheel.outcomes import Outcome
 
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 """Name of a branch end at which the mesh is too coarse. Event-driven steps that start from the

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vrw_jax.continuation import ContinuationPoint
+from vrw_jax.branches.arclength import ContinuationPoint
 
 BRANCH_POINT_KIND = "branch_point"
 """Kind of a special point at which a multiplier is 1 but the branch does not turn back.

@@ -11,6 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax.base.options import StepOptions
+from vrw_jax.branches.arclength import ContinuationPoint
 from vrw_jax.branches.branch_location import CycleFinderFactory
 from vrw_jax.branches.continuation_problems import (
     AbstractGaitProblem,
@@ -19,18 +21,15 @@ from vrw_jax.branches.continuation_problems import (
     ContactGaitProblem,
     ReturnMapProblem,
 )
-from vrw_jax.continuation import ContinuationPoint
-from vrw_jax.cycles import (
-    CycleOptions,
-    LimitCycle,
-    limit_cycles,
-    make_finder,
-    transfer_solution_to_mesh,
-)
-from vrw_jax.models import AbstractWheel, GaitMethod
-from vrw_jax.numerics import StepOptions, select_tree_rows
-from vrw_jax.simulation import start_walk_toward_gait
-from vrw_jax.wheel import WheelParams
+from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.gait_search import limit_cycles
+from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.models.capabilities import GaitMethod
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.stepping import start_walk_toward_gait
+from vrw_jax.wheel.params import WheelParams
 
 
 class BranchRequest(NamedTuple):

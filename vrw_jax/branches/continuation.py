@@ -17,66 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.branches.branch import Branch, FixedPoint
-from vrw_jax.branches.branch_location import (
-    AbstractContinuation,
-    BranchData,
-    QuantitiesByName,
-    continue_and_locate_special_points,
-)
-from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
-from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
-from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
-from vrw_jax.continuation import (
-    UNIT_MULTIPLIER_ADVICE,
-    ArclengthOptions,
-    ContinuationPoint,
-    ContinuationResult,
-    ContinuationSetup,
-    CorrectorPlane,
-    FixedPointProblem,
-    check_state_units,
-    check_vector_map,
-    estimate_state_units,
-    floquet_multipliers,
-    has_unit_multiplier,
-    solve_on_planes,
-)
-from vrw_jax.cycles import (
-    AbstractCycle,
-    CycleOptions,
-    LimitCycle,
-    ReturnMapCycle,
-    make_finder,
-    resolve_model,
-)
-from vrw_jax.measures import (
-    FORCE_PEAK_MEASURES,
-    MARGIN_MEASURES,
-    STEP_MEASURES,
-    UNILATERAL_STEP_MEASURES,
-    make_labeled_variables,
-    make_locked_leg_coordinate,
-    make_measure_attributes,
-)
-from vrw_jax.measures import xarray as xr
-from vrw_jax.models import AbstractWheel
-from vrw_jax.numerics import (
-    StepOptions,
-    batch_sizes,
-    map_in_numpy_batches,
-    select_tree_rows,
-    with_default_jax_settings,
-)
-from vrw_jax.runtime import announce_wait
-from vrw_jax.simulation import (
-    ModelLike,
-    collect_provenance_attributes,
-    convert_model_argument,
-    convert_step_options,
-    require_single_wheel,
-)
-from vrw_jax.validation import (
+from vrw_jax.base import batch_sizes
+from vrw_jax.base.checks import (
     check_bool,
     check_callable,
     check_int,
@@ -87,7 +29,61 @@ from vrw_jax.validation import (
     require_no_masked_entries,
     require_untraced_arguments,
 )
-from vrw_jax.wheel import FRICTION_NAME, Outcome, WheelParams, check_parameter_name
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.branches.arclength import (
+    ArclengthOptions,
+    ContinuationPoint,
+    ContinuationResult,
+    ContinuationSetup,
+    CorrectorPlane,
+    FixedPointProblem,
+)
+from vrw_jax.branches.batched_continuation import solve_on_planes
+from vrw_jax.branches.branch import Branch, FixedPoint
+from vrw_jax.branches.branch_location import (
+    AbstractContinuation,
+    BranchData,
+    continue_and_locate_special_points,
+)
+from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME, QuantitiesByName
+from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
+from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
+from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.finder_selection import make_finder, resolve_model
+from vrw_jax.gaits.fixed_points import (
+    UNIT_MULTIPLIER_ADVICE,
+    check_state_units,
+    check_vector_map,
+    estimate_state_units,
+    has_unit_multiplier,
+)
+from vrw_jax.gaits.floquet import floquet_multipliers
+from vrw_jax.gaits.limit_cycle_result import LimitCycle
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.return_map_finder import ReturnMapCycle
+from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.measures import (
+    FORCE_PEAK_MEASURES,
+    MARGIN_MEASURES,
+    STEP_MEASURES,
+    UNILATERAL_STEP_MEASURES,
+    make_labeled_variables,
+    make_locked_leg_coordinate,
+    make_measure_attributes,
+)
+from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.stepping import (
+    ModelLike,
+    convert_model_argument,
+    convert_step_options,
+    require_single_wheel,
+)
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, check_parameter_name
 
 DOUBLE_SUPPORT_INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 BRANCH_ENDING_QUANTITIES = (

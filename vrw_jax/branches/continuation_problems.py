@@ -18,30 +18,31 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool
 
-from vrw_jax.branches.branch_points import CONTACT_ORDER_COLUMN
-from vrw_jax.collocation import CollocationSolution
-from vrw_jax.continuation import (
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Scalar
+from vrw_jax.branches import arclength
+from vrw_jax.branches.arclength import (
     AbstractContinuationProblem,
     ContinuationPoint,
     NewtonStep,
     ProblemUnknowns,
     SectionStateVector,
-    arclength,
 )
-from vrw_jax.cycles import (
-    CollocationSystem,
-    PeriodMap,
-    compute_correction_norm,
-    compute_force_peaks,
-    measure_return_map_force_peaks,
-    solve_linear_systems,
-)
-from vrw_jax.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
-from vrw_jax.models import AbstractStep, AbstractWheel, AnySectionState
-from vrw_jax.numerics import Scalar, StepOptions, compile_batch_function, unbatch
-from vrw_jax.wheel import (
+from vrw_jax.branches.branch_points import CONTACT_ORDER_COLUMN
+from vrw_jax.gaits.collocation_search import CollocationSystem, compute_correction_norm
+from vrw_jax.gaits.force_peaks import compute_force_peaks
+from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.gaits.return_map_finder import measure_return_map_force_peaks
+from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
+from vrw_jax.lanes.batching import unbatch
+from vrw_jax.lanes.lane_function import compile_batch_function
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax.models.step_inputs import AnySectionState
+from vrw_jax.models.step_results import AbstractStep
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
-    Outcome,
     WheelParams,
     make_wheel_from_parameters,
     stack_parameters,

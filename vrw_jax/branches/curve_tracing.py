@@ -15,14 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.base import batch_sizes
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_location import (
     AbstractContinuation,
     BranchData,
-    QuantitiesByName,
     continue_and_locate_special_points,
 )
-from vrw_jax.branches.branch_points import BRANCH_POINT_KIND
+from vrw_jax.branches.branch_points import BRANCH_POINT_KIND, QuantitiesByName
 from vrw_jax.branches.continuation import (
     BRANCH_ENDING_QUANTITIES,
     MAX_BRANCH_MESH_REFINEMENTS,
@@ -43,21 +46,16 @@ from vrw_jax.branches.gait_test_functions import (
     locate_jump_onset,
     select_test_quantity,
 )
-from vrw_jax.collocation import CollocationSolution
-from vrw_jax.continuation import (
-    BIFURCATION_NAMES,
-    ArclengthOptions,
-    ContinuationPoint,
-    TestFunctionCurve,
-    TestFunctionPoint,
-)
-from vrw_jax.cycles import CollocationSystem, LimitCycle, transfer_solution_to_mesh
-from vrw_jax.measures import MARGIN_MEASURES, make_labeled_variables
-from vrw_jax.measures import xarray as xr
-from vrw_jax.models import ViscoelasticWheel
-from vrw_jax.numerics import StepOptions, batch_sizes
-from vrw_jax.simulation import collect_provenance_attributes
-from vrw_jax.wheel import Outcome, WheelParams, make_wheel_from_parameters
+from vrw_jax.branches.sign_changes import BIFURCATION_NAMES
+from vrw_jax.branches.test_functions import TestFunctionCurve, TestFunctionPoint
+from vrw_jax.gaits.collocation_search import CollocationSystem
+from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
+from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
+from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams, make_wheel_from_parameters
 
 RANGE_EDGE_COLUMN = "edge of the box"
 """Name of the quantity that vanishes if the second parameter is at an end of its range."""

@@ -14,43 +14,38 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Scalar
+from vrw_jax.branches.arclength import SectionStateVector
 from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
-from vrw_jax.branches.continuation import (
-    DOUBLE_SUPPORT_INDICATOR_NAMES,
-    GaitContinuation,
-)
+from vrw_jax.branches.continuation import DOUBLE_SUPPORT_INDICATOR_NAMES, GaitContinuation
 from vrw_jax.branches.continuation_problems import (
     BranchWheel,
     CollocationProblem,
     make_trial_linearizer,
     measure_gait_period,
 )
-from vrw_jax.collocation import CollocationSolution
-from vrw_jax.continuation import (
-    BIFURCATION_NAMES,
+from vrw_jax.branches.sign_changes import BIFURCATION_NAMES
+from vrw_jax.branches.test_functions import (
     AbstractTestFunction,
-    SectionStateVector,
     TestFunctionNewtonStep,
     compute_offset_bifurcation_margins,
 )
-from vrw_jax.cycles import (
-    CollocationSystem,
-    compute_correction_norm,
-    compute_force_peaks,
-    compute_takeoff_acceleration,
-)
-from vrw_jax.measures import MARGIN_MEASURES
-from vrw_jax.models import ViscoelasticWheel
-from vrw_jax.numerics import Scalar, StepOptions, unbatch
-from vrw_jax.wheel import (
+from vrw_jax.gaits.collocation_search import CollocationSystem, compute_correction_norm
+from vrw_jax.gaits.force_peaks import compute_force_peaks
+from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration
+from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.lanes.batching import unbatch
+from vrw_jax.models.measures import MARGIN_MEASURES
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel import transitions
+from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
-    PhaseInstant,
     Symbols,
-    make_paper_phases,
     make_wheel_from_parameters,
     stack_parameters,
-    transitions,
 )
+from vrw_jax.wheel.phases import PhaseInstant, make_paper_phases
 
 LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_substitutes
 """Names of margins that vanish as a cube. Each margin is mapped to a quantity that vanishes

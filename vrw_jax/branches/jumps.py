@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from vrw_jax.continuation import ContinuationResult, ContinuationStatus
-from vrw_jax.numerics import select_tree_rows
+from vrw_jax.branches.arclength import ContinuationResult, ContinuationStatus
+from vrw_jax.lanes.batching import select_tree_rows
 
 # Largest number of jumps in one direction of a branch.
 MAX_JUMPS_PER_DIRECTION = 20

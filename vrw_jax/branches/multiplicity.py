@@ -17,7 +17,7 @@ from vrw_jax.branches.branch_points import (
     LocatedRoot,
     RootRequest,
 )
-from vrw_jax.continuation import MULTIPLIER_TOLERANCES
+from vrw_jax.gaits.floquet import MULTIPLIER_TOLERANCES
 
 
 def sort_multiplier_moduli(return_map_jacobians: np.ndarray) -> np.ndarray:

@@ -5,15 +5,17 @@ from typing import Any
 
 import numpy as np
 
+from vrw_jax.base.checks import check_names, check_range, check_type
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, CurveTracer
 from vrw_jax.branches.gait_test_functions import FORCE_QUANTITY_NAMES
-from vrw_jax.continuation import ArclengthOptions
-from vrw_jax.cycles import LimitCycle
-from vrw_jax.numerics import StepOptions, select_tree_rows, with_default_jax_settings
-from vrw_jax.runtime import announce_wait
-from vrw_jax.validation import check_names, check_range, check_type
-from vrw_jax.wheel import PARAMETER_DOMAINS, check_parameter_name, make_wheel_from_parameters
+from vrw_jax.gaits.limit_cycle_result import LimitCycle
+from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.wheel.params import PARAMETER_DOMAINS, check_parameter_name, make_wheel_from_parameters
 
 ParameterBounds = Mapping[str, tuple[float, float]]
 

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.branch_location import COARSE_MESH_END_NAME
 from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
@@ -26,12 +28,12 @@ from vrw_jax.branches.curve_tracing import (
     compute_distances_to_polyline,
 )
 from vrw_jax.branches.gait_test_functions import DLS_VANISHING_NAME, LINEAR_MARGIN_SUBSTITUTES
-from vrw_jax.continuation import BIFURCATION_NAMES
-from vrw_jax.measures import MARGIN_MEASURES
-from vrw_jax.measures import xarray as xr
-from vrw_jax.models import ViscoelasticWheel
-from vrw_jax.numerics import StepOptions, with_default_jax_settings
-from vrw_jax.wheel import Outcome, WheelParams
+from vrw_jax.branches.sign_changes import BIFURCATION_NAMES
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.measures import MARGIN_MEASURES
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams
 
 GAIT_CHANGE_NAME = "gait"
 """Name of the change between a sample with a gait and a sample without a gait."""

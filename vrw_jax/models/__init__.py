@@ -1,36 +1,37 @@
-"""Models of the wheel with a common interface, one model per file."""
+"""Models of the wheel: what one step is."""
 
-from vrw_jax.models import batch_step, unit_scaling
-from vrw_jax.models.batch_step import (
-    N_STEP_INPUTS,
-    advance_gait_step,
-    can_use_batch_kernel,
-    compute_jacobian_columns,
-    split_jacobian_by_leaf,
+from vrw_jax.models.batch_step import N_STEP_INPUTS, advance_gait_step, compute_jacobian_columns
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
+from vrw_jax.models.contact_mechanics import compute_foot_heights, compute_leg_directions
+from vrw_jax.models.contact_state import unpack_state
+from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.measures import (
+    FORCE_PEAK_MEASURES,
+    LIMIT_CYCLE_MEASURES,
+    MARGIN_MEASURES,
+    MEASURES,
+    POST_LANDING_COMPONENT_NAMES,
+    PRE_TOUCHDOWN_COMPONENT_NAMES,
+    SELECTION_MARGIN_NAMES,
+    STEP_MEASURES,
+    STOPPER_MARGIN_MEASURES,
+    UNILATERAL_STEP_MEASURES,
+    describe_violation,
 )
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
-from vrw_jax.models.interface import AbstractWheel, StepGroundValues
+from vrw_jax.models.registry import (
+    REGISTERED_MODEL_CLASSES,
+    describe_accepted_models,
+    find_model_class,
+    list_model_config_names,
+)
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.step_inputs import (
-    PAPER_START_STATE,
-    AnySectionState,
-    SectionState,
-    complete_ground_line_slopes,
-    is_slope_in_domain,
-    is_valid_start_state,
-    replace_invalid_inputs,
-    require_stepwise_shape,
-    separate_next_slope,
-)
+from vrw_jax.models.step_inputs import PAPER_START_STATE
 from vrw_jax.models.step_results import (
-    AbstractContactStep,
-    AbstractStep,
-    AdvanceResult,
     DoubleSupportIndicators,
     EnergyLoss,
-    Margins,
     RequiredFriction,
     StepResult,
 )
-from vrw_jax.models.unit_scaling import complete_jacobian_columns
-from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.models.stepping import walk
+from vrw_jax.models.unilateral_wheel import UnilateralWheel

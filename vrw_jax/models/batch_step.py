@@ -18,18 +18,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from vrw_jax import simd
-from vrw_jax.integrator import (
-    BatchPhase,
+from vrw_jax import lanes
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.types import Vector
+from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
+from vrw_jax.flow.tableaus import (
     ButcherTableau,
-    ImplicitDynamics,
     StageAccelerations,
     StageState,
-    integrate_batch_phase,
     load_explicit_tableau,
-    sample_batch_phase,
-    with_batched_jvp,
 )
+from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
+from vrw_jax.lanes.autodiff import ForwardFunction
+from vrw_jax.lanes.batching import BatchFunction, unbatch
+from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.models.phase_sequence import (
     PhaseResult,
     PhaseRunner,
@@ -40,28 +43,12 @@ from vrw_jax.models.phase_sequence import (
     make_trajectory,
     run_step_phases,
 )
-from vrw_jax.models.step_results import (
-    AdvanceResult,
-    Trajectory,
-)
-from vrw_jax.numerics import (
-    BatchFunction,
-    ForwardFunction,
-    StepOptions,
-    Vector,
-    compile_batch_function,
-    compute_sine_cosine,
-    unbatch,
-)
-from vrw_jax.wheel import (
-    PARAMETER_NAMES,
-    AbstractPhase,
-    Motion,
-    PhaseInstant,
-    WheelParams,
-    compute_wheel_units,
-    transitions,
-)
+from vrw_jax.models.step_results import AdvanceResult, Trajectory
+from vrw_jax.wheel import transitions
+from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant
+from vrw_jax.wheel.units import compute_wheel_units
 
 
 class _NextPhaseInputs(NamedTuple):
@@ -274,12 +261,12 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
     require the batch kernel and it is not available.
     """
     is_solver_explicit = load_explicit_tableau(options.solver) is not None
-    if options.engine == "lanes" and not (is_solver_explicit and simd.is_machine_code_available()):
+    if options.engine == "lanes" and not (is_solver_explicit and lanes.is_machine_code_available()):
         raise ValueError(
             "engine is 'lanes', which needs a CPU, llvmlite and an explicit solver, but the solver "
             f"is {options.solver} on a {jax.default_backend()}: take engine='diffrax'."
         )
-    return is_solver_explicit and simd.is_machine_code_available() and options.engine != "diffrax"
+    return is_solver_explicit and lanes.is_machine_code_available() and options.engine != "diffrax"
 
 
 def run_lane_phases(
@@ -444,7 +431,7 @@ def build_step_jacobian(
         compute_columns = unbatch(
             compile_batch_function(
                 compute_lane_jacobian,
-                register_limits=simd.RegisterLimits(
+                register_limits=lanes.RegisterLimits(
                     N_STEP_INPUTS + (n_jacobian_columns > N_STEP_INPUTS)
                 ),
             )

@@ -8,19 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from vrw_jax.base.checks import has_traced_leaf
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.printing import format_quantity
+from vrw_jax.base.types import Elementwise
 from vrw_jax.models.capabilities import ModelCapabilities
 from vrw_jax.models.step_inputs import SectionState, complete_ground_line_slopes
 from vrw_jax.models.step_results import AdvanceResult
-from vrw_jax.numerics import Elementwise, StepOptions
-from vrw_jax.printing import format_quantity
-from vrw_jax.validation import has_traced_leaf
-from vrw_jax.wheel import (
+from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,
     WheelParams,
-    WheelUnits,
     make_wheel_from_parameters,
 )
+from vrw_jax.wheel.units import WheelUnits
 
 StepGroundValues = tuple[Array, ...]
 """Arrays that describe the ground under one step or under all steps: slopes and, for some models,

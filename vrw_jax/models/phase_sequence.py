@@ -14,6 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.step_inputs import (
     PAPER_START_STATE,
     SectionStateEntries,
@@ -29,29 +33,19 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.numerics import (
-    Elementwise,
-    StepOptions,
-    Vector,
-    compute_sine_cosine,
-    select_trees_by_condition,
-)
-from vrw_jax.wheel import (
-    MAX_SI_VALUE,
+from vrw_jax.wheel import dynamics, transitions
+from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import MAX_SI_VALUE, Symbols, WheelParams
+from vrw_jax.wheel.phases import (
     PAPER_PHASES,
     AbstractPhase,
-    Landing,
-    Motion,
-    Outcome,
     PhaseInstant,
     PhaseMargins,
-    Symbols,
-    WheelParams,
-    dynamics,
     make_paper_phases,
-    replace_rest_outcome,
-    transitions,
 )
+from vrw_jax.wheel.rest import replace_rest_outcome
+from vrw_jax.wheel.transitions import Landing
 
 FALLBACK_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """Regular posture (theta, L1, L2 and their rates) that replaces the state of a wheel after a failed

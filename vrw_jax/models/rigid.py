@@ -9,6 +9,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from vrw_jax.base.checks import check_bool
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Elementwise
+from vrw_jax.lanes.autodiff import compute_square_root
+from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.step_inputs import (
@@ -27,25 +32,10 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.numerics import (
-    Elementwise,
-    StepOptions,
-    compute_square_root,
-    select_trees_by_condition,
-)
-from vrw_jax.validation import check_bool
-from vrw_jax.wheel import (
-    PARAMETER_NAMES,
-    Motion,
-    Outcome,
-    Symbols,
-    WheelParams,
-    compute_rear_foot_height,
-    dynamics,
-    geometry,
-    require_known_friction,
-    transitions,
-)
+from vrw_jax.wheel import dynamics, geometry, transitions
+from vrw_jax.wheel.geometry import Motion, compute_rear_foot_height
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import PARAMETER_NAMES, Symbols, WheelParams, require_known_friction
 
 # Number of angles that each round of the search for minima of margins samples. The value is chosen
 # because forces are smooth over the 45 degrees of a step.

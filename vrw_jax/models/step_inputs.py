@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vrw_jax.numerics import Elementwise
-from vrw_jax.wheel import MAX_SI_VALUE, PARAMETER_DOMAINS, WheelParams
+from vrw_jax.base.types import Elementwise
+from vrw_jax.wheel.params import MAX_SI_VALUE, PARAMETER_DOMAINS, WheelParams
 
 SectionState = Float[Array, "3"]
 """State (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s and m/s. The leg labels are

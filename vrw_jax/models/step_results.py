@@ -9,11 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.measures import MARGIN_MEASURES, MEASURES
+from vrw_jax.base.printing import (
+    AbstractPrintable,
+    LabelAndText,
+    format_outcome_counts,
+    format_quantity,
+)
+from vrw_jax.base.status_codes import describe_step_ending
+from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.models.step_inputs import AnySectionState
-from vrw_jax.numerics import describe_step_ending
-from vrw_jax.printing import AbstractPrintable, LabelAndText, format_outcome_counts, format_quantity
-from vrw_jax.wheel import Outcome
+from vrw_jax.wheel.outcomes import Outcome
 
 MeasureValue = Float[Array, "..."]
 """Value of a measure for a step; a batch has one value per element."""

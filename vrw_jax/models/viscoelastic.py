@@ -13,13 +13,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vrw_jax.hybrid import (
-    GuardsAndMargins,
-    StateArray,
-    VectorField,
+from vrw_jax.base.checks import check_bool
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
+from vrw_jax.flow.phase_integration import VectorField
+from vrw_jax.flow.scaled_integration import (
     integrate_phase_in_scaled_units,
     sample_phase_in_scaled_units,
 )
+from vrw_jax.lanes.autodiff import ForwardFunction, enable_all_ad_modes
 from vrw_jax.models.batch_step import (
     build_step_finisher,
     build_step_function,
@@ -41,17 +44,10 @@ from vrw_jax.models.phase_sequence import (
 )
 from vrw_jax.models.step_inputs import PAPER_START_STATE, SectionState
 from vrw_jax.models.step_results import AdvanceResult, StepResult, Trajectory
-from vrw_jax.numerics import Elementwise, ForwardFunction, StepOptions, Vector, enable_all_ad_modes
-from vrw_jax.validation import check_bool
-from vrw_jax.wheel import (
-    PARAMETER_NAMES,
-    AbstractPhase,
-    Motion,
-    PhaseInstant,
-    WheelParams,
-    compute_wheel_units,
-    require_known_friction,
-)
+from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, require_known_friction
+from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant
+from vrw_jax.wheel.units import compute_wheel_units
 
 
 class DiffraxPhaseFunctions(NamedTuple):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vrw_jax.numerics import Elementwise, Vector
+from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel.geometry import (
     DoubleSupportCircle,
     Motion,

@@ -1,6 +1,6 @@
 """Outcomes of a step: one integer code per batch element. Each code has a name and a sentence."""
 
-from vrw_jax.numerics import StatusCode
+from vrw_jax.base.status_codes import StatusCode
 
 
 class Outcome(StatusCode):

@@ -11,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from vrw_jax.numerics import Elementwise, RealInput, Scalar, compute_sine_cosine, make_real_field
-from vrw_jax.printing import AbstractPrintable, LabelAndText, format_quantity
-from vrw_jax.validation import check_int, check_reals, format_value, require_known_name
+from vrw_jax.base.checks import check_int, check_reals, format_value, require_known_name
+from vrw_jax.base.options import make_real_field
+from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
+from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.types import Elementwise, RealInput, Scalar
 
 
 class ParameterDomain(NamedTuple):

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.numerics import Elementwise, Vector, compute_sine_cosine
+from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Acceleration, FootForce
 from vrw_jax.wheel.geometry import (

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.numerics import Elementwise
+from vrw_jax.base.types import Elementwise
 from vrw_jax.wheel.outcomes import Outcome
 
 POSSIBLE_OUTCOMES_AT_REST = (Outcome.FELL_BACK, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)

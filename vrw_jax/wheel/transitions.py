@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.numerics import Elementwise
+from vrw_jax.base.types import Elementwise
 from vrw_jax.wheel.dynamics import (
     EquationTerms,
     FootForce,

@@ -13,12 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from vrw_jax.numerics import Elementwise, StepOptions
-from vrw_jax.wheel.params import (
-    PARAMETER_NAMES,
-    UNIT_POWERS,
-    Symbols,
-)
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Elementwise
+from vrw_jax.wheel.params import PARAMETER_NAMES, UNIT_POWERS, Symbols
 
 TABLE_1_LENGTH_M = 1.0
 """Locked leg length of the wheel whose own units are those of SI. The value is chosen because the

@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 import vrw_jax as vrw
 from experiments.atlas.hybrid import JAX, hy
 from experiments.atlas.results import Case, Row, compute_error, time_second_call
-from vrw_jax.collocation import END_WEIGHTS, GAUSS_NODES, INTEGRATION_MATRIX
+from vrw_jax.gaits import END_WEIGHTS, GAUSS_NODES, INTEGRATION_MATRIX
 from vrw_jax.hybrid import product_multipliers, segment_maps
 
 Q = 0.97

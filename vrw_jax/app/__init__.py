@@ -1,0 +1,1 @@
+"""Figures, command line, tables of the paper and web page."""

@@ -1,0 +1,327 @@
+"""Motion of the feet for any model, and figures of their contact modes."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import ArrayLike
+
+from vrw_jax.app.figure_style import (
+    DARK_GRAY_COLOR,
+    LEG_1_COLOR,
+    LEG_2_COLOR,
+    OKABE_ITO_AMBER,
+    OKABE_ITO_GREEN,
+    OKABE_ITO_PINK,
+    OKABE_ITO_SKY_BLUE,
+    StyledFigure,
+    add_side_legend,
+    draw_panel_letter,
+    format_axis_label,
+)
+from vrw_jax.models.measures import CONTACT_MODE_NAMES, PHASE_NAMES
+from vrw_jax.wheel.foot_contact import ContactMode
+
+CONTACT_MODE_COLORS = ("white", OKABE_ITO_GREEN, OKABE_ITO_AMBER, OKABE_ITO_PINK)
+"""Colors of the contact modes, by contact code."""
+
+CONTACT_MODE_MARKERS = ("o", "o", ">", "<")
+"""Markers of the contact modes, by contact code. They differ because some readers see the green and
+the pink as the same gray.
+"""
+
+GROUND_FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+"""Names of the ground forces (N) on the feet of Leg 1 and Leg 2."""
+
+OTHER_LEG_COLOR = "#999999"
+"""Color of every leg other than Legs 1 and 2."""
+
+LEG_LINE_STYLES = {1: (LEG_1_COLOR, "-"), 2: (LEG_2_COLOR, "--")}
+"""Color and line style of Legs 1 and 2 in plots over time."""
+
+STICK_LINE_STYLES: dict[int, Any] = {1: "-", 2: ":"}
+"""Line styles of Legs 1 and 2 in stick diagrams; other legs are dashed."""
+
+PHASE_STICK_COLORS = ("#A0A0A0", OKABE_ITO_SKY_BLUE, "#000000")
+"""Colors of the phases in stick diagrams, in the order of phases."""
+
+OTHER_LEG_LINE_STYLES = (
+    (OKABE_ITO_SKY_BLUE, "-."), (OKABE_ITO_PINK, ":"), (OKABE_ITO_AMBER, (0, (8, 3))),
+    (DARK_GRAY_COLOR, (0, (5, 1, 1, 1, 1, 1))),
+)  # fmt: skip
+"""Colors and line styles of the other legs that move or touch the ground, in the order of leg
+labels.
+"""
+
+
+class HubAndFootMotion(NamedTuple):
+    """Positions of hub and feet during a walk, with contact modes and forces, in the slope's frame.
+
+    Leg labels change with each step: Leg 1 is the front leg at the landing, and Leg 2 is the leg
+    behind Leg 1.
+    """
+
+    sample_times: np.ndarray  # (time,), s
+    hub_positions: np.ndarray  # (time, 2), x downhill and z normal to the slope, m
+    foot_positions: np.ndarray  # (time, leg, 2), in the same coordinates, m
+    foot_forces: np.ndarray  # (time, leg, 2), tangential and normal force, N
+    contact_modes: np.ndarray  # (time, leg), contact mode
+
+    def interpolate_at_time(self, t: float) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return the positions of hub and feet at the time `t` (s), and the index of the next
+        sample.
+
+        Contact modes and forces at this time are those of the next sample.
+        """
+        index_after = min(
+            int(np.searchsorted(self.sample_times, t, side="right")), self.sample_times.size - 1
+        )
+        index_before = max(index_after - 1, 0)
+        time_before, time_after = self.sample_times[[index_before, index_after]]
+        fraction = (
+            (t - time_before) / (time_after - time_before) if time_after > time_before else 1.0
+        )
+        interpolate = lambda sampled_values: (
+            (1.0 - fraction) * sampled_values[index_before] + fraction * sampled_values[index_after]
+        )
+        return interpolate(self.hub_positions), interpolate(self.foot_positions), index_after
+
+
+def reports_contact_modes(walk: xr.Dataset) -> bool:
+    """Return whether a trajectory contains the contact mode of each leg."""
+    return "contact" in walk.variables
+
+
+def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
+    """Return the motion of hub and feet in a trajectory that was computed with any model.
+
+    In the paper's phases no foot slides: foot 1 is at rest, and foot 2 is at rest in double
+    support.
+    """
+    hub_positions = np.stack([walk.hub_x.values, walk.hub_z.values], -1)
+    if reports_contact_modes(walk):
+        foot_positions = np.stack([walk.foot_x.values, walk.foot_z.values], -1)
+        foot_forces = np.stack([walk.tangential.values, walk.normal.values], -1)
+        contact_modes = walk.contact.values
+    else:
+        n_legs = int(walk.attrs["parameter_n_legs"])
+        leg_angles = walk.theta.values[:, None] + 2.0 * np.pi / n_legs * np.arange(n_legs)
+        leg_lengths = np.full(leg_angles.shape, walk.attrs["parameter_locked_length"])
+        leg_lengths[:, 0] = walk.L1.values
+        leg_lengths[:, 1] = walk.L2.values
+        foot_positions = hub_positions[:, None] - leg_lengths[..., None] * np.stack(
+            [np.sin(leg_angles), np.cos(leg_angles)], -1
+        )
+        foot_forces = np.zeros_like(foot_positions)
+        ground_forces = [walk[force_name].values for force_name in GROUND_FORCE_NAMES]
+        foot_forces[:, :2] = np.stack(ground_forces, -1).reshape(-1, 2, 2)
+        contact_modes = np.full(leg_angles.shape, ContactMode.OFF)
+        contact_modes[:, 0] = ContactMode.STICK
+        contact_modes[walk.phase.values == 0, 1] = ContactMode.STICK
+    return HubAndFootMotion(
+        walk.time.values, hub_positions, foot_positions, foot_forces, contact_modes
+    )
+
+
+def insert_landing_gaps(walk: xr.Dataset, sampled_values: ArrayLike) -> np.ndarray:
+    """Return values of the samples of a trajectory, with NaN inserted at each landing.
+
+    The gaps separate steps in plots, because landings relabel the legs.
+    """
+    landing_indices = np.flatnonzero(np.diff(walk.step.values)) + 1
+    return np.insert(np.asarray(sampled_values, float), landing_indices, np.nan)
+
+
+def find_constant_spans(
+    walk: xr.Dataset, sampled_codes: np.ndarray
+) -> list[tuple[float, float, int]]:
+    """Return the start time (s), the end time (s) and the code of every span with one code.
+
+    A span ends where the code changes, and at each landing.
+
+    - `sampled_codes`: code for each sample of the trajectory.
+    """
+    is_span_end = np.any(np.diff([walk.step.values, sampled_codes]), axis=0)
+    span_start_indices = np.flatnonzero(is_span_end) + 1
+    return [
+        (span_times[0], span_times[-1], int(span_codes[0]))
+        for span_times, span_codes in zip(
+            np.split(walk.time.values, span_start_indices),
+            np.split(sampled_codes, span_start_indices),
+            strict=True,
+        )
+    ]
+
+
+def draw_feet(
+    axes: Axes, foot_positions: np.ndarray, contact_modes: np.ndarray, marker_size: float
+) -> None:
+    """Draw feet in the colors of their contact modes, at positions of shape (2, feet)."""
+    for contact_mode in np.unique(contact_modes):
+        axes.plot(
+            *foot_positions[:, contact_modes == contact_mode],
+            CONTACT_MODE_MARKERS[contact_mode],
+            color=CONTACT_MODE_COLORS[contact_mode],
+            zorder=8,
+            markersize=marker_size,
+            markeredgecolor=DARK_GRAY_COLOR,
+            markeredgewidth=0.1 * marker_size,
+        )
+
+
+def make_contact_mode_handles(contact_modes: np.ndarray) -> list[Line2D]:
+    """Return a legend entry for each contact mode that occurs in `contact_modes`."""
+    return [
+        Line2D([], [], linestyle="", marker=CONTACT_MODE_MARKERS[contact_mode],
+        color=CONTACT_MODE_COLORS[contact_mode],
+               markeredgecolor=DARK_GRAY_COLOR, markeredgewidth=0.5,
+               label=CONTACT_MODE_NAMES[contact_mode])
+        for contact_mode in np.unique(contact_modes)
+    ]  # fmt: skip
+
+
+def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
+    """Return the labels of Legs 1 and 2, and of all legs that are marked at any time.
+
+    - `is_leg_marked`: whether a panel marks the contact of a leg, shape (time, leg).
+    """
+    return [
+        leg_number
+        for leg_number, is_leg_ever_marked in enumerate(np.any(is_leg_marked, axis=0).tolist(), 1)
+        if is_leg_ever_marked or leg_number < 3
+    ]
+
+
+def make_contact_panels(walk: xr.Dataset, width_inches: float, forces_only: bool) -> Figure:
+    """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time, or
+    of the forces only.
+
+    The walk is a trajectory with contact modes.
+    """
+    foot_motion = compute_foot_motion(walk)
+    is_foot_touching = foot_motion.contact_modes != ContactMode.OFF
+    touching_legs = _select_marked_legs(is_foot_touching)
+    moving_legs = _select_marked_legs(is_foot_touching | ~walk.on_stopper.values.astype(bool))
+    times_with_gaps = insert_landing_gaps(walk, foot_motion.sample_times)
+    other_leg_line_styles = iter(OTHER_LEG_LINE_STYLES * len(moving_legs))
+    line_style_by_leg = {
+        leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_line_styles)
+        for leg_number in moving_legs
+    }
+    panel_height_ratios = [1.0, 1.0, 0.35 + 0.11 * len(touching_legs), 1.0, 1.2, 1.2]
+    first_panel = 4 if forces_only else 0
+    panel_height_ratios = panel_height_ratios[first_panel:]
+    figure = StyledFigure(figsize=(width_inches, 3.4 if forces_only else 8.0))
+    panel_axes = figure.subplots(
+        len(panel_height_ratios), 1, sharex=True, height_ratios=panel_height_ratios
+    )
+    for axes, panel_letter in zip(panel_axes, "abcdef", strict=False):
+        draw_panel_letter(axes, panel_letter)
+    leg_panels = [
+        (panel_axes[-2], touching_legs, walk.normal, "normal\nforce [N]"),
+        (panel_axes[-1], touching_legs, walk.tangential, "tangential\nforce [N]"),
+    ]
+    if not forces_only:
+        angle_axes, length_axes, mode_axes, height_axes, *_ = panel_axes
+        angle_axes.plot(times_with_gaps, insert_landing_gaps(walk, walk.theta), color="black")
+        angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
+        _draw_contact_modes(mode_axes, walk, foot_motion.contact_modes, touching_legs)
+        leg_panels += [
+            (length_axes, moving_legs, walk.length, "$L$ [m]"),
+            (height_axes, touching_legs, walk.foot_z, "height of\nfoot [m]"),
+        ]
+    for axes, drawn_legs, quantity_by_leg, panel_label in leg_panels:
+        for leg_number in drawn_legs:
+            line_color, line_style = line_style_by_leg[leg_number]
+            axes.plot(
+                times_with_gaps,
+                insert_landing_gaps(walk, quantity_by_leg.values[:, leg_number - 1]),
+                color=line_color,
+                linestyle=line_style,
+                label=f"Leg {leg_number}",
+            )
+        axes.set_ylabel(panel_label)
+    for axes in panel_axes[-3:]:
+        axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4, zorder=0)
+    panel_axes[-1].set(xlabel="time [s]", xlim=foot_motion.sample_times[[0, -1]])
+    add_side_legend(panel_axes[0] if forces_only else length_axes)
+    figure.align_ylabels(panel_axes)
+    return figure
+
+
+def _draw_contact_modes(
+    axes: Axes, walk: xr.Dataset, contact_modes: np.ndarray, touching_legs: list[int]
+) -> None:
+    """Draw a bar in the color of the contact mode for each foot while it touches the ground."""
+    for bar_row_index, leg_number in enumerate(touching_legs):
+        for start_time, end_time, contact_mode in find_constant_spans(
+            walk, contact_modes[:, leg_number - 1]
+        ):
+            if contact_mode != ContactMode.OFF:
+                axes.broken_barh(
+                    [(start_time, end_time - start_time)],
+                    (bar_row_index - 0.35, 0.7),
+                    color=CONTACT_MODE_COLORS[contact_mode],
+                )
+    axes.set_yticks(range(len(touching_legs)), list(map(str, touching_legs)))
+    axes.set(ylabel="foot on\nthe ground", ylim=(len(touching_legs) - 0.5, -0.5))
+    mode_handles = [
+        Patch(color=CONTACT_MODE_COLORS[contact_mode], label=CONTACT_MODE_NAMES[contact_mode])
+        for contact_mode in np.unique(contact_modes[contact_modes != ContactMode.OFF])
+    ]
+    add_side_legend(axes, mode_handles)
+
+
+def draw_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
+    """Draw Legs 1 and 2 and every leg on the ground at equal time intervals.
+
+    The sticks have the colors of the phases. For walks with unilateral contact, the feet have the
+    colors of their contact modes instead. `stick_interval` is in s.
+    """
+    foot_motion = compute_foot_motion(walk)
+    stick_times = np.arange(0.0, foot_motion.sample_times[-1], stick_interval)
+    sample_indices = np.searchsorted(foot_motion.sample_times, stick_times)
+    is_leg_drawn = foot_motion.contact_modes != ContactMode.OFF
+    is_leg_drawn[:, :2] = True
+    has_contact_modes = reports_contact_modes(walk)
+    line_width = 0.7 if has_contact_modes else 0.8
+    for sample_index in sample_indices:
+        drawn_legs = np.flatnonzero(is_leg_drawn[sample_index])
+        foot_positions = foot_motion.foot_positions[sample_index, drawn_legs]
+        for leg_number, foot_position in zip(
+            (drawn_legs + 1).tolist(), foot_positions, strict=True
+        ):
+            if has_contact_modes:
+                stick_color = "black" if leg_number < 3 else DARK_GRAY_COLOR
+            else:
+                stick_color = PHASE_STICK_COLORS[int(walk.phase[sample_index])]
+            axes.plot(
+                *np.stack([foot_position, foot_motion.hub_positions[sample_index]], -1),
+                color=stick_color,
+                linestyle=STICK_LINE_STYLES.get(leg_number, "--"),
+                linewidth=line_width,
+            )
+        if has_contact_modes:
+            contact_modes = foot_motion.contact_modes[sample_index, drawn_legs]
+            draw_feet(axes, foot_positions.T, contact_modes, 4.0)
+    legend_leg_labels = [(1, "Leg 1"), (2, "Leg 2")]
+    if is_leg_drawn[sample_indices, 2:].any():
+        legend_leg_labels.append((3, "another leg"))
+    for leg_number, legend_text in legend_leg_labels:
+        line_style = STICK_LINE_STYLES.get(leg_number, "--")
+        axes.plot(
+            [], [], color="black", linestyle=line_style, linewidth=line_width, label=legend_text
+        )
+    axes.plot([], [], color=LEG_2_COLOR, label="hub")
+    if not has_contact_modes:
+        for phase_name, phase_color in zip(PHASE_NAMES, PHASE_STICK_COLORS, strict=True):
+            axes.plot([], [], color=phase_color, linewidth=3.0, label=phase_name)
+        return
+    for legend_handle in make_contact_mode_handles(
+        foot_motion.contact_modes[sample_indices][is_leg_drawn[sample_indices]]
+    ):
+        axes.add_line(legend_handle)

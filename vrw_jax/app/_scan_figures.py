@@ -1,0 +1,659 @@
+"""Figures of scans: measures and outcomes over parameters, and the curves on which margins are
+0.
+"""
+
+import textwrap
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PathCollection
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal, Stroke
+
+from vrw_jax.app.figure_style import (
+    COLUMN_FIGURE_WIDTH_INCHES,
+    LIGHT_GRAY_COLOR,
+    OKABE_ITO_AMBER,
+    OKABE_ITO_BLUE,
+    OUTCOME_LABELS_AND_COLORS,
+    PAGE_FIGURE_WIDTH_INCHES,
+    UNSTABLE_CYCLE_CODE,
+    FigureWidth,
+    StyledFigure,
+    add_figure_legend,
+    draw_outcome_cells,
+    figure_style,
+    find_width_inches,
+    format_axis_label,
+    format_value_label,
+    make_bar_panels,
+    make_outcome_patches,
+    make_panel_grid,
+    require_dataset_variables,
+    scale_to_width,
+    select_special_point_style,
+    typeset_greek_symbols,
+)
+from vrw_jax.branches.branch import SpecialPointCurve
+from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, describe_violation
+from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
+from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS
+from vrw_jax.studies.sensitivity_indices import sobol_indices
+from vrw_jax.studies.store_integrity import read_scan_manifest
+from vrw_jax.wheel.outcomes import Outcome
+
+PARAMETER_AXIS_ORDER = dict.fromkeys(
+    ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)
+)
+"""Parameters in the order in which figures assign them to the horizontal axis, the vertical axis
+and the panel columns.
+"""
+
+DRAWN_MARGIN_NAMES = (
+    "fore_foot_force", "takeoff_acceleration", "clearance_sls1", "clearance_sls2",
+    "locked_stopper_force", "rear_stopper_force", "contraction", "friction_fore",
+    "landing_friction_fore", "hit_planted_impulse",
+)  # fmt: skip
+"""Names of the margins for which figures draw the curve of value 0."""
+
+SHOWN_MEASURE_NAMES = ("mean_steps", "dls_fraction", "speed")
+"""Names of the measures that figures show if the scan contains them."""
+
+LOGARITHMIC_MEASURE_NAMES = ("mean_steps",)
+"""Names of the measures that are shown on a logarithmic scale, chosen because these measures vary
+by powers of ten.
+"""
+
+MAX_PANEL_COLUMNS = 4
+"""Largest number of panels in a row, chosen because more panels leave no space for labels."""
+
+MAX_PAIRED_PARAMETERS = 6
+"""Largest number of parameters in a figure of parameter pairs, chosen because more parameters leave
+no space for labels.
+"""
+
+MAX_DRAWN_SAMPLES = 20_000
+"""Largest number of samples in a figure of parameter pairs, chosen because more samples would cover
+each other.
+"""
+
+
+class FiguresByName(dict[str, Any]):
+    """Figures by name, which notebooks show one below the other."""
+
+    def _repr_html_(self) -> str:
+        return "".join(
+            f'<img alt="{name}" src="data:image/png;base64,'
+            f'{b64encode(figure._repr_png_()).decode()}"><br>'
+            for name, figure in self.items()
+        )
+
+
+def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Figure]:
+    """Return the figures of a scan, by name.
+
+    A grid with one or two axes leads to one figure. Further axes add one figure each. Narrow
+    figures show fewer slices of a grid and fewer pairs of parameters.
+
+    Args:
+        scan: dataset that `vrw.scan` returns for a grid or for samples.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        dict[str, Figure]: the figures, whose names depend on the design.
+
+    Examples:
+        >>> gaits = vrw.scan(vrw.grid(damping=[150.0, 200.0]), ["speed", "dls_fraction"])
+        >>> sorted(vrw.plot.scan_figures(gaits))
+        ['scan']
+    """
+    require_dataset_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
+    swept_parameters = [
+        parameter_name for parameter_name in PARAMETER_AXIS_ORDER if parameter_name in scan.coords
+    ]
+    varied_parameters = [
+        parameter_name
+        for parameter_name in swept_parameters
+        if np.ptp(scan[parameter_name].values) > 0.0
+    ] or swept_parameters
+    if "sample" in scan.dims:
+        if len(varied_parameters) < 3:
+            return FiguresByName(scan=draw_scan_samples(scan, varied_parameters, width))
+        figures_by_name = FiguresByName(
+            scan_pairs=draw_parameter_pairs(scan, varied_parameters, width)
+        )
+        if read_scan_manifest(scan.attrs).get("design", {}).get("kind") == SALTELLI_DESIGN_KIND:
+            measure_names = [
+                measure_name for measure_name in DIFFERENTIABLE_MEASURES if measure_name in scan
+            ]
+            figures_by_name["sobol_indices"] = draw_sobol_indices(
+                sobol_indices(scan, measure_names), width
+            )
+        return figures_by_name
+    if len(varied_parameters) == 1:
+        return FiguresByName(scan=draw_measure_curves(scan, varied_parameters[0], width))
+    x, y, *further_parameters = varied_parameters
+    if not further_parameters:
+        return FiguresByName(scan=draw_scan_slices(scan, x, y, None, width))
+    return FiguresByName(
+        (f"scan_over_{parameter_name}", draw_scan_slices(scan, x, y, parameter_name, width))
+        for parameter_name in further_parameters
+    )
+
+
+@figure_style()
+def draw_scan_slices(
+    scan: xr.Dataset, x: str, y: str, panel_column_parameter: str | None, width: FigureWidth
+) -> Figure:
+    """Return a figure over two parameters, with one column of panels per value of
+    `panel_column_parameter`.
+
+    `x` and `y` are the names of the two parameters. The figure shows outcomes and the measures in
+    `SHOWN_MEASURE_NAMES`. Every other parameter has the middle one of its values, which the title
+    states. Cells without a gait are gray.
+    """
+    slice_indices = {
+        parameter_name: scan.sizes[parameter_name] // 2
+        for parameter_name in SWEEPABLE_PARAMETERS
+        if parameter_name in scan.dims and parameter_name not in (x, y, panel_column_parameter)
+    }
+    panel_column_datasets = [scan.isel(slice_indices).transpose(y, x, ...)]
+    width_inches = find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES)
+    if panel_column_parameter is not None:
+        last_index = scan.sizes[panel_column_parameter] - 1
+        if last_index:
+            width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+        max_n_columns = scale_to_width(MAX_PANEL_COLUMNS, width_inches)
+        panel_column_indices = np.linspace(0, last_index, min(last_index + 1, max_n_columns))
+        panel_column_datasets = [
+            panel_column_datasets[0].isel({panel_column_parameter: panel_column_index})
+            for panel_column_index in panel_column_indices.round().astype(int)
+        ]
+    n_panel_columns = len(panel_column_datasets)
+    panel_measures = _list_shown_measures(scan)
+    figure = StyledFigure(figsize=(width_inches, 1.65 * (len(panel_measures) + 1) + 1.0))
+    panel_axes = figure.subplots(
+        len(panel_measures) + 1, n_panel_columns, sharex=True, sharey=True, squeeze=False
+    )
+    outcome_codes_by_panel = np.stack(
+        [_compute_displayed_outcome_codes(dataset) for dataset in panel_column_datasets]
+    )
+    outcome_codes = np.unique(outcome_codes_by_panel)
+    cell_edges = _find_cell_edges(scan[x].values), _find_cell_edges(scan[y].values)
+    for axes_of_row, measure_name in zip(panel_axes, panel_measures, strict=False):
+        measure_values = np.stack([dataset[measure_name] for dataset in panel_column_datasets])
+        color_scale = _make_color_scale(
+            measure_name, measure_values, outcome_codes_by_panel == Outcome.STEPPED
+        )
+        for axes, values_of_panel in zip(axes_of_row, measure_values, strict=True):
+            axes.set_facecolor(LIGHT_GRAY_COLOR)
+            cell_mesh = axes.pcolormesh(
+                *cell_edges, values_of_panel, cmap="viridis", norm=color_scale, rasterized=True
+            )
+        _add_color_bar(
+            figure,
+            axes_of_row.tolist(),
+            cell_mesh,
+            measure_values,
+            textwrap.fill(format_axis_label(measure_name, "{name}"), 24),
+            aspect=12,
+            pad=0.01,
+        )
+    legend_lines: dict[str, Line2D] = {}
+    for axes_of_column, dataset, codes_of_panel in zip(
+        panel_axes.T, panel_column_datasets, outcome_codes_by_panel, strict=True
+    ):
+        draw_outcome_cells(axes_of_column[-1], *cell_edges, codes_of_panel, outcome_codes)
+        for axes in axes_of_column:
+            legend_lines |= _draw_margin_zero_lines(axes, dataset, x, y)
+        if panel_column_parameter is not None:
+            panel_value = dataset[panel_column_parameter].item()
+            axes_of_column[0].set_title(format_value_label(panel_column_parameter, panel_value))
+        axes_of_column[-1].set_xlabel(
+            format_axis_label(
+                x, "{name} {symbol}" if width_inches > 2.5 * n_panel_columns else "{symbol}"
+            )
+        )
+    for axes in panel_axes[:, 0]:
+        axes.set_ylabel(format_axis_label(y, "{symbol}"))
+    _add_scan_legend(figure, outcome_codes, legend_lines, n_panel_columns)
+    if slice_indices:
+        fixed_values_text = ", ".join(
+            format_value_label(parameter_name, scan[parameter_name].values[slice_index])
+            for parameter_name, slice_index in slice_indices.items()
+        )
+        figure.suptitle(f"at {fixed_values_text}", fontsize=9.0)
+    return figure
+
+
+@figure_style()
+def draw_scan_samples(
+    scan: xr.Dataset, parameter_names: Sequence[str], width: FigureWidth
+) -> Figure:
+    """Return a figure of individual samples over the first two parameters."""
+    x, y, *_ = (*parameter_names, "sample")
+    measure_names = _list_shown_measures(scan)
+    marker_size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
+    n_panels = len(measure_names) + 1
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    figure, panel_axes = make_panel_grid(width_inches, n_panels, 2.4, 0.5, n_panels, sharey=True)
+    for axes, measure_name in zip(panel_axes, measure_names, strict=False):
+        point_collection = _draw_measure_samples(axes, scan, x, y, measure_name, marker_size)
+        _add_color_bar(
+            figure,
+            axes,
+            point_collection,
+            scan[measure_name].values,
+            format_axis_label(measure_name),
+            location="top",
+            aspect=25,
+        )
+    outcome_codes = _compute_displayed_outcome_codes(scan)
+    _draw_outcome_samples(
+        panel_axes[-1], scan[x].values, scan[y].values, outcome_codes, marker_size
+    )
+    for axes in panel_axes:
+        axes.set_xlabel(format_axis_label(x, "{symbol}"))
+    panel_axes[0].set_ylabel("sample" if y == "sample" else format_axis_label(y, "{symbol}"))
+    _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
+    return figure
+
+
+@figure_style()
+def draw_parameter_pairs(
+    scan: xr.Dataset, parameter_names: Sequence[str], width: FigureWidth
+) -> Figure:
+    """Return a figure with one panel of samples per pair of parameters.
+
+    Panels below the diagonal show a measure, and panels above the diagonal show the outcome. The
+    measure is the first of `SHOWN_MEASURE_NAMES` that the scan contains. Panels on the diagonal
+    show the fraction of samples with a stable cycle. Only the first `MAX_DRAWN_SAMPLES` samples are
+    drawn, because they are spread as evenly as all samples.
+    """
+    drawn_samples = scan.isel(sample=slice(MAX_DRAWN_SAMPLES))
+    measure_name = next(iter(_list_shown_measures(scan)), None)
+    outcome_codes = _compute_displayed_outcome_codes(drawn_samples)
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    parameter_names = parameter_names[: scale_to_width(MAX_PAIRED_PARAMETERS, width_inches)]
+    n_parameters = len(parameter_names)
+    marker_size = float(np.clip(8000.0 / len(outcome_codes), 0.6, 8.0))
+    figure = StyledFigure(figsize=(width_inches, width_inches * 0.9))
+    panel_axes = figure.subplots(n_parameters, n_parameters, sharex="col", squeeze=False)
+    point_collection = None
+    for (i, j), axes in np.ndenumerate(panel_axes):
+        x, y = parameter_names[j], parameter_names[i]
+        x_values, y_values = drawn_samples[x].values, drawn_samples[y].values
+        if i == j:
+            histogram_edges = np.linspace(x_values.min(), x_values.max(), 13)
+            n_samples, n_stable_samples = (
+                np.histogram(parameter_values, histogram_edges)[0]
+                for parameter_values in (x_values, x_values[outcome_codes == Outcome.STEPPED])
+            )
+            stable_fraction = n_stable_samples / np.maximum(n_samples, 1)
+            stable_color = OUTCOME_LABELS_AND_COLORS[Outcome.STEPPED][1]
+            axes.stairs(stable_fraction, histogram_edges, fill=True, color=stable_color)
+            axes.set_ylim(0.0, 1.0)
+        elif i < j:
+            _draw_outcome_samples(axes, x_values, y_values, outcome_codes, marker_size)
+        elif measure_name is not None:
+            point_collection = _draw_measure_samples(
+                axes, drawn_samples, x, y, measure_name, marker_size
+            )
+        if i == n_parameters - 1:
+            axes.set_xlabel(format_axis_label(x, "{symbol}"))
+        if j == 0 and i > 0:
+            axes.set_ylabel(format_axis_label(y, "{symbol}"))
+        elif i != j:
+            axes.tick_params(labelleft=False)
+    panel_axes[0, 0].set_ylabel("share that walks")
+    if width_inches < 1.3 * n_parameters:  # The labels need more space than the panels have.
+        panel_axes[0, 0].set_ylabel("share that\nwalks")
+        for axes in panel_axes.flat:
+            axes.locator_params(nbins=2)
+            axes.tick_params("x", rotation=90)
+    if measure_name is not None and point_collection is not None:
+        _add_color_bar(
+            figure,
+            panel_axes.ravel().tolist(),
+            point_collection,
+            drawn_samples[measure_name].values,
+            format_axis_label(measure_name, "{name}"),
+            aspect=40,
+            pad=0.01,
+        )
+    _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
+    return figure
+
+
+def _draw_measure_samples(
+    axes: Axes, scan: xr.Dataset, x: str, y: str, measure_name: str, marker_size: float
+) -> PathCollection:
+    """Draw samples in colors that show a measure, and return the collection of points.
+
+    Samples without a gait are gray.
+    """
+    marker_style: dict[str, Any] = {"s": marker_size, "linewidths": 0.0, "rasterized": True}
+    has_gait, measure_values = scan.outcome.values == Outcome.STEPPED, scan[measure_name].values
+    is_stable = _compute_displayed_outcome_codes(scan) == Outcome.STEPPED
+    x_values, y_values = scan[x].values, scan[y].values
+    axes.scatter(x_values[~has_gait], y_values[~has_gait], color=LIGHT_GRAY_COLOR, **marker_style)
+    return axes.scatter(
+        x_values[has_gait],
+        y_values[has_gait],
+        c=measure_values[has_gait],
+        norm=_make_color_scale(measure_name, measure_values, is_stable),
+        **marker_style,
+    )
+
+
+def _draw_outcome_samples(
+    axes: Axes, x: np.ndarray, y: np.ndarray, outcome_codes: np.ndarray, marker_size: float
+) -> None:
+    """Draw samples in the colors of their outcomes."""
+    outcome_colors = [OUTCOME_LABELS_AND_COLORS[outcome_code][1] for outcome_code in outcome_codes]
+    axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
+
+
+@figure_style()
+def draw_sobol_indices(indices: xr.Dataset, width: FigureWidth) -> Figure:
+    """Return a figure of the Sobol' indices of each measure, with their confidence intervals."""
+    measure_names = list(map(str, indices.measure.values))
+    bar_positions = np.arange(indices.sizes["parameter"])
+    figure, panel_axes = make_bar_panels(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
+        measure_names,
+        0.26 * len(bar_positions) + 0.5,
+        0.6,
+        sharex=True,
+        sharey=True,
+    )
+    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
+        sobol_indices_of_measure = indices.sel(measure=measure_name)
+        for sobol_index_name, legend_text, bar_offset, bar_color in (
+            ("first_order", "by itself (first order)", -0.19, OKABE_ITO_BLUE),
+            ("total", "with all it meets (total)", 0.19, OKABE_ITO_AMBER),
+        ):
+            sobol_index_values, lower_bounds, upper_bounds = (
+                sobol_indices_of_measure[sobol_index_name + name_suffix].values
+                for name_suffix in ("", "_lower", "_upper")
+            )
+            axes.barh(
+                bar_positions + bar_offset,
+                sobol_index_values,
+                0.36,
+                color=bar_color,
+                label=legend_text,
+                xerr=np.maximum(
+                    [sobol_index_values - lower_bounds, upper_bounds - sobol_index_values], 0.0
+                ),
+                error_kw={"elinewidth": 0.7},
+            )
+        if sobol_indices_of_measure.is_constant_measure:
+            axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
+        parameter_names = indices.parameter.values
+        axes.set_yticks(bar_positions, [f"${MEASURES[name].mathtext}$" for name in parameter_names])
+        axes.set_xlim(0.0, 1.05)
+    panel_axes[0].invert_yaxis()
+    for axes in panel_axes[-panel_axes[0].get_gridspec().ncols :]:
+        axes.set_xlabel("share of the variance")
+        axes.tick_params(labelbottom=True)
+    add_figure_legend(figure, panel_axes[0].get_legend_handles_labels()[0], 2)
+    omitted_samples_percent = 100.0 * indices.attrs["left_out"]
+    omitted_rows_note = (
+        f"{indices.attrs['rows']:,} rows; {omitted_samples_percent:.1f} % left out, without a gait"
+    )
+    figure.suptitle(omitted_rows_note, fontsize=8.0)
+    return figure
+
+
+@figure_style()
+def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
+    """Return a figure of the measures in `SHOWN_MEASURE_NAMES` as functions of one parameter.
+
+    Parameter values without a gait are gray.
+    """
+    scan = scan.isel(
+        {
+            parameter_name: 0
+            for parameter_name in SWEEPABLE_PARAMETERS
+            if parameter_name in scan.dims and parameter_name != x
+        }
+    ).sortby(x)
+    measure_names = _list_shown_measures(scan) or ["fore_foot_force"]
+    width_inches = find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES)
+    figure = StyledFigure(figsize=(width_inches, 1.6 * len(measure_names) + 0.6))
+    panel_axes = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
+    cell_edges = _find_cell_edges(scan[x].values)
+    missing_gait_indices = np.flatnonzero(scan.outcome.values != Outcome.STEPPED)
+    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
+        axes.plot(scan[x].values, scan[measure_name].values, marker=".", color=OKABE_ITO_BLUE)
+        axes.set_yscale("log" if measure_name in LOGARITHMIC_MEASURE_NAMES else "linear")
+        axes.set_ylabel(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
+        for sample_index in missing_gait_indices:
+            cell_ends = cell_edges[sample_index : sample_index + 2]
+            axes.axvspan(*cell_ends, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
+    panel_axes[-1].set_xlabel(format_axis_label(x))
+    return figure
+
+
+def _list_shown_measures(scan: xr.Dataset) -> list[str]:
+    """Return the names of the measures that figures show for this scan."""
+    return [measure_name for measure_name in SHOWN_MEASURE_NAMES if measure_name in scan]
+
+
+def _make_color_scale(
+    measure_name: str, measure_values: np.ndarray, is_stable: np.ndarray
+) -> Normalize:
+    """Return the linear or logarithmic color scale for a measure.
+
+    Its range is that of the stable gaits, or of all gaits if none is stable. A few distant unstable
+    gaits would otherwise make the colors of all other gaits equal.
+    """
+    is_finite = np.isfinite(measure_values)
+    is_in_range = is_finite & is_stable if (is_finite & is_stable).any() else is_finite
+    if not is_in_range.any():
+        return Normalize(0.0, 1.0)
+    min_value, max_value = measure_values[is_in_range].min(), measure_values[is_in_range].max()
+    is_logarithmic = measure_name in LOGARITHMIC_MEASURE_NAMES and min_value > 0.0
+    return (LogNorm if is_logarithmic else Normalize)(min_value, max_value)
+
+
+def _add_color_bar(
+    figure: Figure,
+    axes: Axes | list[Axes],
+    colored_values: ScalarMappable,
+    measure_values: np.ndarray,
+    label_text: str,
+    **color_bar_settings: Any,
+) -> None:
+    """Add a color bar, whose ends are pointed if finite `measure_values` lie beyond them."""
+    min_shown_value, max_shown_value = colored_values.get_clim()
+    finite_values = measure_values[np.isfinite(measure_values)]
+    has_lower_values = bool((finite_values < min_shown_value).any())
+    has_higher_values = bool((finite_values > max_shown_value).any())
+    pointed_ends = ("neither", "min", "max", "both")[has_lower_values + 2 * has_higher_values]
+    figure.colorbar(colored_values, ax=axes, extend=pointed_ends, **color_bar_settings).set_label(
+        label_text
+    )
+
+
+def _find_cell_edges(cell_center_positions: np.ndarray) -> np.ndarray:
+    """Return the edges of cells around the given positions."""
+    if len(cell_center_positions) == 1:
+        return cell_center_positions[0] + np.array([-0.5, 0.5]) * max(
+            abs(cell_center_positions[0]) * 0.01, 1e-6
+        )
+    inner_cell_edges = 0.5 * (cell_center_positions[1:] + cell_center_positions[:-1])
+    first_cell_edge, last_cell_edge = (
+        2.0 * cell_center_positions[[0, -1]] - inner_cell_edges[[0, -1]]
+    )
+    return np.array([first_cell_edge, *inner_cell_edges, last_cell_edge])
+
+
+def _compute_displayed_outcome_codes(scan: xr.Dataset) -> np.ndarray:
+    """Return the outcome codes of a scan, with unstable cycles replaced by `UNSTABLE_CYCLE_CODE`.
+
+    They are replaced only if the scan contains the spectral radius.
+    """
+    outcome_codes = scan.outcome.values.astype(int)
+    if "spectral_radius" in scan:
+        outcome_codes[scan.spectral_radius.values >= 1.0] = UNSTABLE_CYCLE_CODE
+    return outcome_codes
+
+
+def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dict[str, Line2D]:
+    """Draw the curves on which a margin is 0, and return their legend entries, by margin name.
+
+    The first dimension of the margins is `y`.
+    """
+    legend_lines: dict[str, Line2D] = {}
+    if min(scan.sizes[x], scan.sizes[y]) < 2:
+        return legend_lines
+    for margin_name in DRAWN_MARGIN_NAMES:
+        if margin_name not in scan:
+            continue
+        margin_array = scan[margin_name]
+        if MARGIN_MEASURES[margin_name].leg_dimension:
+            margin_array = margin_array.min("leg")
+        if margin_name == "clearance_sls1" and "takeoff_acceleration" in scan:
+            # Without missing values the line has no steps.
+            margin_array = margin_array.where(scan.takeoff_acceleration >= 0.0)
+        margin_values = margin_array.values
+        if not ((margin_values < 0.0).any() and (margin_values > 0.0).any()):
+            continue
+        line_color, line_style = select_special_point_style(margin_name)
+        axes.contour(
+            scan[x].values, scan[y].values, margin_values, levels=[0.0],
+            colors=[line_color], linestyles=[line_style], linewidths=1.4,
+        ).set_path_effects([Stroke(linewidth=2.6, foreground="white"), Normal()])  # fmt: skip
+        legend_lines[margin_name] = Line2D(
+            [],
+            [],
+            color=line_color,
+            linestyle=line_style,
+            label=MARGIN_MEASURES[margin_name].violation_text,
+        )
+    return legend_lines
+
+
+def _add_scan_legend(
+    figure: Figure,
+    outcome_codes: np.ndarray,
+    legend_lines: Mapping[str, Line2D],
+    n_panel_columns: int,
+) -> None:
+    """Add a legend of outcomes and of margin curves below a figure."""
+    margin_names = sorted(legend_lines, key=DRAWN_MARGIN_NAMES.index)
+    margin_lines = [legend_lines[margin_name] for margin_name in margin_names]
+    add_figure_legend(
+        figure,
+        [*make_outcome_patches(outcome_codes), *margin_lines],
+        4 if n_panel_columns > 1 else 2,
+        fontsize=7.5,
+        columnspacing=1.4,
+    )
+
+
+@figure_style()
+def map_figure(
+    scan: xr.Dataset,
+    measure: str,
+    curves: Sequence[SpecialPointCurve],
+    *,
+    width: FigureWidth = None,
+) -> Figure:
+    """Return a map of a measure over two parameters, with curves of special points.
+
+    Cells without a gait are gray. A curve is thin where its gaits are unstable.
+
+    Args:
+        scan: dataset that `vrw.scan` returns for a grid of two parameters.
+        measure: name of a measure in the scan.
+        curves: results of `vrw.continue_special_point` for the same parameters; may be empty.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        Figure: one panel, in SI units.
+
+    Examples:
+        >>> grid = vrw.grid(damping=[150.0, 200.0], slope=[0.28, 0.3])
+        >>> figure = vrw.plot.map_figure(vrw.scan(grid, ["speed"]), "speed", [])
+    """
+    require_dataset_variables(
+        "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
+    )
+    x, y = (
+        curves[0].parameters
+        if curves
+        else (
+            parameter_name for parameter_name in SWEEPABLE_PARAMETERS if parameter_name in scan.dims
+        )
+    )
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    figure = StyledFigure(figsize=(width_inches, 0.62 * width_inches))
+    axes = figure.subplots()
+    axes.set_facecolor(LIGHT_GRAY_COLOR)
+    measure_values = scan[measure].where(scan.outcome == 0).transpose(y, x).values
+    measure_image = axes.pcolormesh(
+        scan[x].values,
+        scan[y].values,
+        measure_values,
+        shading="nearest",
+        cmap="cividis",
+        rasterized=True,
+    )
+    figure.colorbar(measure_image, ax=axes, aspect=30, pad=0.01).set_label(
+        format_axis_label(measure)
+    )
+    labeled_special_points = set()
+    for special_point_curve in curves:
+        curve_color, line_style = select_special_point_style(special_point_curve.name)
+        is_stable = special_point_curve.dataset.spectral_radius.values < 1.0
+        for is_point_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
+            # Each piece includes the first point of the next piece. The curve has one legend entry.
+            is_point_or_next_drawn = is_point_drawn | np.append(False, is_point_drawn[:-1])
+            curve_points = np.where(
+                is_point_or_next_drawn[:, None], special_point_curve.values, np.nan
+            )
+            legend_text = None
+            if is_point_drawn.any() and special_point_curve.name not in labeled_special_points:
+                labeled_special_points.add(special_point_curve.name)
+                legend_text = typeset_greek_symbols(describe_violation(special_point_curve.name))
+            axes.plot(
+                *curve_points.T,
+                color=curve_color,
+                linestyle=line_style,
+                linewidth=line_width,
+                label=legend_text,
+                path_effects=[Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()],
+            )
+    codim2_points = [
+        codim2_point.values
+        for special_point_curve in curves
+        for codim2_point in special_point_curve.codim2_points
+    ]
+    axes.plot(
+        *np.reshape(codim2_points, (-1, 2)).T,
+        "o",
+        color="black",
+        markersize=2.5,
+        markerfacecolor="white",
+        markeredgewidth=0.6,
+        label="two special points at once",
+    )
+    axes.set(
+        xlabel=format_axis_label(x),
+        ylabel=format_axis_label(y),
+        xlim=scan[x].values[[0, -1]],
+        ylim=scan[y].values[[0, -1]],
+    )
+    if curves:
+        add_figure_legend(figure, axes.get_legend_handles_labels()[0], 2)
+    return figure

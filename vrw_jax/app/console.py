@@ -1,0 +1,390 @@
+"""Output of commands: tables, progress, and one-sentence error messages for mistakes of users."""
+
+import contextlib
+import enum
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import typer
+from jax.typing import ArrayLike
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from vrw_jax.app.encoding import replace_unencodable_characters
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.progress import PROGRESS_VARIABLE
+from vrw_jax.gaits.cycle import format_floquet_multipliers
+from vrw_jax.gaits.limit_cycle_result import LimitCycle
+from vrw_jax.gaits.return_map_finder import ReturnMapCycle
+from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES
+from vrw_jax.models.step_results import StepResult
+from vrw_jax.studies.scan_execution import ScanProgress
+from vrw_jax.studies.scan_forecast import format_duration
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import PARAMETER_DOMAINS, WheelParams
+
+if TYPE_CHECKING:
+    from vrw_jax.app.paper_fact import PaperFact
+
+
+class ExitCode(enum.IntEnum):
+    """Exit codes of the command line other than 0, which means success."""
+
+    CHECK_FAILED = 1  # A fact does not hold, a run has no result, or a store is damaged.
+    USER_ERROR = 2
+    INTERRUPTED = 130
+
+
+stdout_console = Console()
+stderr_console = Console(stderr=True)
+
+
+@contextlib.contextmanager
+def report_command_errors(
+    interruption_message: str = "stopped; nothing was written.",
+) -> Iterator[None]:
+    """Return a context manager that handles errors in a command.
+
+    It prints an error in one sentence and ends the command with exit code 2, or 130 after Ctrl-C.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        print_error_sentence(interruption_message)
+        raise typer.Exit(ExitCode.INTERRUPTED) from None
+    except MemoryError as command_error:
+        print_error_sentence(
+            "this asks for more memory than there is: give smaller designs, or fewer at once."
+        )
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
+    except ValueError as command_error:
+        print_error_sentence(str(command_error))
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
+    except OSError as command_error:
+        print_error_sentence(_format_system_error(command_error))
+        raise typer.Exit(ExitCode.USER_ERROR) from command_error
+
+
+@contextlib.contextmanager
+def report_stdout_errors() -> Iterator[None]:
+    """Return a context manager that handles errors of standard output.
+
+    If standard output is not writable, the command ends with exit code 2.
+    """
+    exit_code: Any = 0
+    try:
+        try:
+            yield
+        except SystemExit as system_exit:
+            exit_code = system_exit.code
+        sys.stdout.flush()
+    except OSError as stdout_error:
+        # Python would still write the rest of the output when it exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # A broken pipe has been closed by its reader on purpose.
+        if not isinstance(stdout_error, BrokenPipeError):
+            print_error_sentence(
+                f"standard output can't be written: {_format_system_error(stdout_error)}"
+            )
+        exit_code = ExitCode.USER_ERROR
+    raise SystemExit(exit_code)
+
+
+def print_error_sentence(error_sentence: str) -> None:
+    """Print an error message on standard error."""
+    stderr_console.print(
+        f"[bold red]vrw:[/] {escape(error_sentence)}", highlight=False, soft_wrap=True
+    )
+
+
+def show_warnings_as_sentences() -> None:
+    """Print the library's warnings as sentences, without their location in the source code."""
+    default_show_warning = warnings.showwarning
+
+    def show_warning(
+        message: Warning | str, category: type[Warning], filename: str, *args: Any, **kwargs: Any
+    ) -> None:
+        if category is UserWarning and Path(filename).is_relative_to(Path(__file__).parents[1]):
+            print_error_sentence(str(message))
+        else:
+            default_show_warning(message, category, filename, *args, **kwargs)
+
+    warnings.showwarning = show_warning
+
+
+def _format_system_error(system_error: OSError) -> str:
+    """Return a sentence that describes an error of the operating system."""
+    file_name_text = f"{system_error.filename}: " if system_error.filename else ""
+    return f"{file_name_text}{str(system_error.strerror or system_error).rstrip('.')}."
+
+
+@contextlib.contextmanager
+def show_computation_stages(first_stage_name: str) -> Iterator[Callable[[str], None]]:
+    """Show the stage and the duration of a computation, and yield a function that sets the next
+    stage.
+
+    If stderr is not a terminal, each stage is printed on one line.
+    """
+    if not stderr_console.is_terminal:
+        yield lambda stage_name: stderr_console.print(
+            f"{stage_name} ...", highlight=False, soft_wrap=True
+        )
+        return
+    with make_progress_bar("stages") as progress_bar:
+        progress_task = progress_bar.add_task(first_stage_name, total=None)
+        yield lambda stage_name: progress_bar.update(progress_task, description=stage_name)
+
+
+def print_written_paths(paths: Iterable[Path]) -> None:
+    """Print the paths of written files."""
+    for written_path in paths:
+        stdout_console.print(f"written: {written_path}", highlight=False, soft_wrap=True)
+
+
+def print_text_table(
+    table_title: str | None,
+    table_rows: Iterable[Sequence[str]],
+    column_headings: Sequence[str] = (),
+    right_aligned_headings: Sequence[str] = (),
+) -> None:
+    """Print a table. If it has no headings, the first column is bold.
+
+    Texts are printed literally, except in a column with the heading "", which may contain color
+    markup.
+    """
+    rich_table = Table(
+        title=table_title, title_justify="left", show_header=bool(column_headings), box=None
+    )
+    table_headings = column_headings or ("name", "text")
+    for column_heading in table_headings:
+        rich_table.add_column(
+            column_heading,
+            justify="right" if column_heading in right_aligned_headings else "left",
+            style=None if column_headings or column_heading != "name" else "bold",
+        )
+    for row_cells in table_rows:
+        cell_texts = [
+            replace_unencodable_characters(cell_text, stdout_console.encoding)
+            for cell_text in row_cells
+        ]
+        rich_table.add_row(
+            *(
+                cell_text if column_heading == "" else escape(cell_text)
+                for column_heading, cell_text in zip(table_headings, cell_texts, strict=True)
+            )
+        )
+    stdout_console.print(rich_table)
+
+
+def print_paper_facts(paper_facts: "list[PaperFact]", folder: Path) -> None:
+    """Print the table of facts, and how many facts hold."""
+    verdict_texts = ("[bold red]does not hold[/]", "[green]holds[/]")
+    print_text_table(
+        None,
+        (
+            (
+                paper_fact.claim,
+                paper_fact.source,
+                paper_fact.published_value,
+                paper_fact.computed,
+                verdict_texts[paper_fact.holds],
+            )
+            for paper_fact in paper_facts
+        ),
+        ("fact", "where", "published", "found", ""),
+    )
+    from vrw_jax.app.paper_table import summarize_paper_facts
+
+    stdout_console.print(
+        f"{summarize_paper_facts(paper_facts)}; see the figures and {folder / 'facts.md'}."
+    )
+
+
+def make_progress_bar(task_name: str) -> Progress:
+    """Return a progress bar on standard error. The bar for a scan counts samples and shows a
+    note.
+    """
+    last_columns = (
+        (MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
+        if task_name == "scan"
+        else (TimeElapsedColumn(),)
+    )
+    os.environ[PROGRESS_VARIABLE] = "0"  # The bar replaces the notices of the library.
+    task_columns = (TextColumn("{task.description}"), BarColumn(), *last_columns)
+    return Progress(*task_columns, console=stderr_console)
+
+
+def make_scan_progress_reporter(
+    update_progress_bar: Callable, progress_task: int
+) -> Callable[[ScanProgress], None]:
+    """Return a function that shows the progress of a scan.
+
+    It shows the rate, the fraction of samples without a gait, and the remaining time. The rate is
+    measured from the second chunk on, because the first chunk includes compilation. The bar
+    includes the samples of an earlier run; the rate and the fraction refer only to the present run.
+    """
+    times_and_counts: list[tuple[float, int]] = []
+
+    def report_progress(scan_progress: ScanProgress) -> None:
+        """Update the progress bar from the progress of the scan."""
+        current_seconds, n_samples_done = time.monotonic(), scan_progress.n_done
+        progress_bar_note = (
+            f"{scan_progress.n_reused:,} from an earlier run" if scan_progress.n_reused else ""
+        )
+        if n_samples_done:
+            times_and_counts.append((current_seconds, n_samples_done))
+            first_report_seconds, n_samples_at_first_report = times_and_counts[0]
+            progress_bar_note = (
+                f"{100 * scan_progress.n_failed / n_samples_done:.0f} % without a gait"
+            )
+            if current_seconds > first_report_seconds:
+                samples_per_second = (n_samples_done - n_samples_at_first_report) / (
+                    current_seconds - first_report_seconds
+                )
+                remaining_seconds = (scan_progress.n_samples - n_samples_done) / samples_per_second
+                progress_bar_note = (
+                    f"{samples_per_second:,.0f} per s, {progress_bar_note}, "
+                    f"{format_duration(remaining_seconds)} left"
+                )
+        update_progress_bar(
+            progress_task,
+            total=scan_progress.n_reused + scan_progress.n_samples,
+            completed=scan_progress.n_reused + n_samples_done,
+            description="scanning" if n_samples_done else "compiling",
+            note=progress_bar_note,
+        )
+
+    return report_progress
+
+
+def print_outcome_counts(scan_dataset: "xr.Dataset") -> None:
+    """Print the number of samples for each outcome of a scan."""
+    outcome_codes, n_samples_by_code = np.unique(scan_dataset.outcome.values, return_counts=True)
+    outcomes = map(Outcome, outcome_codes.tolist())
+    print_text_table(
+        "Outcomes",
+        (
+            (
+                f"{n_samples:,}",
+                f"{100 * n_samples / n_samples_by_code.sum():.1f} %",
+                outcome.name,
+                outcome.meaning,
+            )
+            for n_samples, outcome in zip(n_samples_by_code, outcomes, strict=True)
+        ),
+        ("samples", "share", "outcome", "meaning"),
+        ("samples", "share"),
+    )
+
+
+def print_wheel_and_gait(
+    params: WheelParams,
+    step_result: Any,  # `step_result` is the step of any model.
+    start_state: ArrayLike,
+    n_steps_walked: int,
+    limit_cycle_result: LimitCycle | ReturnMapCycle,
+    force_peaks: Mapping[str, Any],
+) -> None:
+    """Print a wheel, the last step of its walk, its limit cycle and the force peaks of the gait.
+
+    `start_state` is the section state at the start of the last step.
+    """
+    parameter_texts = [
+        f"{parameter_name} {float(getattr(params, parameter_name)):g} {parameter_domain.unit}"
+        for parameter_name, parameter_domain in PARAMETER_DOMAINS.items()
+    ]
+    stdout_console.print(
+        "[bold]Wheel[/]  " + ", ".join(parameter_texts) + f", {params.n_legs} legs"
+    )
+    step_outcome = Outcome(int(step_result.outcome))
+    if step_outcome == Outcome.STEPPED:
+        last_state_change = float(
+            np.abs(np.asarray(step_result.section_state) - np.asarray(start_state)).max()
+        )
+        stdout_console.print(
+            f"Walked {n_steps_walked} steps; the last changed the section state by "
+            f"{last_state_change:.1e}."
+        )
+        shown_measures = dict(step_result.measures())
+        for measure_name in ("outcome", "solver_steps", *MARGIN_MEASURES):
+            shown_measures.pop(measure_name, None)
+        _print_measure_table("Last step", shown_measures)
+    else:
+        stdout_console.print(
+            f"[bold]Step {n_steps_walked + 1} ended as {step_outcome.name}:[/] "
+            f"{step_outcome.meaning}"
+        )
+    if limit_cycle_result.found:
+        spectral_radius, multiplier_texts = format_floquet_multipliers(
+            np.asarray(limit_cycle_result.monodromy_value)
+        )
+        stdout_console.print(
+            f"[bold]Limit cycle[/]  {'stable' if spectral_radius < 1.0 else 'unstable'}: "
+            f"multipliers {multiplier_texts}; period {float(limit_cycle_result.period):.5f} s, "
+            f"speed {float(limit_cycle_result.speed):.5f} m/s, DLS "
+            f"{100 * float(limit_cycle_result.dls_fraction):.2f} %."
+        )
+    else:
+        search_outcome = Outcome(int(limit_cycle_result.outcome))
+        stdout_console.print(
+            f"[bold]Limit cycle[/]  {search_outcome.name}: {search_outcome.meaning}"
+        )
+    if force_peaks:
+        _print_measure_table("Force in the gait", force_peaks)
+    # This is a cycle of the paper's model.
+    if step_outcome == Outcome.STEPPED and "lambda_4_plus" in step_result.measures():
+        _print_step_margins(step_result)
+
+
+def _print_measure_table(table_title: str, measure_values: Mapping[str, Any]) -> None:
+    """Print a table of measures, given as a mapping from names to values."""
+    measure_table_rows = (
+        (
+            measure_description.long_name,
+            measure_description.symbol,
+            f"{float(measure_values[measure_name]):.5g}",
+            measure_description.display_unit,
+        )
+        for measure_name, measure_description in MEASURES.items()
+        if measure_name in measure_values
+    )
+    print_text_table(
+        table_title, measure_table_rows, ("quantity", "symbol", "value", "unit"), ("value",)
+    )
+
+
+def _print_step_margins(step_result: StepResult) -> None:
+    """Print the margins of a step, and whether each of them holds."""
+    margin_table_rows, n_violated_margins = [], 0
+    for margin_name, margin_description in MARGIN_MEASURES.items():
+        margin_values = np.atleast_1d(np.asarray(getattr(step_result.margins, margin_name)))
+        lowest_margin, margin_label = float(margin_values.min()), margin_description.long_name
+        is_violated = lowest_margin < 0.0
+        n_violated_margins += is_violated
+        if margin_description.leg_dimension and is_violated:
+            violating_legs = np.flatnonzero(margin_values < 0.0) + 3
+            margin_label += f" (broken at legs {', '.join(map(str, violating_legs))})"
+        margin_table_rows.append(
+            (
+                "[bold red]broken[/]" if is_violated else "[green]holds[/]",
+                margin_label,
+                margin_description.symbol,
+                f"{lowest_margin:.4g}",
+                margin_description.display_unit,
+            )
+        )
+    column_headings = ("", "margin of", "symbol", "least", "unit")
+    print_text_table("Margins of the paper's model", margin_table_rows, column_headings, ("least",))
+    n_margins = len(margin_table_rows)
+    stdout_console.print(
+        f"{n_margins - n_violated_margins} of {n_margins} margins hold, {n_violated_margins} are "
+        "broken. The model walks on regardless: it measures what it does not model."
+    )

@@ -1,0 +1,450 @@
+"""Simulation of hybrid systems, which consist of modes, guards and resets.
+
+    ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounce),))
+    simulate_hybrid((ball,), start, events=10)
+
+A mode whose functions have wrong shapes raises a ValueError. If the simulation fails, the result
+has a code of `Termination` and contains all earlier events.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
+from vrw_jax.base.forward_only import forbid_reverse_mode
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.status_codes import StatusCode, describe_step_ending
+from vrw_jax.base.types import Scalar
+from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
+from vrw_jax.flow.phase_integration import VectorField, integrate_phase
+from vrw_jax.lanes.batching import make_opaque_loop_condition
+from vrw_jax.lanes.program_cache import call_compiled_program
+from vrw_jax.lanes.settings import with_default_jax_settings
+
+MAX_STORED_NUMBERS = 100_000_000
+"""Largest product of the number of events and the dimension of the state.
+
+The value is chosen because the times, the states before and the states after the events then occupy
+2.4 GB.
+"""
+
+
+class Guard(NamedTuple):
+    """Guard function `value`, with the reset and the next mode that follow its event.
+
+    The function `value` of the state is positive inside its mode. The mode ends when `value` falls
+    to zero. Then `reset` is applied to the state, and the mode with the index `target_mode` begins.
+    """
+
+    value: Callable[[StateArray], Scalar]
+    reset: Callable[[StateArray], StateArray] = lambda y: y
+    target_mode: int | None = None  # index of the next mode; None stands for the same mode
+
+
+class Mode(NamedTuple):
+    """Autonomous vector field, from shape (dim,) to (dim,), and the guards that end the mode.
+
+    A single guard may be passed without a tuple. If the field depends on time, time is one of the
+    coordinates of the state.
+    """
+
+    field: VectorField
+    guards: tuple[Guard, ...]
+
+    def guard_values(self, y: StateArray) -> Array:
+        """Return the values of all guards at the state `y`, shape (guards,)."""
+        return jnp.stack([guard.value(y) for guard in self.guards])
+
+
+class Termination(StatusCode):
+    """Reason why a simulation ended."""
+
+    MAX_EVENTS_REACHED = 0, "The simulation has the requested number of events."
+    MAX_TIME_REACHED = 1, "No guard ended the mode within StepOptions.max_phase_time."
+    ZENO = 2, "Events follow each other so fast that the time does not advance (Zeno)."
+    GUARD_VIOLATED_AT_ENTRY = (
+        3,
+        "A mode begins with a guard below zero: start where the guard is zero or positive.",
+    )
+    MAX_STEPS_REACHED = 4, "The solver steps are exhausted: raise StepOptions.max_solver_steps."
+    STEP_SIZE_UNDERFLOW = (
+        5,
+        "The steps are too short, or an event is not located: a singular field or a noisy guard.",
+    )
+
+
+STATUS_RUNNING_CODE = -1
+"""Termination code of a simulation that has not ended. It is no member of `Termination`."""
+
+
+class HybridSolution(NamedTuple):
+    """Events of a simulation in chronological order, and the final state of the simulation.
+
+    Entries after the first `n_events` events are zero.
+    """
+
+    times: Float[Array, " events"]
+    time_tolerance: Float[Array, " events"]
+    """Error of each event's time due to the tolerances of the state, s. It is no bound."""
+    time_roundoff: Float[Array, " events"]
+    """Error of each event's time due to the round-off of the state, s."""
+    states_before: Float[Array, "events dim"]  # states on the guard
+    states_after: Float[Array, "events dim"]  # states after the reset
+    modes: Int[Array, " events"]  # indices of the modes that ended
+    guards: Int[Array, " events"]  # indices of the guards that ended the modes
+    n_events: Int[Array, ""]
+    time: Scalar  # time of the last state
+    state: StateArray  # state at the end of the simulation
+    mode: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+    termination: Int[Array, ""]  # a Termination
+
+    @property
+    def ending(self) -> Any:
+        """Return a sentence on how the simulation ended; for a batch, an array of sentences."""
+        return describe_step_ending(self.termination, Termination)
+
+
+@announce_wait("the system's equations and guards", "10 s")
+@with_default_jax_settings
+def simulate_hybrid(
+    modes: Sequence[Mode] | Mode,
+    start: ArrayLike | Sequence,
+    *,
+    events: int,
+    mode: int = 0,
+    options: StepOptions | None = None,
+) -> HybridSolution:
+    """Return the simulation that starts at `start` and passes through at most `events` events.
+
+    `integrate_phase` locates the earliest event of each mode as accurately as the integrator, with
+    derivatives of the event's time and state. At the start of a mode, a guard is treated as zero if
+    its root is within round-off of the start time. If the guard's time derivative is also zero, the
+    guard ends the mode unless its second time derivative is positive.
+
+    The transforms `jax.jit`, `jax.jacfwd` and `jax.vmap` are supported; reverse mode is not.
+    Outside of `jax.jit`, functions with equal code and equal constants share a compiled program.
+
+    Args:
+        modes: modes of the system. A single mode, and a single guard of a mode, may be passed
+            without a tuple.
+        start: state at the start, shape (dim,).
+        events: largest number of events.
+        mode: index of the first mode.
+        options: options of the integration.
+    """
+    options = StepOptions() if options is None else options
+    check_type("options", options, StepOptions, "give vrw.StepOptions()")
+    start, events = check_reals("start", start), check_int("events", events)
+    modes = convert_modes_to_tuple(modes)
+    if start.ndim != 1 or not start.size:
+        raise ValueError(f"start has shape {start.shape}, but a state is one row of numbers.")
+    if not isinstance(start, jax.core.Tracer) and not np.all(np.isfinite(start)):
+        raise ValueError("start contains a number that is not finite: give finite numbers.")
+    if events * start.size > MAX_STORED_NUMBERS:
+        raise ValueError(f"events is {events}, but so many states don't fit: give fewer.")
+    if not 0 <= mode < len(modes):
+        raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
+    for mode_number, (field, guards) in enumerate(modes):
+        if not guards:
+            raise ValueError(
+                f"mode {mode_number} has no guard, but only a guard can end it: give one."
+            )
+        _check_output_shape(f"the field of mode {mode_number}", field, start, start.shape)
+        for guard_number, guard in enumerate(guards):
+            guard_name = f"guard {guard_number} of mode {mode_number}"
+            _check_output_shape(guard_name, guard.value, start, ())
+            _check_output_shape(f"the reset of {guard_name}", guard.reset, start, start.shape)
+            if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
+                raise ValueError(
+                    f"{guard_name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
+                    "count from 0."
+                )
+    options.check_tolerances(start.dtype)
+    mode_index = jnp.asarray(mode, jnp.int32)
+    solution = call_compiled_program(_simulate_modes, (modes, events), options, start, mode_index)
+    return forbid_reverse_mode("simulate_hybrid", solution)
+
+
+def time_errors(
+    modes: Sequence[Mode] | Mode,
+    start: ArrayLike | Sequence,
+    solution: HybridSolution,
+    options: StepOptions | None = None,
+) -> Float[Array, " events"]:
+    """Return estimated errors of the event times, s, shape (events,).
+
+    The simulation is repeated with tolerances that are ten and a hundred times as large. The change
+    of each event's time is divided by the `time_tolerance` of that event. Ratios below 1 are
+    replaced by 1. The estimate for an event is twice its `time_tolerance` times the largest ratio
+    for this and all earlier events. The estimate is at least the sum of the round-off of all states
+    and of the time.
+
+    Unlike `time_tolerance`, the estimate includes the accumulated errors of solver steps and of
+    earlier events. It also includes errors that the error estimate of an implicit solver omits in a
+    stiff field. The estimate is infinite from the first event that the simulation at ten times the
+    tolerance does not reach. The estimate is no proven bound.
+
+    Args:
+        modes: modes of the system, as in `simulate_hybrid`.
+        start: state at which `solution` begins, shape (dim,).
+        solution: result of `simulate_hybrid`.
+        options: options with which `solution` was computed.
+    """
+    options = StepOptions() if options is None else options
+    modes = convert_modes_to_tuple(modes)
+    start, solution = lax.stop_gradient((check_reals("start", start), solution))
+    return call_compiled_program(_estimate_time_errors, modes, start, solution, options)
+
+
+def _estimate_time_errors(
+    modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
+) -> Float[Array, " events"]:
+    """Return the result of `time_errors` for a tuple of modes whose guards are tuples."""
+    event_indices = jnp.arange(len(solution.times))
+
+    def compute_time_change(tolerance_factor: Array) -> Array:
+        looser_options = options.with_tightened_tolerances(tolerance_factor)
+        modes_and_max_events = (modes, len(event_indices))
+        looser_solution = _simulate_modes(
+            modes_and_max_events, looser_options, start, solution.modes[0]
+        )
+        is_same_event = (looser_solution.guards == solution.guards) & (
+            looser_solution.modes == solution.modes
+        )
+        is_same_event = jnp.cumprod(is_same_event & (event_indices < looser_solution.n_events)) > 0
+        return jnp.where(is_same_event, jnp.abs(looser_solution.times - solution.times), jnp.inf)
+
+    # Each event adds the round-off of its state, and the time has its own.
+    accumulated_roundoff = jnp.cumsum(
+        jnp.where(jnp.isfinite(solution.time_roundoff), solution.time_roundoff, 0.0)
+    )
+    accumulated_roundoff = accumulated_roundoff + jnp.finfo(start.dtype).eps * jnp.abs(
+        solution.times
+    )
+    changes_at_tenfold_tolerance, changes_at_hundredfold_tolerance = lax.stop_gradient(
+        lax.map(compute_time_change, jnp.asarray([0.1, 0.01], start.dtype))
+    )
+    largest_time_change = (
+        jnp.maximum(
+            changes_at_tenfold_tolerance,
+            jnp.where(
+                jnp.isinf(changes_at_hundredfold_tolerance), 0.0, changes_at_hundredfold_tolerance
+            ),
+        )
+        / solution.time_tolerance
+    )
+    largest_time_change = lax.cummax(
+        jnp.where(jnp.isnan(largest_time_change), jnp.inf, jnp.maximum(largest_time_change, 1.0))
+    )
+    time_errors = jnp.maximum(
+        2.0 * largest_time_change * solution.time_tolerance, accumulated_roundoff
+    )
+    return jnp.where(event_indices < solution.n_events, time_errors, 0.0)
+
+
+def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
+    """Return the modes as a tuple, with the guards of each mode as a tuple.
+
+    A single mode or guard may be passed without a tuple. Other types raise a TypeError.
+    """
+    if isinstance(modes, Mode | Guard):  # Mode and Guard are tuples themselves.
+        modes = (modes,)  # type: ignore[assignment]
+    check_type("modes", modes, (list, tuple), "give Modes in a list")
+    modes_with_guard_tuples = []
+    for mode in modes:
+        check_type("a mode", mode, Mode, "give Mode(field, guards)")
+        guards = (mode.guards,) if isinstance(mode.guards, Guard) else mode.guards
+        check_type("guards", guards, (list, tuple), "give Guards in a tuple")
+        for guard in guards:
+            check_type("a guard", guard, Guard, "give Guard(value, reset, target_mode)")
+        modes_with_guard_tuples.append(mode._replace(guards=tuple(guards)))
+    return tuple(modes_with_guard_tuples)
+
+
+def _check_output_shape(
+    function_name: str, function: Callable, start: Array, expected_shape: tuple
+) -> None:
+    """Raise a ValueError unless `function(start)` returns floats of the shape `expected_shape`."""
+    check_callable(function_name, function, "of the state")
+    function_output: Any = jax.eval_shape(function, start)
+    output_shape = getattr(function_output, "shape", None)
+    if output_shape != expected_shape or not jnp.issubdtype(function_output.dtype, jnp.floating):
+        output_description = (
+            f"{function_output.dtype} of shape {output_shape}"
+            if output_shape is not None
+            else type(function_output).__name__
+        )
+        raise ValueError(
+            f"{function_name} gives {output_description} for a state of shape {start.shape}, but "
+            f"it must give floats of shape {expected_shape}: fields and resets give the state's "
+            "shape, guards one number."
+        )
+
+
+def _simulate_one_event(
+    modes: tuple[Mode, ...], mode_index: int, options: StepOptions, state: Array, time: Array
+) -> tuple:
+    """Integrate one phase in a mode, apply the reset at its end, and return both results.
+
+    The result consists of the end of the phase, whether a guard is violated at its start, the
+    errors of the event time due to tolerance and to round-off of the state (s), the next state and
+    the next mode. The errors are large if the guard is grazed.
+    """
+    mode = modes[mode_index]
+    compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
+    guard_values = mode.guard_values(state)
+    guard_rates, second_guard_rates = jax.jvp(compute_guard_rates, (state,), (mode.field(state),))
+    guard_values, guard_rates, second_guard_rates = lax.stop_gradient(
+        (guard_values, guard_rates, second_guard_rates)
+    )
+    time_after_first_step = lax.stop_gradient(time + options.dt0)
+    time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
+    is_guard_near_zero = -guard_values <= jnp.abs(guard_rates) * time_resolution
+    is_guard_violated = jnp.any((guard_values < 0.0) & ~is_guard_near_zero)
+    guard_offset = jnp.where(
+        (guard_values < 0.0) & is_guard_near_zero & (guard_rates > 0.0), -guard_values, 0.0
+    )
+    # For a guard at rest the second derivative decides: the guard does not end the mode if it will
+    # rise.
+    will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
+    guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
+    guards_and_margins = GuardsAndMargins(
+        lambda y: mode.guard_values(y) + guard_offset,
+        len(mode.guards),
+        is_zero_at_start=(guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise,
+    )
+    phase_end = integrate_phase(mode.field, guards_and_margins, state, ~is_guard_violated, options)
+    guard_index = jnp.maximum(phase_end.end_guard_index, 0)
+    end_state = lax.stop_gradient(phase_end.state)
+    guard_gradient = jax.jacfwd(mode.guard_values)(end_state)[guard_index]
+    state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(end_state)
+    state_tolerance = options.atol + options.rtol * jnp.abs(end_state)
+    guard_rate = jnp.abs(guard_gradient @ mode.field(end_state))
+    event_time_errors = [
+        lax.stop_gradient(jnp.abs(guard_gradient) @ state_error_bound / guard_rate)
+        for state_error_bound in (state_tolerance, state_roundoff)
+    ]
+    next_state = lax.switch(guard_index, [g.reset for g in mode.guards], phase_end.state)
+    next_modes = [mode_index if g.target_mode is None else g.target_mode for g in mode.guards]
+    next_mode = jnp.asarray(next_modes, jnp.int32)[guard_index]
+    return phase_end, is_guard_violated, event_time_errors, next_state, next_mode
+
+
+def _simulate_modes(
+    modes_and_max_events: tuple[tuple[Mode, ...], int],
+    options: StepOptions,
+    start: Array,
+    first_mode_index: Array,
+) -> HybridSolution:
+    """Return the simulation that begins at `start` in the mode with the index `first_mode_index`.
+
+    `modes_and_max_events` is a pair of the modes and the largest number of events.
+    """
+    modes, events = modes_and_max_events
+
+    mode_branches = [
+        functools.partial(_simulate_one_event, modes, mode_index, options)
+        for mode_index in range(len(modes))
+    ]
+    # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
+    max_simultaneous_events = sum(len(mode.guards) ** 2 for mode in modes)
+
+    def simulate_next_event(loop_carry: tuple) -> tuple:
+        solution, n_events_without_progress, time_roundoff_remainder = loop_carry
+        phase_end, is_guard_violated, event_time_errors, next_state, next_mode = lax.switch(
+            solution.mode, mode_branches, solution.state, solution.time
+        )
+        has_event = ~is_guard_violated & (phase_end.end_guard_index >= 0)
+        # D. E. Knuth's two-sum returns the rounded sum of two times and its rounding error.
+        duration = phase_end.duration + time_roundoff_remainder
+        time = solution.time + duration
+        rounded_duration = time - solution.time
+        time_roundoff_remainder = (solution.time - (time - rounded_duration)) + (
+            duration - rounded_duration
+        )
+        n_events_without_progress = jnp.where(
+            time > solution.time, 0, n_events_without_progress + 1
+        )
+        # The first condition that holds determines the termination.
+        termination = jnp.select(
+            [
+                has_event & (n_events_without_progress > max_simultaneous_events),
+                has_event & (solution.n_events + 1 >= events),
+                has_event,
+                is_guard_violated,
+                phase_end.has_integration_failed
+                & (phase_end.solver_steps >= options.max_solver_steps),
+                phase_end.is_timed_out,
+            ],
+            [
+                Termination.ZENO,
+                Termination.MAX_EVENTS_REACHED,
+                STATUS_RUNNING_CODE,
+                Termination.GUARD_VIOLATED_AT_ENTRY,
+                Termination.MAX_STEPS_REACHED,
+                Termination.MAX_TIME_REACHED,
+            ],
+            Termination.STEP_SIZE_UNDERFLOW,
+        )
+        event_index = jnp.where(has_event, solution.n_events, events)
+        event_entries = (
+            time,
+            *event_time_errors,
+            phase_end.state,
+            next_state,
+            solution.mode,
+            phase_end.end_guard_index,
+        )
+        times, time_tolerance, time_roundoff, states_before, states_after, modes, guards = (
+            record.at[event_index].set(entry, mode="drop")
+            for record, entry in zip(solution[: len(event_entries)], event_entries, strict=True)
+        )
+        return (
+            HybridSolution(
+                times,
+                time_tolerance,
+                time_roundoff,
+                states_before,
+                states_after,
+                modes,
+                guards,
+                n_events=solution.n_events + has_event,
+                time=time,
+                state=jnp.where(has_event, next_state, phase_end.state),
+                mode=jnp.where(has_event, next_mode, solution.mode).astype(jnp.int32),
+                solver_steps=solution.solver_steps + phase_end.solver_steps,
+                termination=termination.astype(jnp.int32),
+            ),
+            n_events_without_progress,
+            time_roundoff_remainder,
+        )
+
+    initial_count, float_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
+    initial_states = jnp.zeros((events, start.size)) + float_zero
+    initial_indices = jnp.zeros((events,), jnp.int32)
+    initial_times = jnp.zeros(events) + float_zero
+    initial_time_errors = lax.stop_gradient(initial_times)
+    initial_solution = HybridSolution(
+        times=initial_times, time_tolerance=initial_time_errors, time_roundoff=initial_time_errors,
+        states_before=initial_states, states_after=initial_states,
+        modes=initial_indices, guards=initial_indices, n_events=initial_count,
+        time=float_zero, state=start,
+        mode=initial_count + first_mode_index,
+        solver_steps=initial_count, termination=initial_count + STATUS_RUNNING_CODE,
+    )  # fmt: skip
+    is_running = lambda loop_carry: make_opaque_loop_condition(
+        loop_carry[0].termination == STATUS_RUNNING_CODE, loop_carry[0].n_events
+    )
+    return lax.while_loop(
+        is_running, simulate_next_event, (initial_solution, initial_count, float_zero)
+    )[0]

@@ -1,0 +1,657 @@
+"""Integrate one phase of a batch to its earliest event, with a separate step size for each element.
+
+The elements are integrated together until each has ended or has a solver step in which a guard
+crosses zero. Then all events are located together. The crossing solver step is repeated, and
+Newton's method corrects its length. An element that has ended does not change, so its result never
+depends on the other elements.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Vector
+from vrw_jax.flow.event_location import (
+    IntegrationStatus,
+    IntegratorState,
+    compute_event_time_tangent,
+    locate_event,
+)
+from vrw_jax.flow.minima import (
+    MarginMinimaResult,
+    compute_margin_minima_jvp,
+    init_margin_minima_state,
+    refine_margin_minima,
+    update_margin_minima_state,
+)
+from vrw_jax.flow.tableaus import (
+    ButcherTableau,
+    SolverStepFunction,
+    StageState,
+    compute_step_size_factor,
+    estimate_step_error,
+    find_earliest_guard_minimum_fraction,
+    take_rk_step,
+)
+from vrw_jax.flow.tangents import (
+    BatchPhase,
+    MakeBatchPhase,
+    PhaseTangents,
+    apply_batched_jvp_rule,
+    stack_directions,
+)
+from vrw_jax.lanes.autodiff import make_zero_tangent
+from vrw_jax.lanes.batching import select_trees_by_condition
+from vrw_jax.lanes.lowering import mark_noinline
+from vrw_jax.lanes.settings import with_default_jax_settings
+
+
+class BatchPhaseEnd(NamedTuple):
+    """State at the end of a phase, duration, triggered guard and failure flags of each element."""
+
+    state: StageState
+    duration: Array  # s
+    end_guard_index: Array  # index of the guard that ended the phase; -1 if none did
+    is_timed_out: Array
+    # whether the element is a straggler, see `integrate_batch_phase`
+    is_unfinished: Array
+    n_tried_steps: Array  # number of solver steps, accepted or not
+    next_solver_dt: Array  # next step length that the controller proposes, s
+    margin_minima: Array | None  # minima of the margins, (margins, batch)
+
+
+STRAGGLER_ITERATION_FACTOR = 2
+"""Ratio of two iteration counts: when stragglers are cut off, and when half of the batch had ended.
+
+The value is chosen because a ratio near 1 would cut off regular elements.
+"""
+
+
+def integrate_batch_phase(
+    make_phase: MakeBatchPhase,
+    phase_constants: Any,
+    held_constants: Vector,
+    tableau: ButcherTableau,
+    q: Vector,
+    v: Vector,
+    is_active: Array,
+    initial_dt: Array,
+    options: StepOptions,
+    straggler_count: Array | None = None,
+) -> BatchPhaseEnd:
+    """Return the end of a phase that begins at positions `q` and rates `v`, for each batch element.
+
+    - `make_phase`: function that returns the phase for `phase_constants` and `held_constants`;
+    - `phase_constants`, `held_constants`: constants of the equations, see
+      `tangents.MakeBatchPhase`;
+    - `tableau`: tableau of the Runge-Kutta method;
+    - `q`, `v`: tuples of arrays (batch,), one array per coordinate;
+    - `is_active`: which elements are integrated, (batch,);
+    - `initial_dt`: length of the first solver step, (batch,), s;
+    - `straggler_count`: largest number of elements that may be cut off; None for no cut-off.
+
+    Each active element is integrated to its earliest event. Errors are those of
+    `hybrid.integrate_phase`. Stragglers are the last `straggler_count` elements of a large batch
+    that take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. Their
+    integration stops early, and the caller integrates them again in a batch of stragglers.
+
+    The result is differentiable with respect to `phase_constants`, `held_constants`, `q` and `v`,
+    see `tangents`.
+    """
+    integrate_with_rule = jax.custom_jvp(
+        lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments)[0]
+    )
+
+    @integrate_with_rule.defjvp
+    @with_default_jax_settings
+    def compute_integration_jvp(
+        primals: tuple, state_tangents: tuple
+    ) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
+        def integrate_with_tangents(primals: tuple, directions: tuple) -> tuple[BatchPhaseEnd, Any]:
+            phase_constants_tangents, held_constants, q, v = directions
+            start_tangents = stack_directions((*q, *v, *held_constants))
+            phase_tangents = PhaseTangents(
+                make_phase, primals[0], primals[1], phase_constants_tangents, start_tangents
+            )
+            return _integrate_to_event(make_phase, tableau, phase_tangents, *primals)
+
+        phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
+            integrate_with_tangents, primals, state_tangents[:4]
+        )
+        zero_phase_end = make_zero_tangent(phase_end)
+        state_tangent = zero_phase_end.state._replace(q=q, v=v)
+        return phase_end, zero_phase_end._replace(
+            state=state_tangent, duration=event_time_tangent, margin_minima=minima_tangents
+        )
+
+    return integrate_with_rule(
+        phase_constants, held_constants, q, v, is_active, initial_dt, options, straggler_count
+    )
+
+
+def _compute_phase_end_jvp(
+    tableau: ButcherTableau,
+    phase_tangents: PhaseTangents,
+    solver_step_function: SolverStepFunction,
+    start_state: StageState,
+    phase_end: BatchPhaseEnd,
+    integrator_state: IntegratorState,
+    margin_minima_result: MarginMinimaResult | None,
+) -> tuple[Vector, Vector, Array, Array | None]:
+    """Return the tangents at the end of a phase, for given tangents of its start and constants.
+
+    The result contains the tangents of positions, rates, duration and minima of the margins. The
+    first axis contains the directions.
+
+    - `integrator_state`: state of the loop after it has ended, with the minima of the whole phase.
+    """
+    n = len(start_state.q)
+    last_step_length = jnp.where(
+        integrator_state.has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
+    )
+    stage_states = solver_step_function(integrator_state.state, last_step_length)
+    assert integrator_state.state_tangents is not None
+    end_state_tangents = phase_tangents.propagate_to_step_end(
+        tableau, stage_states, integrator_state.state_tangents, last_step_length
+    )
+
+    end_state = stage_states[-1]
+    tangents_by_component = tuple(jnp.moveaxis(end_state_tangents, 1, 0))
+    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
+    event_time_tangent = compute_event_time_tangent(
+        integrator_state.has_guard_crossed,
+        phase_end.end_guard_index,
+        phase.evaluate_with_rates(phase.evaluate_guards, end_state)[1],
+        phase_tangents.evaluate_tangents(
+            lambda phase, state: phase.evaluate_guards(state), end_state, end_state_tangents
+        ),
+    )
+    motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
+    state_tangents = tuple(
+        x + event_time_tangent * y
+        for x, y in zip(tangents_by_component[: 2 * n], motion_rates, strict=True)
+    )
+    minima_tangents = None
+    margin_minima_state = integrator_state.margin_minima_state
+    if margin_minima_state is not None and margin_minima_result is not None:
+        minima_tangents = compute_margin_minima_jvp(
+            solver_step_function,
+            tableau,
+            phase_tangents,
+            margin_minima_state,
+            margin_minima_result,
+            start_state,
+            phase_end.state,
+            jnp.stack([*state_tangents, *tangents_by_component[2 * n :]], 1),
+        )
+    return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
+
+
+def _integrate_to_event(
+    make_phase: MakeBatchPhase,
+    tableau: ButcherTableau,
+    phase_tangents: PhaseTangents | None,
+    phase_constants: Any,
+    held_constants: Vector,
+    q: Vector,
+    v: Vector,
+    is_active: Array,
+    initial_dt: Array,
+    options: StepOptions,
+    straggler_count: Array | None,
+) -> tuple[BatchPhaseEnd, Any]:
+    """Return the end of a phase for each batch element, and its tangents.
+
+    The tangents are those of `_compute_phase_end_jvp`; None without `phase_tangents`.
+    """
+    phase = make_phase(phase_constants, held_constants)
+    phase = _wrap_each_phase_function(
+        phase, mark_noinline if phase.is_compiled_separately else jax.jit
+    )
+    solver_step_function = _make_solver_step_function(phase, tableau)
+    start_state = phase.make_state(q, v)
+    guard_values, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, start_state)
+    is_guard_met_at_start = tuple(
+        (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
+        for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
+    )
+    # The index is that of the first guard whose event is the start itself; -1 if there is none.
+    start_event_guard_index = jnp.full(is_guard_met_at_start[0].shape, -1, jnp.int32)
+    for guard_index, is_guard_met in reversed(list(enumerate(is_guard_met_at_start))):
+        start_event_guard_index = jnp.where(is_guard_met, guard_index, start_event_guard_index)
+    is_phase_started = is_active & (start_event_guard_index < 0)
+
+    integrator_state = _integrate_until_crossing(
+        phase,
+        solver_step_function,
+        tableau,
+        start_state,
+        guard_values,
+        is_phase_started,
+        initial_dt,
+        options,
+        straggler_count,
+        phase_tangents,
+    )
+    has_guard_crossed = integrator_state.has_guard_crossed
+    if phase.margins_include_start or phase_tangents is not None:
+        # The functions are called, not inlined, because the program is already long.
+        phase = _wrap_each_phase_function(phase, mark_noinline)
+        solver_step_function = _make_solver_step_function(phase, tableau)
+    event_search = locate_event(phase, solver_step_function, tableau, integrator_state, options)
+    is_crossing_event_unresolved = has_guard_crossed & event_search.is_event_unresolved
+    duration = integrator_state.elapsed_time + jnp.where(
+        has_guard_crossed, event_search.event_step_length, 0.0
+    )
+    end_state = select_trees_by_condition(
+        has_guard_crossed, event_search.end_state, integrator_state.state
+    )
+    margin_minima_state, margin_minima_result = integrator_state.margin_minima_state, None
+    if margin_minima_state is not None:
+        margin_minima_state = update_margin_minima_state(
+            phase,
+            margin_minima_state,
+            integrator_state.state,
+            end_state,
+            event_search.event_step_length,
+            has_guard_crossed,
+            integrator_state.state_tangents,
+        )
+        margin_minima_result = refine_margin_minima(
+            phase,
+            solver_step_function,
+            margin_minima_state,
+            jnp.stack(phase.evaluate_margins(start_state)),
+            options,
+        )
+    is_straggler = (
+        has_guard_crossed & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
+    )
+    event_guard_index = jnp.where(
+        is_active & (start_event_guard_index >= 0),
+        start_event_guard_index,
+        jnp.where(has_guard_crossed, event_search.guard_index, -1),
+    )
+    phase_end = BatchPhaseEnd(
+        state=end_state,
+        duration=duration,
+        end_guard_index=jnp.where(
+            is_crossing_event_unresolved | is_straggler, -1, event_guard_index
+        ),
+        is_timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
+        | is_straggler,
+        is_unfinished=integrator_state.is_running,
+        n_tried_steps=integrator_state.n_tried_steps
+        + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),
+        next_solver_dt=integrator_state.next_step_length,
+        margin_minima=None
+        if margin_minima_result is None
+        else margin_minima_result.phase_margin_minima,
+    )
+    if phase_tangents is None:
+        return phase_end, None
+    return phase_end, _compute_phase_end_jvp(
+        tableau,
+        phase_tangents,
+        solver_step_function,
+        start_state,
+        phase_end,
+        integrator_state._replace(margin_minima_state=margin_minima_state),
+        margin_minima_result,
+    )
+
+
+def _make_solver_step_function(phase: BatchPhase, tableau: ButcherTableau) -> SolverStepFunction:
+    """Return a function of state and length that takes one Runge-Kutta step in the phase.
+
+    The function is traced once for all its calls.
+    """
+    return jax.jit(lambda state, h: take_rk_step(tableau, phase.evaluate_acceleration, state, h))
+
+
+def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
+    """Return a copy of the phase in which `wrap_function` has been applied to each function."""
+    return phase._replace(
+        evaluate_acceleration=wrap_function(phase.evaluate_acceleration),
+        evaluate_guards=wrap_function(phase.evaluate_guards),
+        evaluate_margins=wrap_function(phase.evaluate_margins),
+    )
+
+
+def _integrate_until_crossing(
+    phase: BatchPhase,
+    solver_step_function: SolverStepFunction,
+    tableau: ButcherTableau,
+    start_state: StageState,
+    guard_values: Vector,
+    is_phase_started: Array,
+    initial_dt: Array,
+    options: StepOptions,
+    straggler_count: Array | None,
+    phase_tangents: PhaseTangents | None,
+) -> IntegratorState:
+    """Take adaptive solver steps in all batch elements, and return the state of the loop.
+
+    An element stops when a guard crosses zero, when it reaches the time limit, or when it fails.
+    The loop ends when no element is running, or earlier if the caller allows the slowest elements
+    to be left unfinished.
+    """
+
+    def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:
+        step_length = integrator_state.next_step_length
+        stage_states = solver_step_function(integrator_state.state, step_length)
+        inner_guard_values = [
+            integrator_state.guard_values,
+            *(phase.evaluate_guards(stage_states[i]) for i in tableau.guard_stage_indices),
+        ]
+        end_guard_values = phase.evaluate_guards(stage_states[-1])
+        mean_squared_error = _compute_mean_squared_error(
+            tableau, stage_states, step_length, end_guard_values, options, phase.state_units
+        )
+        guard_minimum_fraction = find_earliest_guard_minimum_fraction(
+            tableau, [*inner_guard_values, end_guard_values]
+        )
+        is_within_tolerance = mean_squared_error <= 1.0
+        # A step inside which a guard may be negative is repeated up to the guard's minimum.
+        may_cross_inside = is_within_tolerance & (guard_minimum_fraction < 1.0)
+        controller_factor = compute_step_size_factor(
+            tableau, mean_squared_error, guard_minimum_fraction.dtype
+        )
+        next_state, is_accepted = _classify_solver_step(
+            options,
+            integrator_state,
+            jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor),
+            may_cross_inside | ~is_within_tolerance,
+            end_guard_values,
+        )
+        state, guard_values = select_trees_by_condition(
+            is_accepted,
+            (stage_states[-1], end_guard_values),
+            integrator_state[:2],
+        )
+        middle_guard_values, end_guard_values = select_trees_by_condition(
+            integrator_state.is_running,
+            (inner_guard_values[tableau.middle_guard_index], end_guard_values),
+            (integrator_state.middle_guard_values, integrator_state.end_guard_values),
+        )
+        *_, n_iterations_until_half_ended, n_iterations, margin_minima_state, state_tangents = (
+            integrator_state
+        )
+        if margin_minima_state is not None:
+            margin_minima_state = update_margin_minima_state(
+                phase,
+                margin_minima_state,
+                integrator_state.state,
+                stage_states[-1],
+                step_length,
+                is_accepted,
+                state_tangents,
+            )
+        if phase_tangents is not None and state_tangents is not None:
+            state_tangents = phase_tangents.propagate_if_accepted(
+                tableau, stage_states, state_tangents, step_length, is_accepted
+            )
+        if straggler_count is not None:
+            n_running_elements = jnp.sum(next_state.is_running, dtype=jnp.int32)
+            n_iterations_until_half_ended = jnp.where(
+                2 * n_running_elements > is_accepted.size,
+                n_iterations + 1,
+                n_iterations_until_half_ended,
+            )
+        return next_state._replace(
+            state=state,
+            guard_values=guard_values,
+            middle_guard_values=middle_guard_values,
+            end_guard_values=end_guard_values,
+            n_tried_steps=integrator_state.n_tried_steps + integrator_state.is_running,
+            n_iterations_until_half_ended=n_iterations_until_half_ended,
+            n_iterations=n_iterations + 1,
+            margin_minima_state=margin_minima_state,
+            state_tangents=state_tangents,
+        )
+
+    def needs_more_steps(integrator_state: IntegratorState) -> Array:
+        """Return whether the loop continues, which depends on the number of running elements."""
+        if straggler_count is None:
+            return jnp.any(integrator_state.is_running)
+        n_running_elements = jnp.sum(integrator_state.is_running, dtype=jnp.int32)
+        max_iterations = (
+            STRAGGLER_ITERATION_FACTOR * integrator_state.n_iterations_until_half_ended + 8
+        )
+        is_iteration_limit_exceeded = integrator_state.n_iterations > max_iterations
+        return (n_running_elements > 0) & ~(
+            (n_running_elements <= straggler_count) & is_iteration_limit_exceeded
+        )
+
+    initial_minima = (
+        init_margin_minima_state(phase, start_state, phase_tangents)
+        if phase.margins_include_start
+        else None
+    )
+    initial_counts, initial_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
+    initial_state = IntegratorState(
+        state=start_state,
+        guard_values=guard_values,
+        next_step_length=initial_dt,
+        elapsed_time=jnp.zeros_like(initial_dt),
+        integration_status=jnp.where(
+            is_phase_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
+        ).astype(jnp.int32),
+        crossing_guard_bits=initial_counts,
+        middle_guard_values=guard_values,
+        end_guard_values=guard_values,
+        n_tried_steps=initial_counts,
+        n_iterations_until_half_ended=initial_count,
+        n_iterations=initial_count,
+        margin_minima_state=initial_minima,
+        state_tangents=None if phase_tangents is None else phase_tangents.start_tangents,
+    )
+    return lax.while_loop(needs_more_steps, take_one_solver_step, initial_state)
+
+
+def _classify_solver_step(
+    options: StepOptions,
+    integrator_state: IntegratorState,
+    step_length_factor: Array,
+    is_step_rejected: Array,
+    end_guard_values: Vector,
+) -> tuple[IntegratorState, Array]:
+    """Return the status of each batch element after a solver step, and whether it accepts the step.
+
+    The returned state has a new status, new bits of the crossing guards, the new elapsed time, and
+    the length of the next solver step. If a guard crosses zero within the solver step, the length
+    is instead that of the step just taken. A step that would end after the time limit is shortened
+    to end there. An element fails if its next step is too short for the time to advance, or if the
+    number of its solver steps reaches the limit.
+    """
+    is_running = integrator_state.is_running
+    is_valid_step = is_running & ~is_step_rejected
+    crossing_guard_bits = jnp.zeros_like(integrator_state.crossing_guard_bits)
+    for candidate_guard_index, end_guard_value in enumerate(end_guard_values):
+        crossing_guard_bits = crossing_guard_bits | jnp.where(
+            end_guard_value <= 0.0, 1 << candidate_guard_index, 0
+        )
+    has_guard_crossed = is_valid_step & (crossing_guard_bits > 0)
+    is_accepted = is_valid_step & ~has_guard_crossed
+    step_length = integrator_state.next_step_length
+    elapsed_time = integrator_state.elapsed_time
+    phase_time_limit = options.max_phase_time
+    end_time = jnp.where(
+        step_length == phase_time_limit - elapsed_time, phase_time_limit, elapsed_time + step_length
+    )
+    elapsed_time = jnp.where(is_accepted, end_time, elapsed_time)
+    next_step_length_limit = jnp.minimum(
+        step_length * step_length_factor, phase_time_limit - elapsed_time
+    )
+    has_timed_out = is_accepted & (elapsed_time >= phase_time_limit)
+    is_step_too_short = (integrator_state.n_tried_steps + 1 >= options.max_solver_steps) | (
+        elapsed_time + next_step_length_limit == elapsed_time
+    )
+    integration_status = jnp.where(
+        is_step_too_short, IntegrationStatus.FAILED, IntegrationStatus.RUNNING
+    )
+    integration_status = jnp.where(
+        has_timed_out,
+        IntegrationStatus.TIMED_OUT,
+        jnp.where(has_guard_crossed, IntegrationStatus.CROSSED, integration_status),
+    )
+    integration_status = jnp.where(
+        is_running, integration_status, integrator_state.integration_status
+    )
+    next_state = integrator_state._replace(
+        integration_status=integration_status.astype(jnp.int32),
+        crossing_guard_bits=jnp.where(
+            is_running, crossing_guard_bits, integrator_state.crossing_guard_bits
+        ),
+        elapsed_time=elapsed_time,
+        next_step_length=jnp.where(
+            is_running & ~has_guard_crossed, next_step_length_limit, step_length
+        ),
+    )
+    return next_state, is_accepted
+
+
+def _compute_mean_squared_error(
+    tableau: ButcherTableau,
+    stage_states: list[StageState],
+    step_length: Array,
+    end_guard_values: Vector,
+    options: StepOptions,
+    state_units: Vector | None,
+) -> Array:
+    """Return the mean square of the error of a solver step, divided by the tolerance.
+
+    The result is infinite for a solver step whose end is not finite. The mean is computed in
+    float32, because an error estimate needs no higher precision.
+
+    - `end_guard_values`: guards at the end of the step, which must be finite;
+    - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
+      units.
+    """
+    start_state, end_state = stage_states[0], stage_states[-1]
+    start_state_components = (*start_state.q, *start_state.v)
+    convert_to_float32 = lambda x: x.astype(jnp.float32)
+    sum_of_squares: Any = 0.0
+    component_units: Any = (
+        (1.0,) * len(start_state_components) if state_units is None else state_units
+    )
+    for component_error, start_component, end_component, component_unit in zip(
+        estimate_step_error(tableau, stage_states, step_length),
+        start_state_components,
+        (*end_state.q, *end_state.v),
+        component_units,
+        strict=True,
+    ):
+        error_tolerance = options.atol * component_unit + options.rtol * jnp.maximum(
+            jnp.abs(start_component), jnp.abs(end_component)
+        )
+        relative_error = convert_to_float32(component_error) / convert_to_float32(error_tolerance)
+        sum_of_squares = sum_of_squares + relative_error * relative_error
+    for end_guard_value in end_guard_values:
+        sum_of_squares = sum_of_squares + convert_to_float32(0.0 * end_guard_value)
+    return jnp.where(
+        jnp.isfinite(sum_of_squares), sum_of_squares / len(start_state_components), jnp.inf
+    )
+
+
+def sample_batch_phase(
+    phase: BatchPhase,
+    tableau: ButcherTableau,
+    q: Vector,
+    v: Vector,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+) -> Array:
+    """Return positions and rates at `n_samples` equally spaced times of a phase.
+
+    The first sample is at the start of the phase, and the last is after `duration`, s. The result
+    has the shape (samples, 2 coordinates, batch), with the positions before the rates.
+    """
+
+    def solver_step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
+        stage_states = take_rk_step(tableau, phase.evaluate_acceleration, state, step_length)
+        return stage_states[-1], _compute_mean_squared_error(
+            tableau, stage_states, step_length, (), options, phase.state_units
+        )
+
+    pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
+    return sample_at_equal_times(
+        solver_step_function,
+        pack_sample,
+        phase.make_state(q, v),
+        tableau,
+        duration,
+        n_samples,
+        options,
+    )
+
+
+def sample_at_equal_times(
+    solver_step_function: Callable[[Any, Array], tuple[Any, Array]],
+    pack_sample: Callable[[Any], Array],
+    start_state: Any,
+    tableau: ButcherTableau,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+) -> Array:
+    """Return samples at `n_samples` equally spaced times from 0 to `duration`, s.
+
+    - `solver_step_function`: function of state and step length, s, that returns the state at the
+      end of a solver step and the squared ratio of its error to the tolerance;
+    - `pack_sample`: function that returns the sample for a state. The first axis of the result
+      contains the samples.
+    """
+    initial_count = jnp.zeros((), jnp.int32)
+
+    def take_solver_step_to_sample(loop_carry: tuple) -> tuple:
+        sample_state, h, remaining_time_to_sample, n_tried_steps = loop_carry
+        sampled_step_length = jnp.minimum(h, remaining_time_to_sample)
+        step_end, mean_squared_error = solver_step_function(sample_state, sampled_step_length)
+        step_length_factor = compute_step_size_factor(
+            tableau, mean_squared_error, sampled_step_length.dtype
+        )
+        is_within_tolerance = mean_squared_error <= 1.0
+        # A step that was shortened to end at a sample does not reduce the next step's length.
+        h = jnp.where(
+            is_within_tolerance & (sampled_step_length < h),
+            jnp.maximum(h, sampled_step_length * step_length_factor),
+            sampled_step_length * step_length_factor,
+        )
+        is_running = remaining_time_to_sample > 0.0
+        return (
+            select_trees_by_condition(is_running & is_within_tolerance, step_end, sample_state),
+            jnp.where(is_running, h, loop_carry[1]),
+            jnp.where(
+                is_running & is_within_tolerance,
+                jnp.where(
+                    sampled_step_length == remaining_time_to_sample,
+                    0.0,
+                    remaining_time_to_sample - sampled_step_length,
+                ),
+                remaining_time_to_sample,
+            ),
+            n_tried_steps + 1,
+        )
+
+    def integrate_to_next_sample(loop_carry: tuple, _: None) -> tuple[tuple, Array]:
+        needs_step = lambda loop_carry: (
+            jnp.any(loop_carry[2] > 0.0) & (loop_carry[3] < options.max_solver_steps)
+        )
+        initial_loop_carry = (*loop_carry, duration / (n_samples - 1), initial_count)
+        sample_state, h, _, _ = lax.while_loop(
+            needs_step, take_solver_step_to_sample, initial_loop_carry
+        )
+        return (sample_state, h), pack_sample(sample_state)
+
+    initial_loop_carry = start_state, options.dt0 + jnp.zeros_like(duration)
+    samples_after_start = lax.scan(
+        integrate_to_next_sample, initial_loop_carry, None, length=n_samples - 1
+    )[1]
+    return jnp.concatenate([pack_sample(start_state)[None], samples_after_start])

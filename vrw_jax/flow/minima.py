@@ -1,0 +1,296 @@
+"""Minima of margins during a phase of a batch, as accurate as the integration.
+
+The method is that of `hybrid/minima`, applied to all batch elements. During the integration, the
+solver step that contains the lowest minimum of each margin is stored. Afterwards, a secant
+iteration for the root of the margin's time derivative locates each minimum, one margin after
+another.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.base.cubic_minima import find_cubic_minimum, refine_minimum_location
+from vrw_jax.base.options import StepOptions
+from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
+from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
+from vrw_jax.lanes.batching import select_trees_by_condition
+
+
+class MarginMinimaState(NamedTuple):
+    """Margins at the present state, and the lowest minimum of each margin so far."""
+
+    margin_values: Array  # margins at the present state, (margins, batch)
+    margin_rates: Array
+    lowest_margin_values: (
+        Array  # lowest interior minimum, (margins, batch); infinity if there is none
+    )
+    step_start_q: Array  # positions at the start of that step, (margins, coordinates, batch)
+    step_start_v: Array
+    step_length: Array  # length of that step, (margins, batch), s
+    time_to_minimum: Array  # time from the step's start to the minimum, s
+    step_start_margin_rates: Array  # rates of the margins at the step's start
+    # tangents of that start, (margins, directions, components, batch)
+    step_start_tangents: Array | None = None
+
+
+def init_margin_minima_state(
+    phase: BatchPhase, start_state: StageState, phase_tangents: PhaseTangents | None
+) -> MarginMinimaState:
+    """Return the state of the search for minima before the first solver step.
+
+    A margin that is zero at the start of the phase by construction cannot fall there. Its negative
+    time derivative at the start is round-off and is replaced by zero.
+    """
+    margin_values, margin_rates = map(
+        jnp.stack, phase.evaluate_with_rates(phase.evaluate_margins, start_state)
+    )
+    includes_phase_start = jnp.asarray(phase.margins_include_start)[:, None]
+    zero_margins = jnp.zeros_like(margin_values)
+    zero_start_coordinates = jnp.zeros(
+        (len(margin_values), len(start_state.q), margin_values.shape[-1]), margin_values.dtype
+    )
+    margin_rates = jnp.where(includes_phase_start, margin_rates, jnp.maximum(margin_rates, 0.0))
+    zero_tangents = (
+        None
+        if phase_tangents is None
+        else jnp.stack([jnp.zeros_like(phase_tangents.start_tangents)] * len(margin_values))
+    )
+    return MarginMinimaState(
+        margin_values,
+        margin_rates,
+        zero_margins + jnp.inf,
+        zero_start_coordinates,
+        zero_start_coordinates,
+        zero_margins,
+        zero_margins,
+        zero_margins,
+        zero_tangents,
+    )
+
+
+def update_margin_minima_state(
+    phase: BatchPhase,
+    margin_minima_state: MarginMinimaState,
+    step_start: StageState,
+    step_end: StageState,
+    step_length: Array,
+    is_accepted: Array,
+    step_start_tangents: Array | None,
+) -> MarginMinimaState:
+    """Return the lowest interior minima after one more solver step.
+
+    - `is_accepted`: whether each batch element accepts the step;
+    - `step_start_tangents`: tangents of the step's start.
+    """
+    margin_values, margin_rates = map(
+        jnp.stack, phase.evaluate_with_rates(phase.evaluate_margins, step_end)
+    )
+    margin_minimum_location, margin_minimum = find_cubic_minimum(
+        margin_minima_state.margin_values,
+        margin_minima_state.margin_rates * step_length,
+        margin_values,
+        margin_rates * step_length,
+    )
+    has_interior_minimum = (margin_minima_state.margin_rates < 0.0) & (margin_rates >= 0.0)
+    is_minimum_lower = (
+        is_accepted
+        & has_interior_minimum
+        & (margin_minimum < margin_minima_state.lowest_margin_values)
+    )
+
+    def replace_if_lower(old_value: Array, new_value: Array) -> Array:
+        is_lower = is_minimum_lower.reshape(len(old_value), *(1,) * (old_value.ndim - 2), -1)
+        return jnp.where(is_lower, new_value, old_value)
+
+    minimum_of_step = margin_minima_state._replace(
+        lowest_margin_values=margin_minimum,
+        step_start_q=jnp.stack(step_start.q),
+        step_start_v=jnp.stack(step_start.v),
+        step_length=step_length,
+        time_to_minimum=margin_minimum_location * step_length,
+        step_start_margin_rates=margin_minima_state.margin_rates,
+        step_start_tangents=step_start_tangents,
+    )
+    margin_values, margin_rates = select_trees_by_condition(
+        is_accepted, (margin_values, margin_rates), margin_minima_state[:2]
+    )
+    lowest_minimum = jax.tree.map(replace_if_lower, margin_minima_state, minimum_of_step)
+    return lowest_minimum._replace(margin_values=margin_values, margin_rates=margin_rates)
+
+
+class MarginMinimaResult(NamedTuple):
+    """Minima of margins over a phase; each field has the shape (margins, batch)."""
+
+    phase_margin_minima: Array  # minima over the phase, ends included
+    interior_margin_minima: Array  # interior minima; infinity if a margin has none
+    step_length_to_minimum: (
+        Array  # length of the step from the stored start to the interior minimum, s
+    )
+
+
+class _MarginMinimumSearch(NamedTuple):
+    """State of the secant iteration for the minimum of one margin in each batch element."""
+
+    step_length: Array  # length of the next solver step, s
+    best_step_length: Array  # length of the step that ended with the smallest rate, s
+    best_margin_rate: Array
+    margin_value: Array
+    is_minimum_unresolved: Array
+    n_iterations: Array
+
+
+def refine_margin_minima(
+    phase: BatchPhase,
+    solver_step_function: SolverStepFunction,
+    margin_minima_state: MarginMinimaState,
+    start_margin_values: Array,
+    options: StepOptions,
+) -> MarginMinimaResult:
+    """Return the minima of the margins over the phase, refined by a secant iteration.
+
+    `start_margin_values` are the margins at the start of the phase, (margins, batch). Each
+    iteration takes a solver step from the start of the solver step that contains the minimum. At
+    most `max_margin_search_iterations` iterations are made per margin.
+    """
+
+    def refine_one_margin_minimum(
+        _: None, margin_scan_inputs: tuple
+    ) -> tuple[None, tuple[Array, Array]]:
+        margin_index, margin_minimum_state = margin_scan_inputs
+        minimum_step_start_state = phase.make_state(
+            tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+        )
+
+        evaluate_selected_margin = lambda state: (
+            _select_margin(jnp.stack(phase.evaluate_margins(state)), margin_index),
+        )
+
+        def improve_margin_minimum_search(
+            margin_minimum_search: _MarginMinimumSearch,
+        ) -> _MarginMinimumSearch:
+            step_length, *best_step, _, is_minimum_unresolved, n_iterations = margin_minimum_search
+            step_end = solver_step_function(minimum_step_start_state, step_length)[-1]
+            (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
+                evaluate_selected_margin, step_end
+            )
+            step_length, best_step_length, best_margin_rate, has_secant_converged = (
+                refine_minimum_location(
+                    step_length, margin_rate, margin_minimum_state.step_length, *best_step
+                )
+            )
+            return select_trees_by_condition(
+                is_minimum_unresolved,
+                _MarginMinimumSearch(
+                    step_length,
+                    best_step_length,
+                    best_margin_rate,
+                    margin_value,
+                    is_minimum_unresolved & ~has_secant_converged,
+                    n_iterations,
+                ),
+                margin_minimum_search,
+            )._replace(n_iterations=n_iterations + 1)
+
+        zero_step_length = jnp.zeros_like(margin_minimum_state.step_length)
+        margin_minimum_search = _MarginMinimumSearch(
+            margin_minimum_state.time_to_minimum,
+            zero_step_length,
+            margin_minimum_state.step_start_margin_rates,
+            zero_step_length + jnp.inf,
+            jnp.isfinite(margin_minimum_state.lowest_margin_values),
+            jnp.zeros((), jnp.int32),
+        )
+        needs_iteration = lambda margin_minimum_search: (
+            jnp.any(margin_minimum_search.is_minimum_unresolved)
+            & (margin_minimum_search.n_iterations < options.max_margin_search_iterations)
+        )
+        final_search = lax.while_loop(
+            needs_iteration, improve_margin_minimum_search, margin_minimum_search
+        )
+        return None, (final_search.margin_value, final_search.step_length)
+
+    includes_phase_start = np.asarray(phase.margins_include_start)[:, None]
+    end_margin_minima = jnp.minimum(
+        jnp.where(includes_phase_start, start_margin_values, jnp.inf),
+        margin_minima_state.margin_values,
+    )
+    margin_indices = jnp.arange(len(includes_phase_start), dtype=jnp.int32)
+    interior_margin_minima, step_length_to_minimum = lax.scan(
+        refine_one_margin_minimum,
+        None,
+        (margin_indices, margin_minima_state._replace(step_start_tangents=None)),
+    )[1]
+    return MarginMinimaResult(
+        jnp.minimum(interior_margin_minima, end_margin_minima),
+        interior_margin_minima,
+        step_length_to_minimum,
+    )
+
+
+def _select_margin(margins: Array, margin_index: Array) -> Array:
+    """Return the margin with the given index, from margins of shape (..., margins, batch)."""
+    is_selected_margin = jnp.arange(margins.shape[-2]) == margin_index
+    return jnp.sum(jnp.where(is_selected_margin[:, None], margins, 0.0), -2)
+
+
+def compute_margin_minima_jvp(
+    solver_step_function: SolverStepFunction,
+    tableau: ButcherTableau,
+    phase_tangents: PhaseTangents,
+    margin_minima_state: MarginMinimaState,
+    margin_minima_result: MarginMinimaResult,
+    start_state: StageState,
+    end_state: StageState,
+    end_tangents: Array,
+) -> Array:
+    """Return the tangents of the minima of the margins, shape (directions, margins, batch).
+
+    The tangents are those of the margins at fixed times, because the shift of a minimum in time has
+    no first-order effect. `start_state` and `end_state` are the states at the start and at the end
+    of the phase, and `end_tangents` are the tangents of the end state.
+    """
+    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
+    compute_margin_tangents = functools.partial(
+        phase_tangents.evaluate_tangents,
+        lambda phase, state: jnp.stack(phase.evaluate_margins(state)),
+    )
+
+    def compute_margin_tangent(_: None, margin_scan_inputs: tuple) -> tuple[None, Array]:
+        margin_index, margin_minimum_state, step_length = margin_scan_inputs
+        minimum_step_start_state = phase.make_state(
+            tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+        )
+        stage_states = solver_step_function(minimum_step_start_state, step_length)
+        state_tangents = phase_tangents.propagate_to_step_end(
+            tableau, stage_states, margin_minimum_state.step_start_tangents, step_length
+        )
+        return None, _select_margin(
+            compute_margin_tangents(stage_states[-1], state_tangents), margin_index
+        )
+
+    margin_indices = jnp.arange(len(margin_minima_result.phase_margin_minima), dtype=jnp.int32)
+    interior_minima_tangents = jnp.moveaxis(
+        lax.scan(
+            compute_margin_tangent,
+            None,
+            (margin_indices, margin_minima_state, margin_minima_result.step_length_to_minimum),
+        )[1],
+        0,
+        1,
+    )
+    end_margin_minima_tangents = jnp.where(
+        margin_minima_state.margin_values <= margin_minima_result.phase_margin_minima,
+        compute_margin_tangents(end_state, end_tangents),
+        compute_margin_tangents(start_state, phase_tangents.start_tangents),
+    )
+    return jnp.where(
+        margin_minima_result.interior_margin_minima <= margin_minima_result.phase_margin_minima,
+        interior_minima_tangents,
+        end_margin_minima_tangents,
+    )

@@ -1,0 +1,258 @@
+"""Multipliers of a periodic orbit from the Jacobians of its segments, without their product.
+
+In a product of matrices, growing directions stay accurate and decaying directions do not. If one
+multiplier is 1 and another 1e-20, the product has no correct digit of the small multiplier. An
+orthogonal iteration around the period makes every factor triangular (a periodic Schur form). Each
+multiplier is then a product of diagonal entries, all of which are accurate.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from vrw_jax.base.forward_only import forbid_reverse_mode
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Scalar
+from vrw_jax.flow.phase_integration import VectorField, sample_phase
+from vrw_jax.lanes.program_cache import call_compiled_program
+
+
+class FlowSegments(NamedTuple):
+    """Flow of a vector field, divided into segments of equal duration."""
+
+    states: Float[Array, "n_ends dim"]  # states at the segments' ends, the start first
+    jacobians: Float[
+        Array, "n_segments n n"
+    ]  # Jacobian of each segment's end with respect to its start
+    divergence: Scalar  # divergence integrated over all segments, the logarithm of the determinant
+
+
+def segment_maps(
+    field: VectorField,
+    start: ArrayLike | Sequence,
+    duration: ArrayLike,
+    n_segments: int,
+    options: StepOptions,
+    n_directions: int | None = None,
+) -> FlowSegments:
+    """Return states and Jacobians of the flow of `field`, divided into segments of equal duration.
+
+    The step-size control includes the errors of derivatives. Each tangent is stored as a direction
+    of nearly constant length and the logarithm of its growth, so that decaying directions stay
+    accurate. A coordinate that measures time comes after all other coordinates and is not a
+    direction. The Jacobian of a segment is NaN if the number of its solver steps reaches the limit.
+
+    Args:
+        field: vector field.
+        start: state at the start, shape (dim,).
+        duration: duration of all segments together, s.
+        n_segments: number of segments.
+        options: options of the integration.
+        n_directions: number of leading coordinates with respect to which the Jacobians are
+            computed, by default all.
+    """
+    start = jnp.asarray(start, float)
+    field_output_shape = jax.eval_shape(field, start)
+    n_tangents = start.size if n_directions is None else n_directions
+    if start.ndim != 1 or field_output_shape.shape != start.shape:
+        raise ValueError(
+            f"the field gives shape {field_output_shape.shape} for a start of shape {start.shape}, "
+            "but both must be one row of the same length."
+        )
+    if not (0 < n_tangents <= start.size and n_segments > 0):
+        raise ValueError(
+            f"directions is {n_tangents} and n_segments {n_segments}, but the first must be "
+            f"from 1 to {start.size} and the other positive."
+        )
+    static_arguments = (field, n_segments, n_tangents)
+    duration = jnp.asarray(duration, start.dtype)
+    flow_segments = call_compiled_program(
+        _integrate_flow_segments, static_arguments, start, duration, options
+    )
+    return forbid_reverse_mode("segment_maps", flow_segments)
+
+
+def _integrate_flow_segments(
+    static_arguments: tuple[VectorField, int, int],
+    start: Array,
+    duration: Array,
+    options: StepOptions,
+) -> FlowSegments:
+    field, n_segments, n_tangents = static_arguments
+    n_coordinates, n_state_and_tangents = start.size, start.size * (1 + n_tangents)
+    segment_duration = duration / n_segments
+
+    def evaluate_flow_and_tangents(augmented_state: Array) -> Array:
+        state = augmented_state[:n_coordinates]
+        tangents = augmented_state[n_coordinates:n_state_and_tangents].reshape(
+            n_tangents, n_coordinates
+        )
+        jvp_of_field = lambda tangent: jax.jvp(field, (state,), (tangent,))[1]
+        tangent_rates = jax.vmap(jvp_of_field)(tangents)
+        tangent_growth_rates = jnp.sum(tangents * tangent_rates, axis=1) / jnp.sum(
+            tangents * tangents, axis=1
+        )
+        normalized_tangent_rates = tangent_rates - tangent_growth_rates[:, None] * tangents
+        unit_direction_rates = jax.vmap(jvp_of_field)(
+            jnp.eye(n_tangents, n_coordinates, dtype=augmented_state.dtype)
+        )
+        clock_rate = jnp.ones_like(state[:1])
+        return jnp.concatenate(
+            [
+                field(state),
+                normalized_tangent_rates.ravel(),
+                tangent_growth_rates,
+                jnp.trace(unit_direction_rates)[None],
+                clock_rate,
+            ]
+        )
+
+    def integrate_segment(state: Array, _: None) -> tuple[Array, tuple]:
+        start_state = jnp.concatenate(
+            [state, jnp.eye(n_tangents, n_coordinates).ravel(), jnp.zeros(n_tangents + 2)]
+        )
+        end_state = sample_phase(
+            evaluate_flow_and_tangents, start_state, segment_duration, 2, options
+        )[-1]
+        # Otherwise the solver steps were exhausted.
+        is_segment_completed = jnp.abs(end_state[-1] - segment_duration) <= 1e-9 * segment_duration
+        tangents = end_state[n_coordinates:n_state_and_tangents].reshape(n_tangents, n_coordinates)
+        tangent_growth_factors = jnp.exp(
+            end_state[n_state_and_tangents : n_state_and_tangents + n_tangents]
+        )
+        segment_jacobian = jnp.where(
+            is_segment_completed, tangents[:, :n_tangents].T * tangent_growth_factors, jnp.nan
+        )
+        return end_state[:n_coordinates], (
+            end_state[:n_coordinates],
+            segment_jacobian,
+            end_state[-2],
+        )
+
+    _, (end_states, jacobians, divergences) = lax.scan(
+        integrate_segment, start, None, length=n_segments
+    )
+    return FlowSegments(jnp.concatenate([start[None], end_states]), jacobians, jnp.sum(divergences))
+
+
+class ProductMultipliers(NamedTuple):
+    """Eigenvalues of a product of matrices, in order of decreasing modulus."""
+
+    values: np.ndarray  # eigenvalues, complex; NaN if `is_known` is False
+    logarithms: np.ndarray  # logarithms of the moduli, finite even if an eigenvalue underflows
+    relative_error: np.ndarray  # estimated relative errors
+    is_known: np.ndarray  # whether the relative error is within `accuracy`
+
+
+N_SCHUR_SWEEPS = 60
+"""Largest number of orthogonal iterations around the period.
+
+The value is chosen because moduli that differ by a factor of two are then separated to the last
+digit. Closer moduli stay together in one block, whose product loses few digits.
+"""
+
+
+def product_multipliers(
+    jacobians: ArrayLike | Sequence, accuracy: float = 1e-6, tolerance: float = 1e-15
+) -> ProductMultipliers:
+    """Return the eigenvalues of jacobians[-1] @ ... @ jacobians[0], with estimated errors.
+
+    Args:
+        jacobians: concrete matrices, shape (n_segments, n, n).
+        accuracy: largest relative error with which an eigenvalue is returned. An eigenvalue with a
+            larger error is NaN.
+        tolerance: error of each Jacobian relative to its norm.
+    """
+    jacobians = np.asarray(jacobians, float)
+    if jacobians.ndim != 3 or jacobians.shape[1] != jacobians.shape[2] or not jacobians.size:
+        raise ValueError(f"maps has shape {jacobians.shape}, but it must be (n_segments, n, n).")
+    if not np.all(np.isfinite(jacobians)):
+        raise ValueError(
+            "maps contains a number that is not finite: the flow left its domain, or its steps "
+            "were exhausted; take more segments, or raise StepOptions.max_solver_steps."
+        )
+    n_coordinates = jacobians.shape[1]
+    orthonormal_basis = np.eye(n_coordinates)
+    triangular_factors = np.zeros_like(jacobians)
+    for _ in range(N_SCHUR_SWEEPS):
+        next_orthonormal_basis = orthonormal_basis
+        for factor_index, jacobian in enumerate(jacobians):
+            next_orthonormal_basis, triangular_factors[factor_index] = np.linalg.qr(
+                jacobian @ next_orthonormal_basis
+            )
+        closing_matrix = orthonormal_basis.T @ next_orthonormal_basis
+        orthonormal_basis = next_orthonormal_basis
+        has_subdiagonal_entry = np.abs(np.tril(closing_matrix, -1)) > 1e-14
+        if not has_subdiagonal_entry.any():
+            break
+    block_slices, block_start = [], 0
+    for block_end in range(1, n_coordinates + 1):
+        if not has_subdiagonal_entry[block_end:, :block_end].any():
+            block_slices.append(slice(block_start, block_end))
+            block_start = block_end
+    jacobian_norms = np.linalg.norm(jacobians, axis=(1, 2))
+    block_results = [
+        _compute_block_multipliers(
+            triangular_factors, closing_matrix, block_slice, jacobian_norms, tolerance
+        )
+        for block_slice in block_slices
+    ]
+    block_multipliers, logarithms, relative_error = (
+        np.concatenate(x) for x in zip(*block_results, strict=True)
+    )
+    is_known = relative_error <= accuracy
+    descending_order = np.argsort(-logarithms, kind="stable")
+    return ProductMultipliers(
+        np.where(is_known, block_multipliers, np.nan)[descending_order],
+        logarithms[descending_order],
+        relative_error[descending_order],
+        is_known[descending_order],
+    )
+
+
+def _compute_block_multipliers(
+    triangular_factors: np.ndarray,
+    closing_matrix: np.ndarray,
+    block_slice: slice,
+    jacobian_norms: np.ndarray,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the multipliers of one diagonal block, logarithms of moduli, and relative errors."""
+    diagonal_blocks = triangular_factors[:, block_slice, block_slice]
+    block_size = block_slice.stop - block_slice.start
+    diagonal_moduli = np.abs(np.diagonal(diagonal_blocks, axis1=1, axis2=2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_diagonal = np.log(diagonal_moduli)
+        error_amplification = np.where(
+            diagonal_moduli > 0.0, jacobian_norms[:, None] / diagonal_moduli, 0.0
+        )
+        relative_error = tolerance * np.max(np.sum(error_amplification, axis=0))
+        scaled_product = np.eye(block_size)
+        log_block_scale = 0.0
+        log_diagonal_spread = np.ptp(np.sum(log_diagonal, axis=0)) if block_size > 1 else 0.0
+        for scaled_block in diagonal_blocks:
+            scaled_product = scaled_block @ scaled_product
+            largest_block_entry = np.max(np.abs(scaled_product)) or 1.0
+            scaled_product = scaled_product / largest_block_entry
+            log_block_scale = log_block_scale + np.log(largest_block_entry)
+        scaled_eigenvalues = np.linalg.eigvals(
+            closing_matrix[block_slice, block_slice] @ scaled_product
+        )
+        logarithms = np.log(np.abs(scaled_eigenvalues)) + log_block_scale
+        if block_size == 1:
+            logarithms = np.sum(log_diagonal, axis=0)
+        multiplier_phases = np.where(
+            scaled_eigenvalues == 0.0, 1.0, scaled_eigenvalues / np.abs(scaled_eigenvalues)
+        )
+        block_multipliers = multiplier_phases * np.exp(logarithms)
+    return (
+        block_multipliers,
+        logarithms,
+        np.full(block_size, relative_error * np.exp(log_diagonal_spread)),
+    )

@@ -1,0 +1,389 @@
+"""Take one explicit Runge-Kutta step for a batch, with a separate array for each coordinate.
+
+The equations of motion are of second order, q'' = f(q, q'), so a solver step stores only the
+accelerations at its stages. The tableau's matrix converts these accelerations to rates, and its
+square converts them to positions. The method is the same as for the first-order system, with half
+of the stored derivatives. The tableaus are those of diffrax.
+"""
+
+import functools
+import itertools
+import json
+import math
+import operator
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.base.types import Vector
+from vrw_jax.lanes.batching import run_if_any_element_active
+
+
+class ButcherTableau(NamedTuple):
+    """Butcher tableau of an explicit Runge-Kutta method with the first-same-as-last property.
+
+    The last stage of a solver step is the first stage of the next.
+    """
+
+    convergence_order: int
+    stage_nodes: np.ndarray  # Butcher's c: times of the stages, in step lengths
+    stage_matrix: np.ndarray  # Butcher's A: from accelerations to rates
+    squared_stage_matrix: np.ndarray  # A squared: from accelerations to positions
+    rate_error_weights: np.ndarray
+    position_error_weights: np.ndarray
+    guard_stage_indices: tuple[int, ...]
+    """Indices of the stages at which guards are evaluated to find minima inside a solver step.
+
+    The nodes of these stages are separated from each other and from both ends.
+    """
+    bernstein_matrix: np.ndarray
+    """Matrix that maps guard values to the inner Bernstein coefficients of their polynomial.
+
+    The guard values are those at the start, at `guard_stage_indices` and at the end. The polynomial
+    through these values does not fall below its smallest coefficient.
+    """
+    middle_guard_index: int
+    """Index of the guard value near the middle of the solver step, used to fit parabolas to guards.
+
+    The guard values are those at the start and at `guard_stage_indices`.
+    """
+    middle_node: float  # time of this value, in step lengths
+
+    def __eq__(self, other: object) -> bool:
+        return self is other  # `load_explicit_tableau` creates each tableau once.
+
+    def __hash__(self) -> int:
+        return id(self)
+
+
+@functools.cache
+def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
+    """Return the tableau of diffrax's solver `solver_name`; None if it is not an explicit method.
+
+    The tableau is read from a file in this package, because the import of diffrax takes a fifth of
+    the start-up time with cached programs.
+    """
+    tableaus = json.loads(Path(__file__).with_name("tableaus.json").read_text(encoding="utf-8"))
+    if solver_name not in tableaus:
+        return None
+    tableau_entry = tableaus[solver_name]
+    n_stages, has_step_end_stage = len(tableau_entry["b_sol"]), tableau_entry["ssal"]
+    n_rows = n_stages + (not has_step_end_stage)
+    stage_matrix = np.zeros((n_rows, n_rows))
+    for i, matrix_row in enumerate(tableau_entry["a_lower"]):
+        stage_matrix[i + 1, : i + 1] = matrix_row
+    rate_error_weights = np.zeros(n_rows)
+    rate_error_weights[:n_stages] = tableau_entry["b_error"]
+    if not has_step_end_stage:
+        stage_matrix[n_stages, :n_stages] = tableau_entry["b_sol"]
+    stage_nodes = stage_matrix.sum(axis=1)
+    # Of several stages at one node, the last stage is the most accurate.
+    last_stage_at_node = {
+        round(float(stage_node), 3): i
+        for i, stage_node in enumerate(stage_nodes)
+        if 0.05 < stage_node < 0.95
+    }
+    nearest_nodes = {
+        min((abs(stage_node - guard_node), stage_node) for stage_node in last_stage_at_node)[1]
+        for guard_node in GUARD_STAGE_NODES
+        if last_stage_at_node
+    }
+    guard_stage_indices = tuple(last_stage_at_node[node] for node in sorted(nearest_nodes))
+    guard_nodes = np.array([0.0, *stage_nodes[list(guard_stage_indices)], 1.0])
+    middle_guard_index = min(
+        range(1, len(guard_nodes) - 1), key=lambda i: abs(guard_nodes[i] - 0.45), default=0
+    )
+    polynomial_degree = len(guard_nodes) - 1
+    bernstein_basis = [
+        math.comb(polynomial_degree, i)
+        * guard_nodes**i
+        * (1.0 - guard_nodes) ** (polynomial_degree - i)
+        for i in range(polynomial_degree + 1)
+    ]
+    return ButcherTableau(
+        convergence_order=tableau_entry["order"],
+        stage_nodes=stage_nodes,
+        stage_matrix=stage_matrix,
+        squared_stage_matrix=_set_roundoff_to_zero(stage_matrix @ stage_matrix),
+        rate_error_weights=rate_error_weights,
+        position_error_weights=_set_roundoff_to_zero(rate_error_weights @ stage_matrix),
+        guard_stage_indices=guard_stage_indices,
+        bernstein_matrix=np.linalg.inv(np.stack(bernstein_basis, 1))[1:-1],
+        middle_guard_index=middle_guard_index,
+        middle_node=float(guard_nodes[middle_guard_index]),
+    )
+
+
+GUARD_STAGE_NODES = (0.15, 0.47, 0.92)
+"""Nodes, as fractions of the solver step, near which guards are evaluated inside the step.
+
+The values are chosen nearer to the ends than equally spaced nodes. A minimum just after the start
+or before the end is the hardest to detect.
+"""
+
+
+def fit_guard_parabola(
+    tableau: ButcherTableau,
+    start_guard_value: Array,
+    middle_guard_value: Array,
+    end_guard_value: Array,
+) -> tuple[Array, Array]:
+    """Return the quadratic and linear coefficients of the parabola through three values of a guard.
+
+    The variable of the parabola is the fraction of the solver step. `middle_guard_value` is the
+    guard at `middle_guard_index`.
+    """
+    secant_rate = (middle_guard_value - start_guard_value) / tableau.middle_node
+    quadratic_coefficient = (end_guard_value - start_guard_value - secant_rate) / (
+        1.0 - tableau.middle_node
+    )
+    return quadratic_coefficient, end_guard_value - start_guard_value - quadratic_coefficient
+
+
+def _compute_bernstein_coefficients(
+    tableau: ButcherTableau, guard_values: list[Array]
+) -> list[Array]:
+    """Return the Bernstein coefficients, except the last, of the polynomial through guard values.
+
+    If all coefficients are positive, so is the polynomial. `guard_values` are the values of the
+    guard at the start, at the stages `guard_stage_indices`, and at the end.
+    """
+    return [
+        guard_values[0],
+        *(_sum_weighted_terms(matrix_row, guard_values) for matrix_row in tableau.bernstein_matrix),
+    ]
+
+
+@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
+def _may_cross_inside_step(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
+    """Return whether a guard may be negative inside a solver step and positive at its end."""
+    bernstein_coefficients = _compute_bernstein_coefficients(tableau, guard_values)
+    return (functools.reduce(jnp.minimum, bernstein_coefficients) <= 0.0) & (guard_values[-1] > 0.0)
+
+
+@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
+def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tuple[Array, Array]:
+    """Return whether a guard may have a negative minimum inside a solver step, and where.
+
+    The location is the node of the lowest Bernstein coefficient, as a fraction of the step. A guard
+    that only decreases has no minimum. `guard_values` are the values of the guard at the start, at
+    the stages `guard_stage_indices`, and at the end.
+    """
+    min_bernstein_coefficient, *inner_bernstein_coefficients = _compute_bernstein_coefficients(
+        tableau, guard_values
+    )
+    minimum_fraction = jnp.zeros_like(min_bernstein_coefficient)
+    for i, inner_bernstein_coefficient in enumerate(inner_bernstein_coefficients):
+        minimum_fraction = jnp.where(
+            inner_bernstein_coefficient < min_bernstein_coefficient,
+            (i + 1) / len(guard_values[1:]),
+            minimum_fraction,
+        )
+        min_bernstein_coefficient = jnp.minimum(
+            inner_bernstein_coefficient, min_bernstein_coefficient
+        )
+    has_guard_risen = inner_bernstein_coefficients[-1] < guard_values[-1]
+    for preceding_guard_value, following_guard_value in itertools.pairwise(guard_values):
+        has_guard_risen = has_guard_risen | (preceding_guard_value < following_guard_value)
+    has_guard_minimum = (
+        (min_bernstein_coefficient <= 0.0)
+        & (minimum_fraction > 0.0)
+        & has_guard_risen
+        & (guard_values[-1] > 0.0)
+    )
+    return has_guard_minimum, minimum_fraction
+
+
+def find_earliest_guard_minimum_fraction(
+    tableau: ButcherTableau, guard_values: list[Vector]
+) -> Array:
+    """Return the location of the earliest minimum at which some guard may be negative.
+
+    The location is a fraction of the solver step, or 1 if no guard has such a minimum.
+    `guard_values` are the guards at the start, at the stages `guard_stage_indices`, and at the end.
+    The computation is skipped if no batch element may have a minimum.
+    """
+    stage_values_by_guard = [list(stage_values) for stage_values in zip(*guard_values, strict=True)]
+    may_cross_inside = functools.reduce(
+        operator.or_,
+        (_may_cross_inside_step(tableau, stage_values) for stage_values in stage_values_by_guard),
+    )
+
+    def find_first_minimum(earliest_minimum_fraction: Array) -> Array:
+        for stage_values in stage_values_by_guard:
+            has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, stage_values)
+            earliest_minimum_fraction = jnp.where(
+                has_guard_minimum,
+                jnp.minimum(earliest_minimum_fraction, minimum_fraction),
+                earliest_minimum_fraction,
+            )
+        return earliest_minimum_fraction
+
+    whole_step_fraction = jnp.ones_like(guard_values[0][0])
+    return run_if_any_element_active(
+        jnp.any(may_cross_inside), find_first_minimum, whole_step_fraction
+    )
+
+
+# Factor by which the estimated step length for the tolerance is multiplied. This value and the two
+# following ones are chosen because they are usual for explicit methods (Hairer, Norsett and Wanner,
+# Solving Ordinary Differential Equations I, Section II.4).
+STEP_LENGTH_SAFETY_FACTOR = 0.9
+# Smallest ratio of successive step lengths.
+MIN_STEP_LENGTH_RATIO = 0.2
+# Largest ratio of successive step lengths; after a rejected step the ratio is at most 1.
+MAX_STEP_LENGTH_RATIO = 5.0
+
+
+def compute_step_size_factor(
+    tableau: ButcherTableau,
+    mean_squared_error: Array,
+    float_dtype: Any,
+) -> Array:
+    """Return the ratio of the next step length to the present one, as `float_dtype`.
+
+    `mean_squared_error` is the mean square of the solver step's error divided by the tolerance.
+    """
+    error_power = jnp.exp(
+        jnp.log(jnp.clip(mean_squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
+    ).astype(float_dtype)
+    return jnp.clip(
+        STEP_LENGTH_SAFETY_FACTOR * error_power,
+        MIN_STEP_LENGTH_RATIO,
+        jnp.where(mean_squared_error <= 1.0, MAX_STEP_LENGTH_RATIO, 1.0),
+    )
+
+
+def _set_roundoff_to_zero(x: np.ndarray) -> np.ndarray:
+    """Return the array with zeros in place of entries that are within round-off of zero."""
+    return np.where(np.abs(x) < 1e-14 * np.max(np.abs(x)), 0.0, x)
+
+
+class StageAccelerations(NamedTuple):
+    """Accelerations at one state, and sine and cosine of the wheel's angle theta."""
+
+    sin: Array  # sine of theta
+    cos: Array
+    acceleration: Vector  # accelerations of all three coordinates, those of the phase first
+
+
+@functools.cache
+def compute_real_stability_limit(tableau: ButcherTableau) -> float:
+    """Return the largest z with |R(-z)| <= 1, where R is the stability function of the method.
+
+    For a motion that decays as exp(-r t), the longest stable solver step is z / r.
+    """
+    z = np.linspace(0.01, 20.0, 2000)
+    stage_vector = np.ones(len(tableau.stage_nodes))
+    stability_polynomial = 1.0
+    # R is the polynomial 1 - z w (1 - z A + ...).
+    for matrix_power in range(1, len(stage_vector) + 1):
+        stability_polynomial = stability_polynomial + (-z) ** matrix_power * (
+            tableau.stage_matrix[-1] @ stage_vector
+        )
+        stage_vector = tableau.stage_matrix @ stage_vector
+    return float(z[np.argmax(np.abs(stability_polynomial) > 1.0 + 1e-12)])
+
+
+class StageState(NamedTuple):
+    """Positions, rates and accelerations at one stage; each is a tuple of arrays (batch,)."""
+
+    q: Vector
+    v: Vector
+    acceleration: StageAccelerations
+
+
+EvaluateAcceleration = Callable[[Vector, Vector], StageAccelerations]
+SolverStepFunction = Callable[[StageState, Array], list[StageState]]
+"""Function of a state and a step length that returns all stages of a Runge-Kutta step.
+
+The first state is the start of the step, and the last state is its end.
+"""
+
+
+def take_rk_step(
+    tableau: ButcherTableau,
+    evaluate_acceleration: EvaluateAcceleration,
+    start_state: StageState,
+    h: Array,
+) -> list[StageState]:
+    """Return the states at all stages of one Runge-Kutta step of length `h`, s.
+
+    The first state is the start of the step, and the last state is its end.
+    """
+    n = len(start_state.q)
+    stage_states, stage_accelerations = [start_state], [start_state.acceleration.acceleration[:n]]
+    for i in range(1, len(tableau.stage_nodes)):
+        q, v = evaluate_stage(tableau, i, start_state.q, start_state.v, stage_accelerations, h)
+        stage_acceleration = evaluate_acceleration(q, v)
+        stage_states.append(StageState(q, v, stage_acceleration))
+        stage_accelerations.append(stage_acceleration.acceleration[:n])
+    return stage_states
+
+
+def estimate_step_error(
+    tableau: ButcherTableau, stage_states: list[StageState], h: Array
+) -> list[Array]:
+    """Return the errors of the positions and then of the rates after a step of length `h`, s."""
+    accelerations_by_coordinate = [
+        [stage_state.acceleration.acceleration[i] for stage_state in stage_states]
+        for i in range(len(stage_states[0].q))
+    ]
+    position_errors = [
+        h * h * _sum_weighted_terms(tableau.position_error_weights, accelerations)
+        for accelerations in accelerations_by_coordinate
+    ]
+    rate_errors = [
+        h * _sum_weighted_terms(tableau.rate_error_weights, accelerations)
+        for accelerations in accelerations_by_coordinate
+    ]
+    return position_errors + rate_errors
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))  # The function is traced once for all steps.
+def evaluate_stage(
+    tableau: ButcherTableau,
+    stage_index: int,
+    start_positions: Vector,
+    start_rates: Vector,
+    stage_accelerations: list[Vector],
+    h: Array,
+) -> tuple[Vector, Vector]:
+    """Return positions and rates at one stage from accelerations at the earlier stages.
+
+    `h` is the length of the solver step, s.
+    """
+    stage_positions, stage_rates = [], []
+    for coordinate in range(len(start_positions)):
+        coordinate_accelerations = [
+            stage_acceleration[coordinate] for stage_acceleration in stage_accelerations
+        ]
+        twice_integrated_acceleration = _sum_weighted_terms(
+            tableau.squared_stage_matrix[stage_index], coordinate_accelerations
+        )
+        integrated_acceleration = _sum_weighted_terms(
+            tableau.stage_matrix[stage_index], coordinate_accelerations
+        )
+        displacement_per_time = float(tableau.stage_nodes[stage_index]) * start_rates[coordinate]
+        if twice_integrated_acceleration is not None:
+            displacement_per_time = displacement_per_time + h * twice_integrated_acceleration
+        stage_positions.append(start_positions[coordinate] + h * displacement_per_time)
+        stage_rates.append(start_rates[coordinate] + h * integrated_acceleration)
+    return tuple(stage_positions), tuple(stage_rates)
+
+
+def _sum_weighted_terms(term_weights: np.ndarray, terms_to_sum: list[Array]) -> Any:
+    """Return the sum of `term_weights` times `terms_to_sum`, or None if all weights are zero.
+
+    Half of the operations in a solver step are such sums. The sum uses functions of `lax`, because
+    they are traced in a third of the time of Python's operators.
+    """
+    weights_and_terms = zip(term_weights, terms_to_sum, strict=False)
+    weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms if w != 0.0]
+    return functools.reduce(lax.add, weighted_terms) if weighted_terms else None

@@ -1,0 +1,280 @@
+"""Find gaits of the paper's model by collocation, and check each gait by one event-driven step."""
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.base.options import StepOptions
+from vrw_jax.gaits.collocation_search import (
+    CollocationState,
+    CollocationSystem,
+    predict_start_from_gait_surface,
+)
+from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
+from vrw_jax.gaits.finder import (
+    AbstractGaitFinder,
+    Gait,
+    GaitBranchPoint,
+    ParameterValues,
+    move_derivative_axis_first,
+)
+from vrw_jax.gaits.limit_cycle_result import (
+    LimitCycle,
+    guess_cycle_from_walk,
+    sample_walk_in_time,
+    solve_limit_cycle,
+)
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
+from vrw_jax.lanes.autodiff import evaluate_with_jacobian
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.measures import (
+    DIFFERENTIABLE_STEP_NAMES,
+    FORCE_PEAK_MEASURES,
+    GAIT_SENSITIVITY_MEASURES,
+    MARGIN_MEASURES,
+    MEASURES,
+)
+from vrw_jax.models.step_inputs import SectionState
+from vrw_jax.models.step_results import AbstractStep, StepResult
+from vrw_jax.models.stepping import convert_step_arguments
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel import transitions
+from vrw_jax.wheel.params import (
+    PARAMETER_NAMES,
+    WheelParams,
+    make_wheel_from_parameters,
+    stack_parameters,
+)
+
+
+class CollocationFinder(AbstractGaitFinder):
+    """Finder of limit cycles of the paper's model, which requires no start near the gait.
+
+    `period_n` applies only to `find_cycle`.
+    """
+
+    model: ViscoelasticWheel
+    n_legs: int = eqx.field(static=True)
+    step_options: StepOptions
+    cycle_options: CycleOptions = eqx.field(static=True)
+    period_n: int = eqx.field(static=True)
+
+    options_type: ClassVar[type] = CycleOptions
+    cycle_measures: ClassVar[tuple[str, ...]] = tuple(CYCLE_MEASURE_FUNCTIONS)
+    readable_measures: ClassVar[tuple[str, ...]] = tuple(
+        dict.fromkeys((*cycle_measures, *DIFFERENTIABLE_STEP_NAMES, *MARGIN_MEASURES))
+    )
+    differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
+        measure_name
+        for measure_name in readable_measures
+        if not MEASURES[measure_name].leg_dimension
+    )
+    supports_cold_start: ClassVar[bool] = True
+    default_measures: ClassVar[tuple[str, ...]] = tuple(
+        measure_name
+        for measure_name in cycle_measures
+        if measure_name not in ("spectral_margin", *GAIT_SENSITIVITY_MEASURES, *FORCE_PEAK_MEASURES)
+    )
+
+    @property
+    def search_options(self) -> CycleOptions:
+        return self.cycle_options
+
+    @property
+    def collocation_system(self) -> CollocationSystem:
+        """Return the collocation system that the search solves."""
+        return CollocationSystem(
+            self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
+        )
+
+    def with_finer_mesh(self) -> "CollocationFinder":
+        """Return a finder whose meshes are finer in each phase."""
+        return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
+
+    @classmethod
+    def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+        """Return the measure of a gait with the given name.
+
+        At a scuffing take-off the clearance in SLS-I jumps, and the clearance in SLS-II is returned
+        instead. Callers must therefore also check `takeoff_acceleration`.
+        """
+        measure_value = super().read_measure(measure_name, cycle, step)
+        if measure_name == "clearance_sls1":
+            is_takeoff_scuffing = cycle.measure("takeoff_acceleration") < 0.0
+            return jnp.where(is_takeoff_scuffing, step.measures()["clearance_sls2"], measure_value)
+        return measure_value
+
+    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> LimitCycle:
+        if isinstance(cycle_guess, LimitCycle) and cycle_guess.system == self.collocation_system:
+            cycle_guess = cycle_guess.collocation_state
+        elif cycle_guess is not None and not isinstance(cycle_guess, CollocationState):
+            section_state = getattr(cycle_guess, "section_state", cycle_guess)
+            params, section_state, _, _ = convert_step_arguments(params, section_state, None, None)
+            cycle_guess = self.guess_cycle_from_state(*lax.stop_gradient((params, section_state)))
+        return dataclasses.replace(
+            solve_limit_cycle(params, self.collocation_system, cycle_guess), model=self.model
+        )
+
+    def guess_cycle_from_state(
+        self, params: WheelParams, section_state: SectionState
+    ) -> CollocationState:
+        """Compute a guess of the cycle from a walk of `period_n` gait steps that starts at
+        `section_state`.
+        """
+        walk_samples = sample_walk_in_time(self.model, params, section_state, self.period_n)
+        return guess_cycle_from_walk(self.collocation_system, params, walk_samples)
+
+    @eqx.filter_jit
+    def shift_first_step(
+        self, first_step_index: int, params: WheelParams, collocation_state: CollocationState
+    ) -> CollocationState:
+        """Return the same cycle, starting with its gait step at the index `first_step_index`."""
+        previous_end_state = collocation_state.gait_step_end_states[first_step_index - 1]
+        landing_result = transitions.resolve_landing(
+            params.symbols(), previous_end_state[0], *previous_end_state[2:]
+        )
+        shifted_state = jax.tree.map(
+            lambda x: jnp.roll(x, -first_step_index, 0) if x.ndim else x, collocation_state
+        )
+        section_state = jnp.stack(
+            [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
+        )
+        return shifted_state._replace(
+            solution=shifted_state.solution._replace(section_state=section_state)
+        )
+
+    @eqx.filter_jit
+    def make_initial_guess(self, parameter_values: ParameterValues) -> CollocationState:
+        predicted_search_start = predict_start_from_gait_surface(
+            self.collocation_system, parameter_values[:, None], jnp.ones((1,), bool)
+        )
+        return jax.tree.map(lambda x: x[..., 0], predicted_search_start)
+
+    def find_gait(self, parameter_values: ParameterValues, cycle_guess: CollocationState) -> Gait:
+        cycle, cycle_derivatives = compute_cycle_and_derivatives(
+            self.collocation_system, parameter_values, cycle_guess
+        )
+        step, step_derivatives = compute_step_and_derivatives(
+            self.model,
+            self.n_legs,
+            parameter_values,
+            cycle.section_state,
+            cycle_derivatives.section_state,
+            self.step_options,
+        )
+        stack_coordinates = lambda cycle: jnp.concatenate(
+            [cycle.section_state, cycle.durations], -1
+        )
+        branch_point = GaitBranchPoint(
+            stack_coordinates(cycle),
+            stack_coordinates(cycle_derivatives),
+            cycle.collocation_state.is_phase_active,
+            cycle.monodromy_value,
+        )
+        return Gait(cycle, step, cycle_derivatives, step_derivatives, branch_point)
+
+    def refine_cycle_guess(
+        self, parameter_values: ParameterValues, cycle_guess: Any
+    ) -> CollocationState:
+        cycle: Any = self.find_cycle_from_values(parameter_values, cycle_guess)
+        return cycle.collocation_state
+
+    def compute_slope_response(
+        self, params: WheelParams, cycle: Any, measure_names: Sequence[str]
+    ) -> SlopeResponse:
+        """Return the linear response of the gait step and of its measures to the slopes of the
+        ground.
+
+        Uneven ground consists of lines with different slopes, and one gait step depends on two
+        successive lines. The response is computed from the collocation if it determines the
+        measures. Otherwise it is computed from the event-driven step.
+        """
+        if not set(measure_names) <= set(COLLOCATION_RESPONSE_MEASURES):
+            return super().compute_slope_response(params, cycle, measure_names)
+        return cycle.slope_response.select_measures(
+            [COLLOCATION_RESPONSE_MEASURES.index(measure_name) for measure_name in measure_names]
+        )
+
+    def precompile_programs(self, params: WheelParams) -> None:
+        parameter_values = stack_parameters(params)
+        section_state = jnp.asarray(
+            self.model.compute_default_start(params), parameter_values.dtype
+        )
+        section_state_derivatives = jnp.zeros(
+            (len(PARAMETER_NAMES), section_state.shape[0]), section_state.dtype
+        )
+        with ThreadPoolExecutor(2) as compile_pool:
+            cycle_program_future = compile_pool.submit(
+                with_default_jax_settings(compute_cycle_and_derivatives),
+                self.collocation_system,
+                parameter_values,
+                self.make_initial_guess(parameter_values),
+            )
+            step_program_future = compile_pool.submit(
+                with_default_jax_settings(compute_step_and_derivatives),
+                self.model,
+                self.n_legs,
+                parameter_values,
+                section_state,
+                section_state_derivatives,
+                self.step_options,
+            )
+            cycle_program_future.result(), step_program_future.result()
+
+
+@eqx.filter_jit
+def compute_cycle_and_derivatives(
+    collocation_system: CollocationSystem, parameter_values: Array, cycle_guess: CollocationState
+) -> tuple[LimitCycle, LimitCycle]:
+    """Return the cycle near `cycle_guess`, and its derivatives with respect to all parameters.
+
+    The derivatives have the parameters on a leading axis.
+    """
+
+    find_cycle = lambda parameter_values: solve_limit_cycle(
+        make_wheel_from_parameters(parameter_values, collocation_system.n_legs),
+        collocation_system,
+        cycle_guess,
+    )
+    cycle, parameter_jacobian = evaluate_with_jacobian(find_cycle, parameter_values)
+    return cycle, move_derivative_axis_first(parameter_jacobian)
+
+
+@eqx.filter_jit
+def compute_step_and_derivatives(
+    model: ViscoelasticWheel,
+    n_legs: int,
+    parameter_values: Array,
+    section_state: Array,
+    section_state_derivatives: Array,
+    options: StepOptions,
+) -> tuple[StepResult, StepResult]:
+    """Return one gait step, and its derivatives with respect to all parameters on the branch of
+    gaits.
+
+    `section_state_derivatives` contains the derivatives of the section state with respect to the
+    parameters.
+    """
+
+    n_parameter_values = len(parameter_values)
+    take_step = lambda step_inputs: model.take_step(
+        make_wheel_from_parameters(step_inputs[:n_parameter_values], n_legs),
+        step_inputs[n_parameter_values:],
+        options,
+    )
+    step, step_input_jacobian = evaluate_with_jacobian(
+        take_step, jnp.concatenate([parameter_values, section_state])
+    )
+    input_derivatives = jnp.concatenate(
+        [jnp.eye(n_parameter_values, dtype=section_state.dtype), section_state_derivatives], axis=1
+    )
+    step_derivatives = jax.tree.map(lambda x: x @ input_derivatives.T, step_input_jacobian)
+    return step, move_derivative_axis_first(step_derivatives)

@@ -1,0 +1,154 @@
+"""Select the gait finder for a model, and check the arguments of a search."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.base.checks import check_int, check_type, has_traced_leaf
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.printing import format_numbers
+from vrw_jax.gaits.collocation_finder import CollocationFinder
+from vrw_jax.gaits.collocation_search import CollocationState
+from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.finder import AbstractGaitFinder
+from vrw_jax.gaits.limit_cycle_result import LimitCycle
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
+from vrw_jax.gaits.unilateral_finder import UnilateralFinder
+from vrw_jax.models.capabilities import GaitMethod
+from vrw_jax.models.stepping import (
+    ModelLike,
+    convert_model_argument,
+    convert_section_state,
+    convert_step_options,
+    require_single_wheel,
+)
+from vrw_jax.wheel.params import WheelParams
+
+UserCycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
+"""Guess that a user provides: a similar wheel's cycle, or a section state near the gait."""
+
+FINDER_CLASS_BY_METHOD: dict[GaitMethod, type[AbstractGaitFinder]] = {
+    GaitMethod.COLLOCATION: CollocationFinder,
+    GaitMethod.CONTACT_WALKS: UnilateralFinder,
+    GaitMethod.RETURN_MAP: ReturnMapFinder,
+    GaitMethod.SELECTION: ReturnMapFinder,
+}
+"""Class of the gait finder, by the gait method of a model."""
+
+
+def make_finder(
+    model: ModelLike | None,
+    n_legs: int,
+    *,
+    period_n: int = 1,
+    cycle_options: CycleOptions | None = None,
+    step_options: StepOptions | None = None,
+) -> AbstractGaitFinder:
+    """Return the gait finder for a model."""
+    if cycle_options is not None:
+        check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
+    resolved_model = convert_model_argument(model)
+    finder_class: Any = FINDER_CLASS_BY_METHOD[resolved_model.capabilities.gait_method]
+    search_options = (
+        {"cycle_options": CycleOptions() if cycle_options is None else cycle_options}
+        if finder_class.options_type is CycleOptions
+        else {}
+    )
+    return finder_class(
+        model=resolved_model,
+        n_legs=n_legs,
+        step_options=convert_step_options(step_options),
+        period_n=period_n,
+        **search_options,
+    )
+
+
+def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
+    """Return the model to which a wheel's gait belongs.
+
+    A ladder of models is replaced by the simplest model that is valid for the gait. The gait is
+    first computed with the paper's model. If this gait is not found or violates a margin on its
+    ground, a more general model is returned. If the parameters have no concrete values, the ladder
+    is returned unchanged. Any other model is also returned unchanged.
+    """
+    return resolve_model_with_reason(params, model)[0]
+
+
+def resolve_model_with_reason(
+    params: WheelParams, model: ModelLike | None
+) -> tuple[ModelLike | None, str | None]:
+    """Return the model to which a wheel's gait belongs and, for the ladder, the reason in one
+    sentence.
+    """
+    selected_model: Any = convert_model_argument(model)
+    if (
+        selected_model.fallback_model is selected_model
+        or not isinstance(params, WheelParams)
+        or has_traced_leaf(params, model)
+        or params.damping.ndim
+    ):
+        return model, None
+    paper_cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
+    if not bool(paper_cycle.found):
+        return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.ending}"
+    section_state = selected_model.complete_section_state(params, paper_cycle.section_state)
+    model_choice = selected_model.choose_model(params, section_state, StepOptions())[0]
+    return model_choice.model, model_choice.why
+
+
+def check_cycle_guess(cycle_guess: Any) -> Any:
+    """Convert a user's guess to a cycle, a `CollocationState` or a finite section state.
+
+    Raise ValueError if the section state is not finite.
+    """
+    if cycle_guess is None or isinstance(cycle_guess, AbstractCycle | CollocationState):
+        return cycle_guess
+    section_state = convert_section_state(cycle_guess, "guess")
+    if not has_traced_leaf(section_state) and not np.isfinite(section_state).all():
+        raise ValueError(
+            f"guess is {format_numbers(section_state)}, but a search can begin at finite numbers "
+            "only: give a neighbour's cycle, or a section state near the gait."
+        )
+    return section_state
+
+
+def resolve_finder(
+    params: WheelParams,
+    model: ModelLike | None,
+    options: CycleOptions | StepOptions | None,
+    period_n: int = 1,
+) -> AbstractGaitFinder:
+    """Check the arguments of a search, and return the gait finder for a model and options.
+
+    Raise TypeError or ValueError if the arguments do not fit the model.
+    """
+    require_single_wheel(
+        params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan"
+    )
+    if options is not None:
+        check_type("options", options, (CycleOptions, StepOptions), "give vrw.CycleOptions()")
+    has_cycle_options = isinstance(options, CycleOptions)
+    gait_finder = make_finder(
+        model,
+        params.n_legs,
+        period_n=check_int("period_n", period_n),
+        cycle_options=options if has_cycle_options else None,  # type: ignore[arg-type]
+        step_options=None if has_cycle_options else options,  # type: ignore[arg-type]
+    )
+    if options is not None and not isinstance(options, gait_finder.options_type):
+        if has_cycle_options:
+            raise TypeError(
+                f"options is a CycleOptions, but {type(gait_finder.model).__name__} is solved on "
+                "its return map: give the vrw.StepOptions of its step."
+            )
+        raise TypeError(
+            "options is a StepOptions, but the paper's wheel is solved by collocation: "
+            "give vrw.CycleOptions(), or CycleOptions.tight()."
+        )
+    gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    return gait_finder

@@ -1,0 +1,519 @@
+"""Find fixed points of return maps by Newton's method on the section, for any system."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float, Int
+
+from vrw_jax.base.checks import check_callable, check_int, check_positive, check_reals
+from vrw_jax.base.printing import (
+    format_each_batch_element,
+    format_heading_and_rows,
+    format_numbers,
+    format_quantity,
+)
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.types import Scalar
+from vrw_jax.flow.hybrid_simulation import Termination
+from vrw_jax.flow.return_map import ReturnMap
+from vrw_jax.gaits.floquet import MULTIPLIER_TOLERANCES, floquet_multipliers
+from vrw_jax.lanes.autodiff import evaluate_with_jacobian, make_zero_tangent
+from vrw_jax.lanes.program_cache import get_compiled_program
+from vrw_jax.lanes.settings import with_default_jax_settings
+
+UNIT_MULTIPLIER_ADVICE = (
+    "A multiplier is 1, which a conserved quantity or a fold causes: take the conserved quantity "
+    "out of the state, or move the parameter away from the fold."
+)
+"""Advice for a state at which the equations of the fixed point are singular."""
+
+
+def has_unit_multiplier(jacobian: Float[np.ndarray, "... n n"]) -> Bool[np.ndarray, "..."]:
+    """Return whether a multiplier is 1, up to the round-off of two equal multipliers."""
+    multipliers = np.linalg.eigvals(np.where(np.isfinite(jacobian), jacobian, 0.0))
+    is_unit_multiplier = np.abs(multipliers - 1.0) < MULTIPLIER_TOLERANCES.unit_circle_distance
+    return np.asarray(is_unit_multiplier.any(-1))
+
+
+class FixedPointResult(NamedTuple):
+    """Fixed point of a map, and the Jacobian of the map at that point.
+
+    - `x`: fixed point, shape (n,);
+    - `jacobian`: Jacobian of the `period_n`-th iterate of the map, shape (n, n);
+    - `residual`: largest absolute component of map(x) - x;
+    - `converged`: whether Newton's method converged;
+    - `n_iterations`: number of Newton iterations;
+    - `termination`: `Termination` status of the simulation of a `ReturnMap` from `x`; None for any
+      other map.
+
+    Examples:
+        >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
+        >>> float(result.x[0]), float(result.jacobian[0, 0])
+        (2.0, 0.5)
+        >>> result.multipliers.tolist()
+        [(0.5+0j)]
+    """
+
+    x: Float[Array, " n"]
+    jacobian: Float[Array, "n n"]
+    residual: Scalar
+    converged: Bool[Array, ""]
+    n_iterations: Int[Array, ""]
+    termination: Int[Array, ""] | None = None
+
+    @property
+    def multipliers(self) -> Complex[Array, "... n"]:
+        """Return the Floquet multipliers in the order of decreasing modulus, shape (..., n).
+
+        The multipliers are NaN where the Jacobian is not finite.
+        """
+        is_finite = jnp.isfinite(self.jacobian).all((-2, -1))[..., None]
+        finite_jacobian = jnp.where(is_finite[..., None], self.jacobian, 0.0)
+        return jnp.where(is_finite, floquet_multipliers(finite_jacobian), jnp.nan)
+
+    @property
+    def ending(self) -> Any:
+        """Return a sentence that describes whether Newton's method converged.
+
+        A second sentence gives the reason if a multiplier is 1. For a batch the result is an array
+        of such texts.
+        """
+
+        def describe_convergence(converged: bool, n_iterations: int, is_singular: bool) -> str:
+            converged_text = "converged" if converged else "did not converge"
+            convergence = f"Newton's method {converged_text} after {n_iterations} iterations"
+            if is_singular:
+                return f"{convergence}. {UNIT_MULTIPLIER_ADVICE}"
+            return convergence + ("." if converged else ": start nearer to the fixed point.")
+
+        return format_each_batch_element(
+            describe_convergence,
+            self.converged,
+            self.n_iterations,
+            has_unit_multiplier(np.asarray(self.jacobian)),
+        )
+
+    def __repr__(self) -> str:
+        if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
+            return f"FixedPointResult{tuple(self)}"
+        multipliers = np.full(len(self.x), np.nan)
+        if np.all(np.isfinite(self.jacobian)):
+            multipliers = np.linalg.eigvals(self.jacobian)
+        text_rows = [
+            ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
+            ("x", format_numbers(self.x)),
+            ("residual", format_quantity(self.residual, "")),
+            ("multipliers", format_numbers(multipliers)),
+        ]
+        if self.termination is not None:
+            text_rows.append(("simulation", Termination(int(self.termination)).meaning))
+        return format_heading_and_rows("FixedPointResult", text_rows)
+
+
+MAX_NEWTON_ITERATIONS = 30
+"""Default limit of Newton iterations. The value is chosen far above the number that a start near
+the fixed point needs.
+"""
+
+
+@announce_wait("the map and its derivatives", "10 s")
+def solve_fixed_point(
+    function: Callable[[Array], Array],
+    start: Float[Array, " n"],
+    *,
+    period_n: int = 1,
+    tolerance: float | Scalar = 1e-12,
+    units: Any = None,
+    max_iterations: int = MAX_NEWTON_ITERATIONS,
+) -> FixedPointResult:
+    """Find a fixed point of `function` applied `period_n` times, by Newton's method.
+
+    The result is differentiable with respect to all values that `function` closes over. Two further
+    Newton iterations with derivatives provide the derivatives of the fixed point to third order.
+    They provide the derivatives of its Jacobian to first order. If Newton's method does not
+    converge, the start is returned unchanged, without derivatives.
+
+    Args:
+        function: map from a vector to a vector of the same shape, differentiable in forward mode.
+            For a hybrid system the map is a `ReturnMap`, which has no fixed point if its simulation
+            ends early.
+        start: initial guess of Newton's method, shape (n,).
+        period_n: number of times that the map is applied.
+        tolerance: largest component of Newton's last correction, in `units`.
+        units: units of the components of `start`, a number or shape (n,). By default, the unit of a
+            component is its size at the start or at the fixed point, whichever is larger.
+        max_iterations: largest number of Newton iterations.
+
+    Returns:
+        A `FixedPointResult`: the state, its multipliers, and the status of the iteration.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> result = vrw.solve_fixed_point(lambda x: jnp.cos(x), jnp.array([0.7]))
+        >>> print(f"{result.x[0]:.6f} {bool(result.converged)}")
+        0.739085 True
+    """
+
+    fixed_point = _solve_checked_fixed_point(
+        _run_newton_loop, function, start, period_n, tolerance, units, max_iterations
+    )
+    if isinstance(function, ReturnMap):
+        fixed_point = fixed_point._replace(
+            termination=function.find_termination(fixed_point.x, period_n)
+        )
+    return fixed_point
+
+
+def solve_fixed_point_implicit(
+    function: Callable[[Array], Array],
+    start: Float[Array, " n"],
+    *,
+    period_n: int = 1,
+    tolerance: float | Scalar = 1e-12,
+    units: Any = None,
+) -> FixedPointResult:
+    """Find a fixed point of a map whose second derivatives are expensive.
+
+    The arguments are those of `solve_fixed_point`. Derivatives of order n of the fixed point
+    require only derivatives of order n of `function`. Derivatives of the Jacobian are NaN.
+    """
+    return _solve_checked_fixed_point(
+        _run_newton_implicit, function, start, period_n, tolerance, units, MAX_NEWTON_ITERATIONS
+    )
+
+
+def check_vector_map(function: Callable, state_name: str, state: Array) -> None:
+    """Raise an error unless the map maps the state, a vector, to a vector of the same shape."""
+    if state.ndim != 1 or not state.size:
+        raise ValueError(
+            f"{state_name} has shape {state.shape}, but it is a vector: give an array of shape "
+            "(n,)."
+        )
+    map_output = jax.eval_shape(function, state)
+    if getattr(map_output, "shape", None) != state.shape:
+        map_output_description = getattr(map_output, "shape", type(map_output).__name__)
+        raise ValueError(
+            f"the map gives {map_output_description} for a {state_name} of shape {state.shape}, "
+            "but it must give an array of that shape: take a map of a state to the next state."
+        )
+
+
+def check_state_units(units: Any, state: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return one positive unit for each component of a state, or raise an error."""
+    units = check_reals("units", units)
+    if units.shape not in ((), state.shape) or (
+        not isinstance(units, jax.core.Tracer) and not np.all((units > 0.0) & np.isfinite(units))
+    ):
+        raise ValueError(
+            f"units are {units}, but each component of the state has one positive unit: give a "
+            f"number above 0, or an array of shape {state.shape}."
+        )
+    return jnp.broadcast_to(lax.stop_gradient(units).astype(state.dtype), state.shape)
+
+
+def _solve_checked_fixed_point(
+    newton_method: Callable[..., FixedPointResult],
+    function: Callable[[Array], Array],
+    start: Any,
+    period_n: int,
+    tolerance: float | Scalar,
+    units: Any,
+    max_iterations: int,
+) -> FixedPointResult:
+    """Check the arguments, and find the fixed point by `newton_method`."""
+    check_callable("function", function, "that maps a state to the next")
+    start, period_n = check_reals("start", start), check_int("period_n", period_n)
+    max_iterations = check_int("max_iterations", max_iterations)
+    start = lax.stop_gradient(start)
+    check_vector_map(function, "start", start)
+    if isinstance(tolerance, jax.Array):
+        tolerance = check_reals("tolerance", tolerance)
+    else:
+        check_positive("tolerance", tolerance)
+
+    tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
+    # A unit of 0 is replaced by the size of the component.
+    units = jnp.zeros_like(start) if units is None else check_state_units(units, start)
+    newton_configuration = (newton_method, function, period_n, max_iterations)
+    find_fixed_point = functools.partial(_find_fixed_point_of_iterate, newton_configuration)
+    compiled_program = None
+    if isinstance(function, ReturnMap):
+        compiled_program = get_compiled_program(
+            _find_fixed_point_of_iterate, newton_configuration, start, tolerance, units
+        )
+    return (compiled_program or find_fixed_point)(start, tolerance, units)
+
+
+def _find_fixed_point_of_iterate(
+    newton_configuration: tuple, start: Array, tolerance: Array, units: Array
+) -> FixedPointResult:
+    newton_method, function, period_n, max_iterations = newton_configuration
+
+    def apply_map_repeatedly(x: Array) -> Array:
+        for _ in range(period_n):
+            x = function(x)
+        return x
+
+    closure_converted_map, closed_over_values = jax.closure_convert(apply_map_repeatedly, start)
+    return newton_method(
+        closure_converted_map, max_iterations, start, tolerance, units, *closed_over_values
+    )
+
+
+ClosureConvertedMap = Callable[..., Array]
+
+
+def _compute_newton_correction(
+    closure_converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
+) -> tuple[Array, Array, Array]:
+    """Return Newton's correction, the Jacobian of the map, and the largest component of the defect
+    map(x) - x.
+    """
+    mapped_point, jacobian = evaluate_with_jacobian(
+        lambda y: closure_converted_map(y, *closed_over_values), x
+    )
+    map_defect = mapped_point - x
+    newton_correction = jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, map_defect)
+    return newton_correction, jacobian, jnp.max(jnp.abs(map_defect))
+
+
+N_DERIVATIVE_ITERATIONS = 2
+"""Number of Newton iterations with derivatives. The value is chosen because a single iteration
+provides only first derivatives of the fixed point.
+"""
+
+
+MAX_STALLED_ITERATIONS = 3
+"""Number of iterations in which the correction does not halve, after which it is compared with the
+largest component. The value is chosen because far from a solution few corrections grow in turn.
+"""
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _run_newton_loop(
+    closure_converted_map: ClosureConvertedMap,
+    max_iterations: int,
+    start: Array,
+    tolerance: Array,
+    units: Array,
+    *closed_over_values: Any,
+) -> FixedPointResult:
+    """Find the fixed point by Newton's method in a single loop.
+
+    With a single loop the map, which is often a large program, is compiled only once.
+    """
+
+    def is_newton_searching(correction_norm: Array, n_iterations: Array) -> Array:
+        return (
+            (correction_norm > tolerance)
+            & (n_iterations < max_iterations)
+            & jnp.isfinite(correction_norm)
+        )
+
+    def needs_newton_iteration(loop_state: tuple) -> Array:
+        _, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
+        return is_newton_searching(correction_norm, n_iterations) | (
+            (correction_norm <= tolerance) & (n_derivative_iterations < N_DERIVATIVE_ITERATIONS)
+        )
+
+    def iterate_newton(loop_state: tuple) -> tuple:
+        x, last_norm, n_iterations, n_derivative_iterations, n_stalled, *_ = loop_state
+        is_searching_iteration = is_newton_searching(last_norm, n_iterations).astype(
+            n_iterations.dtype
+        )
+        newton_correction, jacobian, residual = _compute_newton_correction(
+            closure_converted_map, x, closed_over_values
+        )
+        # The sum of the terms of a component is no more accurate than its largest term.
+        component_sizes = jnp.max(
+            jnp.abs(jnp.stack([start, x, x + newton_correction, jnp.abs(jacobian) @ jnp.abs(x)])), 0
+        )
+        component_units = jnp.where(units > 0.0, units, component_sizes)
+        component_units = jnp.where(component_units > 0.0, component_units, 1.0)
+        # The correction is also checked in the last iterations, because the map may jump near the
+        # point.
+        correction_norm = jnp.max(jnp.abs(newton_correction) / component_units)
+        n_stalled = jnp.where(correction_norm >= 0.5 * last_norm, n_stalled + 1, 0)
+        # The round-off of the other components may be all that is left of a component.
+        correction_norm = jnp.where(
+            n_stalled < MAX_STALLED_ITERATIONS,
+            correction_norm,
+            jnp.max(jnp.abs(newton_correction)) / jnp.max(component_units),
+        )
+        next_x = jnp.where(jnp.all(jnp.isfinite(newton_correction)), x + newton_correction, x)
+        return (
+            next_x,
+            correction_norm,
+            n_iterations + is_searching_iteration,
+            n_derivative_iterations + 1 - is_searching_iteration,
+            n_stalled,
+            jacobian,
+            residual,
+        )
+
+    initial_count, initial_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    initial_loop_state = (
+        start,
+        initial_norm,
+        initial_count,
+        initial_count,
+        initial_count,
+        jnp.zeros((start.size,) * 2, start.dtype),
+        initial_norm,
+    )
+    x, correction_norm, n_iterations, *_, jacobian, residual = lax.while_loop(
+        needs_newton_iteration, iterate_newton, initial_loop_state
+    )
+    has_newton_converged = correction_norm <= tolerance
+    return FixedPointResult(
+        jnp.where(has_newton_converged, x, start),
+        jacobian,
+        residual,
+        has_newton_converged,
+        n_iterations,
+    )
+
+
+@_run_newton_loop.defjvp
+@with_default_jax_settings
+def _run_newton_jvp(
+    closure_converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
+) -> tuple[FixedPointResult, FixedPointResult]:
+    """Return the fixed point and its tangent, by Newton iterations with derivatives.
+
+    The iterations start at the fixed point.
+    """
+    start, _, _, *closed_over_values = primals
+    newton_result = _run_newton_loop(
+        closure_converted_map, max_iterations, *lax.stop_gradient(primals)
+    )
+
+    def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
+        def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+            newton_correction, jacobian, residual = _compute_newton_correction(
+                closure_converted_map, point, closed_over_values
+            )
+            next_point = point + jnp.where(newton_result.converged, newton_correction, 0.0)
+            return next_point, (jacobian, residual)
+
+        point, (jacobians, residuals) = lax.scan(
+            iterate_with_derivatives, newton_result.x, None, length=N_DERIVATIVE_ITERATIONS
+        )
+        x = jnp.where(newton_result.converged, point, start)
+        return FixedPointResult(
+            x, jacobians[-1], residuals[-1], newton_result.converged, newton_result.n_iterations
+        )
+
+    return jax.jvp(solve_from_fixed_point, tuple(closed_over_values), tuple(tangents[3:]))
+
+
+# The same loop, with derivatives by the implicit function theorem.
+_run_newton_implicit = jax.custom_jvp(_run_newton_loop, nondiff_argnums=(0, 1))
+
+
+@_run_newton_implicit.defjvp
+@with_default_jax_settings
+def _run_newton_implicit_jvp(
+    closure_converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
+) -> tuple[FixedPointResult, FixedPointResult]:
+    """Return the fixed point and its tangent by the implicit function theorem.
+
+    The tangent depends on the fixed point. Derivatives of the tangent therefore use the same rule.
+    """
+    newton_result = _run_newton_implicit(closure_converted_map, max_iterations, *primals)
+    closed_over_values, closed_over_tangents = tuple(primals[3:]), tuple(tangents[3:])
+    _, map_output_tangent = jax.jvp(
+        lambda *arguments: closure_converted_map(newton_result.x, *arguments),
+        closed_over_values,
+        closed_over_tangents,
+    )
+    _, jacobian = evaluate_with_jacobian(
+        lambda x: closure_converted_map(x, *closed_over_values), newton_result.x
+    )
+    fixed_point_tangent = jnp.linalg.solve(
+        jnp.eye(newton_result.x.size, dtype=newton_result.x.dtype) - jacobian, map_output_tangent
+    )
+    fixed_point_tangent = jnp.where(newton_result.converged, fixed_point_tangent, 0.0)
+    nan_jacobian_tangent = jnp.full_like(jacobian, jnp.nan) * jnp.sum(fixed_point_tangent)
+    return newton_result, make_zero_tangent(newton_result)._replace(
+        x=fixed_point_tangent, jacobian=nan_jacobian_tangent
+    )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _linearize_map(function: Callable, args: Any, x: Array, p: Array) -> tuple[Array, tuple]:
+    """Linearize the map at many points."""
+    linearize = lambda x, p: evaluate_with_jacobian(lambda x, p: function(args, x, p), x, p)
+    return jax.vmap(linearize)(x, p)
+
+
+RELATIVE_PROBE_LENGTH = 1e-3
+"""Distance, relative to the state, over which the change of the map's Jacobian is measured. The
+value is chosen between the round-off of the Jacobian and a change that is not linear.
+"""
+
+NOISE_PROBES = 1e-12 * np.arange(32.0)
+"""Relative changes of state and parameter at which the round-off of a map is measured. The values
+are chosen because the quadratic terms of the map are then far below its round-off.
+"""
+
+MIN_UNIT_PER_NOISE = 1e11
+"""Smallest unit of a component as a multiple of the round-off of its image. The value is chosen
+because ten times the round-off is then the default tolerance of 1e-10.
+"""
+
+
+def estimate_state_units(
+    function: Callable, args: Any, x: np.ndarray, p: float, parameter_bounds: tuple[float, float]
+) -> np.ndarray:
+    """Estimate the size of each component of the fixed points of x -> `function(args, x, p)`.
+
+    The size is that of `x`, or that of the change of the fixed point between the bounds of the
+    parameter if the change is larger. The change solves the quadratic equation of the branch in the
+    direction of its tangent, so that the change is finite at a fold. The size scales with the units
+    of state and parameter. It exceeds the round-off of the map, and is 1 for a component that is
+    zero and remains zero.
+    """
+
+    def linearize(x: np.ndarray, p: Any) -> tuple[np.ndarray, ...]:
+        # Each call has the same shape, so that one program is compiled.
+        x, p = np.resize(x, (len(NOISE_PROBES), x.shape[-1])), np.resize(p, len(NOISE_PROBES))
+        image, (jacobian, rate) = _linearize_map(function, args, jnp.asarray(x), jnp.asarray(p))
+        return np.asarray(image), np.asarray(jacobian), np.asarray(rate)
+
+    with np.errstate(all="ignore"):
+        parameter_range = parameter_bounds[1] - parameter_bounds[0]
+        image, jacobian, rate = (values[0] for values in linearize(x, p))
+        forcing = parameter_range * rate
+        is_size_unknown = (x == 0.0) & (forcing == 0.0)
+        if is_size_unknown.any():
+            # At a crossing the change between the bounds is of second order.
+            changes = np.max(abs(linearize(x, np.array(parameter_bounds))[0] - image), 0)
+            forcing = np.where(is_size_unknown, changes, forcing)
+        sizes = np.where(x == 0.0, np.fmax(abs(image), abs(forcing)), abs(x))
+        x_probes, p_probes = x + np.outer(NOISE_PROBES, sizes), p + NOISE_PROBES * parameter_range
+        linear_changes = (x_probes - x) @ jacobian.T + np.outer(p_probes - p, rate)
+        noise = np.max(abs(linearize(x_probes, p_probes)[0] - image - linear_changes), 0)
+        sizes = np.fmax(sizes, MIN_UNIT_PER_NOISE * noise)
+        units = np.where((sizes > 0.0) & np.isfinite(sizes), sizes, 1.0)
+        in_units = lambda matrix: np.nan_to_num(matrix * units / units[:, None])
+        left, singular_values, right = np.linalg.svd(np.eye(len(x)) - in_units(jacobian))
+        # At a fold, round-off replaces the singular value 0, and the tangent is large.
+        singular_values = np.maximum(singular_values, np.finfo(x.dtype).eps)
+        solve = lambda vector: right.T @ (left.T @ vector / singular_values)
+        tangent = solve(np.nan_to_num(forcing / units))
+        tangent_size = np.max(abs(tangent))
+        if tangent_size == 0.0:
+            return units
+        probe = RELATIVE_PROBE_LENGTH / tangent_size * tangent
+        jacobian_change = in_units(linearize(x + units * probe, p)[1][0] - jacobian)
+        curvature = solve(jacobian_change @ tangent) / RELATIVE_PROBE_LENGTH
+        change = 2.0 * tangent / (1.0 + np.sqrt(1.0 + 2.0 * np.max(abs(curvature))))
+        return units * np.fmax(1.0, abs(change))

@@ -1,0 +1,328 @@
+"""Compute Floquet multipliers of small real matrices in closed form, differentiably and in batches.
+
+A matrix is the Jacobian of a return map, of shape (..., n, n) with n at most 3. For larger matrices
+LAPACK computes the multipliers, the spectral radius and the bifurcation margins on a CPU. An
+eigenvalue is not differentiable if it equals another eigenvalue. The Jury margins are polynomials
+of the matrix entries and always differentiable.
+"""
+
+import functools
+import itertools
+import operator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float
+
+from vrw_jax.lanes.autodiff import compute_square_root
+
+RealSquareMatrix = Float[Array, "... n n"]
+
+MAX_CLOSED_FORM_SIZE = 3
+"""Size of the largest matrix whose characteristic polynomial is solved in closed form."""
+
+SMOOTH_MIN_SHARPNESS = 50.0
+"""Sharpness of the smooth minimum in `compute_stability_margin`. The value is chosen because the
+result is then at most log(4)/50 below the exact minimum.
+"""
+
+
+@dataclass(frozen=True)
+class MultiplierTolerances:
+    """Tolerances within which multipliers are treated as equal, as real, or as on the unit circle.
+
+    - `unit_circle_distance`: largest distance from modulus 1 at which a multiplier may lie on
+      either side of the circle. The value is chosen because area-preserving maps have multipliers
+      on the circle up to round-off, which is 1e-8 for two equal multipliers;
+    - `located_pair_circle_distance`: largest distance from modulus 1 of the pair at a located
+      Neimark-Sacker bifurcation;
+    - `min_imaginary_part`: imaginary part below which a multiplier on the unit circle is treated as
+      real. The value is chosen because three equal real multipliers are computed with imaginary
+      parts of 1e-5;
+    - `equal_moduli_distance`: largest difference of two moduli that are treated as equal. The value
+      is that of `unit_circle_distance`.
+    """
+
+    unit_circle_distance: float = 1e-6
+    located_pair_circle_distance: float = 1e-4
+    min_imaginary_part: float = 1e-3
+    equal_moduli_distance: float = 1e-6
+
+
+MULTIPLIER_TOLERANCES = MultiplierTolerances()
+"""Tolerances for multipliers in all continuations."""
+
+
+def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, ...]:
+    """Return the coefficients (a_0, ..., a_{n-1}) of det(z - matrix) = z^n + ... + a_1 z + a_0."""
+    n = matrix.shape[-1]
+    if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):
+        raise ValueError(
+            f"the matrix has shape {matrix.shape}, but multipliers are built for 1x1, 2x2 and 3x3."
+        )
+    entry = lambda i, j: matrix[..., i, j]
+    compute_minor = lambda rows, columns: (
+        entry(rows[0], columns[0]) * entry(rows[1], columns[1])
+        - entry(rows[0], columns[1]) * entry(rows[1], columns[0])
+    )
+    add_terms = functools.partial(functools.reduce, operator.add)
+    trace = add_terms([entry(i, i) for i in range(n)])
+    if n == 1:
+        return (-trace,)
+    sum_of_principal_minors = add_terms(
+        [compute_minor(pair, pair) for pair in itertools.combinations(range(n), 2)]
+    )
+    if n == 2:
+        return sum_of_principal_minors, -trace
+    determinant = add_terms(
+        [
+            entry(0, column) * compute_minor((1, 2), other_columns)
+            for column, other_columns in enumerate(((1, 2), (2, 0), (0, 1)))
+        ]
+    )
+    return -determinant, sum_of_principal_minors, -trace
+
+
+class _EigenvaluePair(NamedTuple):
+    """Pair of eigenvalues, which are real or complex conjugates.
+
+    The eigenvalues are pair_mean ± real_offset if they are real, and pair_mean ± i imaginary_offset
+    otherwise.
+    """
+
+    pair_mean: Array
+    real_eigenvalue_offset: Array
+    imaginary_eigenvalue_offset: Array
+
+    @property
+    def pair_modulus(self) -> Array:
+        """Return the common modulus of a complex pair."""
+        return compute_square_root(
+            self.pair_mean * self.pair_mean
+            + self.imaginary_eigenvalue_offset * self.imaginary_eigenvalue_offset
+        )
+
+
+def _solve_quadratic_pair(a0: Array, a1: Array) -> _EigenvaluePair:
+    """Return the two roots of z^2 + a1 z + a0."""
+    pair_mean = -0.5 * a1
+    discriminant = pair_mean * pair_mean - a0
+    return _EigenvaluePair(
+        pair_mean,
+        compute_square_root(discriminant),
+        compute_square_root(-discriminant),
+    )
+
+
+def _solve_cubic_real_root(a0: Array, a1: Array, a2: Array) -> Array:
+    """Return the real root of z^3 + a2 z^2 + a1 z + a0 that is farthest from the other roots.
+
+    A closed form first computes the root without derivatives. Newton's method then makes the root
+    exact, and provides derivatives up to order 3.
+    """
+    b0, b1, b2 = map(lax.stop_gradient, (a0, a1, a2))
+    mean_root = -b2 / 3.0
+    p = b1 - b2 * b2 / 3.0  # The shifted root y = z - mean_root satisfies y^3 + p y + q = 0.
+    q = b0 + mean_root * (b1 + mean_root * (b2 + mean_root))
+    discriminant = 0.25 * q * q + p * p * p / 27.0
+    has_three_real_roots = discriminant < 0.0
+    # A single real root is the sum of two cube roots, computed without cancellation.
+    larger_cube_root = jnp.cbrt(
+        -0.5 * q - jnp.where(q >= 0.0, 1.0, -1.0) * compute_square_root(discriminant)
+    )
+    unique_real_root = larger_cube_root - jnp.where(
+        larger_cube_root == 0.0,
+        0.0,
+        p / (3.0 * jnp.where(larger_cube_root == 0, 1, larger_cube_root)),
+    )
+    # If three roots are real, the extreme root on the isolated side is computed.
+    trigonometric_radius = 2.0 * compute_square_root(-p / 3.0)
+    root_cosine = -4.0 * q / jnp.where(trigonometric_radius == 0.0, 1.0, trigonometric_radius**3)
+    extreme_root = trigonometric_radius * jnp.cos(
+        jnp.arccos(jnp.clip(jnp.abs(root_cosine), 0.0, 1.0)) / 3.0
+    )
+    z = mean_root + jnp.where(
+        has_three_real_roots,
+        jnp.where(root_cosine >= 0.0, extreme_root, -extreme_root),
+        unique_real_root,
+    )
+    for _ in range(3):
+        cubic_value = a0 + z * (a1 + z * (a2 + z))
+        cubic_derivative = a1 + z * (2.0 * a2 + 3.0 * z)
+        z = z - jnp.where(
+            cubic_derivative == 0.0,
+            0.0,
+            cubic_value / jnp.where(cubic_derivative == 0.0, 1.0, cubic_derivative),
+        )
+    return z
+
+
+def _split_into_isolated_and_pair(
+    matrix: RealSquareMatrix,
+) -> tuple[list[Array], _EigenvaluePair | None]:
+    """Return the isolated real eigenvalues of a small matrix, and the remaining pair of
+    eigenvalues.
+
+    The pair is None for a 1x1 matrix.
+    """
+    polynomial_coefficients = compute_characteristic_polynomial(matrix)
+    if len(polynomial_coefficients) == 1:
+        return [-polynomial_coefficients[0]], None
+    if len(polynomial_coefficients) == 2:
+        return [], _solve_quadratic_pair(*polynomial_coefficients)
+    a0, a1, a2 = polynomial_coefficients
+    isolated_root = _solve_cubic_real_root(a0, a1, a2)
+    linear_coefficient = a2 + isolated_root
+    return [isolated_root], _solve_quadratic_pair(
+        a1 + isolated_root * linear_coefficient, linear_coefficient
+    )
+
+
+@jax.jit
+def floquet_multipliers(matrix: RealSquareMatrix) -> Complex[Array, "... n"]:
+    """Return all eigenvalues of a return map's Jacobian, shape (..., n).
+
+    The eigenvalues are in the order of decreasing modulus.
+    """
+    if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
+        return _sort_eigenvalues_by_modulus(jnp.linalg.eigvals(matrix))
+    isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
+    eigenvalues = [lax.complex(x, jnp.zeros_like(x)) for x in isolated_eigenvalues]
+    if remaining_pair is not None:
+        pair_mean, real_eigenvalue_offset, imaginary_eigenvalue_offset = remaining_pair
+        eigenvalues += [
+            lax.complex(
+                pair_mean + offset_sign * real_eigenvalue_offset,
+                offset_sign * imaginary_eigenvalue_offset,
+            )
+            for offset_sign in (1.0, -1.0)
+        ]
+    return _sort_eigenvalues_by_modulus(jnp.stack(eigenvalues, -1))
+
+
+def _sort_eigenvalues_by_modulus(eigenvalues: Array) -> Array:
+    """Return the eigenvalues in the order of decreasing modulus."""
+    eigenvalue_moduli = jnp.square(eigenvalues.real) + jnp.square(eigenvalues.imag)
+    descending_order = jnp.argsort(-lax.stop_gradient(eigenvalue_moduli), axis=-1)
+    return jnp.take_along_axis(eigenvalues, descending_order, -1)
+
+
+@jax.jit
+def compute_spectral_radius(matrix: RealSquareMatrix) -> Float[Array, "..."]:
+    """Return the largest modulus of the eigenvalues of `matrix`.
+
+    If two eigenvalues are equal, the derivative is one-sided or zero.
+    """
+    if matrix.shape[-1] > MAX_CLOSED_FORM_SIZE:
+        return jnp.abs(floquet_multipliers(matrix)[..., 0])
+    isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
+    eigenvalue_moduli = [jnp.abs(x) for x in isolated_eigenvalues]
+    if remaining_pair is not None:
+        max_real_modulus = jnp.abs(remaining_pair.pair_mean) + remaining_pair.real_eigenvalue_offset
+        eigenvalue_moduli.append(
+            jnp.where(
+                remaining_pair.imaginary_eigenvalue_offset > 0.0,
+                remaining_pair.pair_modulus,
+                max_real_modulus,
+            )
+        )
+    return functools.reduce(jnp.maximum, eigenvalue_moduli)
+
+
+@jax.jit
+def compute_jury_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margins"]:
+    """Return the Jury margins, which are all positive if and only if all multipliers are stable.
+
+    The first margin vanishes at a fold (multiplier 1), and the second at a period doubling
+    (multiplier -1). For n > 1 the third margin vanishes when a pair of multipliers crosses the unit
+    circle. For n = 3 the fourth margin completes the criterion.
+    """
+    polynomial_coefficients = compute_characteristic_polynomial(matrix)
+    if len(polynomial_coefficients) == 1:
+        (a0,) = polynomial_coefficients
+        return jnp.stack([1.0 + a0, 1.0 - a0], -1)
+    if len(polynomial_coefficients) == 2:
+        a0, a1 = polynomial_coefficients
+        return jnp.stack([1.0 + a1 + a0, 1.0 - a1 + a0, 1.0 - a0], -1)
+    a0, a1, a2 = polynomial_coefficients
+    pair_margins = 1.0 - a0 * a0 - a1 + a0 * a2
+    return jnp.stack([1.0 + a2 + a1 + a0, 1.0 - a2 + a1 - a0, pair_margins, 1.0 - a0 * a0], -1)
+
+
+@jax.jit
+def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margins"]:
+    """Return the margins to fold, period doubling and Neimark-Sacker bifurcation.
+
+    If n is at most 3, these are the first Jury margins. For larger matrices the first two margins
+    are det(1 - matrix) and det(1 + matrix). The third margin is the product of 1 - z_i z_j over all
+    pairs of eigenvalues z_i and z_j. For n = 1 no third margin exists.
+    """
+    n = matrix.shape[-1]
+    if n <= MAX_CLOSED_FORM_SIZE:
+        return compute_jury_margins(matrix)[..., :3]
+    identity_matrix, eigenvalues = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
+    first_eigenvalue_indices, second_eigenvalue_indices = np.triu_indices(n, 1)
+    eigenvalue_products = jnp.prod(
+        1.0
+        - eigenvalues[..., first_eigenvalue_indices] * eigenvalues[..., second_eigenvalue_indices],
+        axis=-1,
+    ).real
+    return jnp.stack(
+        [
+            jnp.linalg.det(identity_matrix - matrix),
+            jnp.linalg.det(identity_matrix + matrix),
+            eigenvalue_products,
+        ],
+        -1,
+    )
+
+
+@jax.jit
+def compute_stability_margin(matrix: RealSquareMatrix) -> Float[Array, "..."]:
+    """Return a smooth minimum of the Jury margins, which is at most their exact minimum.
+
+    A positive result implies that the gait is stable.
+    """
+    jury_margin_values = SMOOTH_MIN_SHARPNESS * compute_jury_margins(matrix)
+    lowest_jury_margin = lax.stop_gradient(jnp.min(jury_margin_values, -1))
+    sum_of_exponentials = jnp.sum(jnp.exp(lowest_jury_margin[..., None] - jury_margin_values), -1)
+    return (lowest_jury_margin - jnp.log(sum_of_exponentials)) / SMOOTH_MIN_SHARPNESS
+
+
+@jax.jit
+def has_double_multiplier(
+    matrix: RealSquareMatrix, modulus_tolerance: float = 1e-6
+) -> Bool[Array, "..."]:
+    """Return whether the two largest moduli are equal within `modulus_tolerance`.
+
+    The spectral radius then has a kink. The moduli of a complex pair are equal and smooth. Such a
+    pair therefore satisfies the test only if its imaginary part is at most `modulus_tolerance`, or
+    if a real multiplier has the same modulus.
+    """
+    isolated_eigenvalues, remaining_pair = _split_into_isolated_and_pair(matrix)
+    if remaining_pair is None:
+        return jnp.zeros(matrix.shape[:-2], bool)
+    pair_mean, real_eigenvalue_offset, imaginary_eigenvalue_offset = remaining_pair
+    real_eigenvalues = [
+        *isolated_eigenvalues,
+        pair_mean + real_eigenvalue_offset,
+        pair_mean - real_eigenvalue_offset,
+    ]
+    is_complex_pair = imaginary_eigenvalue_offset > 0.0
+    eigenvalue_moduli = jnp.sort(jnp.abs(jnp.stack(real_eigenvalues, -1)), -1)
+    has_equal_real_moduli = (
+        eigenvalue_moduli[..., -1] - eigenvalue_moduli[..., -2] <= modulus_tolerance
+    )
+    has_equal_moduli = jnp.where(
+        is_complex_pair, imaginary_eigenvalue_offset <= modulus_tolerance, has_equal_real_moduli
+    )
+    for x in isolated_eigenvalues:
+        has_equal_moduli = has_equal_moduli | (
+            is_complex_pair
+            & (jnp.abs(jnp.abs(x) - remaining_pair.pair_modulus) <= modulus_tolerance)
+        )
+    return has_equal_moduli

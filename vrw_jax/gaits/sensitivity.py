@@ -1,0 +1,117 @@
+"""Compute the sensitivities of a gait's measures to all parameters, as a labeled table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vrw_jax.base.checks import check_names, format_name_suggestion, require_untraced_arguments
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.gaits.finder_selection import (
+    UserCycleGuess,
+    check_cycle_guess,
+    resolve_finder,
+    resolve_model,
+)
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.measures import MEASURES
+from vrw_jax.models.stepping import ModelLike
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams
+
+
+@announce_wait("the gait with its derivatives", "15 s")
+@with_default_jax_settings
+def sensitivities(
+    params: WheelParams,
+    *,
+    measures: Sequence[str] | None = None,
+    guess: UserCycleGuess | None = None,
+    model: ModelLike | None = None,
+    options: CycleOptions | StepOptions | None = None,
+) -> xr.Dataset:
+    """Return the values, derivatives and elasticities of one gait's measures.
+
+    The derivatives and elasticities are with respect to all parameters. An elasticity is the
+    relative change of a measure per relative change of a parameter. It is NaN if the measure is
+    zero. If the stability measures are omitted, compilation takes much less time. With unilateral
+    contact, friction is also a parameter. With model "auto", `attrs` contains the name of the model
+    that was selected for the gait.
+
+    Args:
+        params: the wheel.
+        measures: names of measures; by default all measures of the model's gait.
+        guess: as in `limit_cycle`.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: as in `limit_cycle`.
+
+    Returns:
+        A dataset with `value` (measure), `derivative` and `elasticity` (measure, parameter).
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> table = vrw.sensitivities(vrw.WheelParams(), measures=["dls_fraction", "speed"])
+        >>> round(float(table.elasticity.sel(measure="speed", parameter="slope")), 3)
+        1.887
+    """
+    require_untraced_arguments("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
+    model = resolve_model(params, model)
+    gait_finder = resolve_finder(params, model, options)
+    measure_names = (
+        gait_finder.default_measures if measures is None else check_names("measures", measures)
+    )
+    unknown_names = sorted(set(measure_names) - set(gait_finder.differentiable_measures))
+    if unknown_names or not measure_names:
+        raise ValueError(
+            f"measures holds {', '.join(unknown_names) or 'nothing'}"
+            f"{format_name_suggestion(unknown_names[0], gait_finder.differentiable_measures) if unknown_names else ''}, "  # noqa: E501
+            "but the measures of a cycle are "
+            f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
+        )
+    parameter_values = gait_finder.model.collect_parameter_values(params)
+    gait_measures = gait_finder.measure_gait(
+        parameter_values, check_cycle_guess(guess), measure_names
+    )
+    if int(gait_measures.outcome) != Outcome.STEPPED:
+        failure_outcome = Outcome(int(gait_measures.outcome))
+        raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
+    measure_derivatives = np.asarray(gait_measures.parameter_jacobian)
+    measure_values = np.asarray(gait_measures.measure_values)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        measure_elasticities = (
+            measure_derivatives * np.asarray(parameter_values) / measure_values[:, None]
+        )
+    table_axes = ("measure", "parameter")
+    parameter_names = gait_finder.model.parameter_names
+    return xr.Dataset(
+        {
+            "value": ("measure", measure_values),
+            "derivative": (
+                table_axes,
+                measure_derivatives,
+                {"long_name": "d(measure)/d(parameter)"},
+            ),
+            "elasticity": (
+                table_axes,
+                np.where(np.isfinite(measure_elasticities), measure_elasticities, np.nan),
+                {"long_name": "relative change of measure per relative change of parameter"},
+            ),
+            "measure_unit": (
+                "measure",
+                [MEASURES[measure_name].unit for measure_name in measure_names],
+            ),
+            "parameter_unit": (
+                "parameter",
+                [MEASURES[parameter_name].unit for parameter_name in parameter_names],
+            ),
+            "parameter_value": ("parameter", np.asarray(parameter_values)),
+        },
+        coords={"measure": list(measure_names), "parameter": list(parameter_names)},
+        attrs={"rung": gait_finder.model.model_name},
+    )

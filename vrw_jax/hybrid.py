@@ -1,0 +1,31 @@
+"""Simulation of any hybrid system: modes, guards, resets, events."""
+
+from vrw_jax.flow.complementarity import LCPStatus, enumerate_lcp_solutions
+from vrw_jax.flow.diffrax_minima import GuardsAndMargins
+from vrw_jax.flow.hybrid_simulation import (
+    Guard,
+    HybridSolution,
+    Mode,
+    Termination,
+    simulate_hybrid,
+    time_errors,
+)
+from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
+from vrw_jax.flow.return_map import ReturnMap
+from vrw_jax.flow.saltation import flow_jacobian_determinant
+from vrw_jax.flow.segments import product_multipliers, segment_maps
+
+__all__ = (
+    "Guard",
+    "HybridSolution",
+    "LCPStatus",
+    "Mode",
+    "ReturnMap",
+    "Termination",
+    "enumerate_lcp_solutions",
+    "flow_jacobian_determinant",
+    "product_multipliers",
+    "segment_maps",
+    "simulate_hybrid",
+    "time_errors",
+)  # The list of `help`.

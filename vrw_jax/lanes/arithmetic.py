@@ -1,0 +1,458 @@
+"""Rules that emit LLVM instructions for elementwise JAX primitives, in the table
+`ELEMENTWISE_RULES`.
+
+A rule takes an `ElementwiseOperation` and the LLVM values of its operands. It returns the LLVM
+value of the result.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vrw_jax.lanes.llvm_library import ir
+from vrw_jax.lanes.value_emitter import I32, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
+
+FUSED_MULTIPLY_ADD_FLAGS = ("contract",)
+"""LLVM's fast-math flag that lets the processor round a product and a following sum once instead of
+twice.
+
+The flag allows no reordering of operations.
+"""
+RECIPROCAL_DIVISION_FLAGS = (*FUSED_MULTIPLY_ADD_FLAGS, "arcp")
+"""LLVM's fast-math flags that let the inverse of a repeated divisor be computed once.
+
+The flags apply only to float64, because processors approximate the inverse in float32.
+"""
+
+ElementwiseRule = Callable[..., LlvmValue]
+
+
+class ElementwiseOperation(NamedTuple):
+    """JAX primitive that acts on each number, and the emitter of its LLVM instructions."""
+
+    value_emitter: ValueEmitter
+    primitive_params: Any
+    operand_dtype: Any  # dtype of the first operand
+    result_dtype: Any
+
+    @property
+    def llvm_builder(self) -> ir.IRBuilder:
+        """Return the builder that appends LLVM instructions."""
+        return self.value_emitter.llvm_builder
+
+
+def emit_llvm_elementwise_primitive(
+    value_emitter: ValueEmitter,
+    primitive_name: str,
+    primitive_params: Any,
+    operand_dtype: Any,
+    result_dtype: Any,
+    operands: Sequence[LlvmValue],
+) -> LlvmValue:
+    """Emit the JAX primitive `primitive_name` for LLVM operands of type `operand_dtype`.
+
+    Return the LLVM value of the result, which has the type `result_dtype`. A repeated call with
+    equal operands returns the first value and emits no instructions.
+    """
+    instruction_key = (
+        primitive_name,
+        result_dtype.num,
+        primitive_params.get("y"),
+        *map(id, operands),
+    )
+    emit_primitive = ELEMENTWISE_RULES[primitive_name]
+    return value_emitter.emit_value_once(
+        instruction_key,
+        lambda: emit_primitive(
+            ElementwiseOperation(value_emitter, primitive_params, operand_dtype, result_dtype),
+            *operands,
+        ),
+    )
+
+
+# The rules of sums and products drop terms known to be zero and factors known to be one.
+
+
+def emit_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+    """Emit the sum x + y and return its LLVM value. A constant operand 0 needs no instruction."""
+    if _equals_llvm_constant(y, 0):
+        return x
+    if _equals_llvm_constant(x, 0):
+        return y
+    return _emit_binary_instruction("add", operation, x, y)
+
+
+def emit_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+    """Emit the difference x - y and return its LLVM value. A constant y = 0 needs no
+    instruction.
+    """
+    if _equals_llvm_constant(y, 0):
+        return x
+    return _emit_binary_instruction("sub", operation, x, y)
+
+
+def emit_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+    """Emit the product x * y and return its LLVM value. A constant factor 0 or 1 needs no
+    instruction.
+    """
+    if _equals_llvm_constant(y, 1) or _equals_llvm_constant(x, 0):
+        return x
+    if _equals_llvm_constant(x, 1) or _equals_llvm_constant(y, 0):
+        return y
+    return _emit_binary_instruction("mul", operation, x, y)
+
+
+def emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+    """Emit the quotient x / y of two floats and return its LLVM value."""
+    # An integer division by zero would stop the process.
+    _require_float_dtype("div", operation)
+    if _equals_llvm_constant(y, 1):
+        return x
+    return operation.llvm_builder.fdiv(
+        *operation.value_emitter.to_scalars_or_vectors(x, y),
+        flags=RECIPROCAL_DIVISION_FLAGS
+        if operation.operand_dtype == np.float64
+        else FUSED_MULTIPLY_ADD_FLAGS,
+    )
+
+
+def emit_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+    """Emit the power of `x` with a constant integer exponent by repeated squaring, and return its
+    LLVM value.
+    """
+    exponent = operation.primitive_params["y"]
+    one_constant = operation.value_emitter.make_llvm_constant(x.type, 1)
+    partial_power, repeated_square = one_constant, x
+    for i, exponent_bit in enumerate(reversed(f"{abs(exponent):b}")):
+        if i:
+            repeated_square = emit_product(operation, repeated_square, repeated_square)
+        if exponent_bit == "1":
+            partial_power = emit_product(operation, partial_power, repeated_square)
+    if exponent >= 0:
+        return partial_power
+    return operation.llvm_builder.fdiv(one_constant, partial_power, flags=FUSED_MULTIPLY_ADD_FLAGS)
+
+
+def emit_negative(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+    """Emit -x and return its LLVM value."""
+    llvm_builder = operation.llvm_builder
+    return (llvm_builder.fneg if operation.operand_dtype.kind == "f" else llvm_builder.neg)(x)
+
+
+def emit_absolute_value(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+    """Emit the absolute value of `x` and return its LLVM value."""
+    if operation.operand_dtype.kind == "f":
+        return _emit_intrinsic_call(operation, "fabs", x)
+    zero_constant = operation.value_emitter.make_llvm_constant(x.type, 0)
+    is_negative_value = emit_comparison("<", operation, x, zero_constant)
+    return operation.llvm_builder.select(is_negative_value, operation.llvm_builder.neg(x), x)
+
+
+def _return_operand(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+    """Return the operand unchanged."""
+    return x
+
+
+def emit_bitwise_operation(
+    builder_method_name: str, operation: ElementwiseOperation, *operands: LlvmValue
+) -> LlvmValue:
+    """Emit a bitwise instruction by a method of llvmlite's `IRBuilder`, and return its LLVM
+    value.
+    """
+    return getattr(operation.llvm_builder, builder_method_name)(
+        *operation.value_emitter.to_scalars_or_vectors(*operands)
+    )
+
+
+def emit_comparison(
+    comparison_operator: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+) -> LlvmValue:
+    """Emit the comparison of two operands, and return the LLVM truth value.
+
+    `comparison_operator` is an operator such as "<".
+    """
+    llvm_builder, number_kind = operation.llvm_builder, operation.operand_dtype.kind
+    if number_kind == "b":  # The signed value of true would be -1.
+        compare_values = llvm_builder.icmp_unsigned
+    elif number_kind != "f":
+        compare_values = llvm_builder.icmp_signed
+    elif comparison_operator == "!=":
+        compare_values = llvm_builder.fcmp_unordered
+    else:
+        compare_values = llvm_builder.fcmp_ordered
+    return compare_values(comparison_operator, *operation.value_emitter.to_scalars_or_vectors(x, y))
+
+
+def emit_extremum(
+    comparison_operator: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+) -> LlvmValue:
+    """Emit the maximum (operator ">") or the minimum ("<") of two operands, and return its LLVM
+    value.
+    """
+    x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
+    llvm_builder = operation.llvm_builder
+    extremum = llvm_builder.select(emit_comparison(comparison_operator, operation, x, y), x, y)
+    if operation.operand_dtype.kind != "f":
+        return extremum
+    # The result is NaN if either operand is NaN.
+    return llvm_builder.select(llvm_builder.fcmp_unordered("uno", x, x), x, extremum)
+
+
+def emit_select(
+    operation: ElementwiseOperation, lane_condition: LlvmValue, *case_values: LlvmValue
+) -> LlvmValue:
+    """Emit the selection of the first case where the condition is false, and of the second where it
+    is true.
+
+    Return the LLVM value that contains the selected case of each lane.
+    """
+    if (
+        all(_equals_llvm_constant(case_value, 0) for case_value in case_values)
+        or case_values[0] is case_values[1]
+    ):
+        return case_values[0]
+    value_emitter = operation.value_emitter
+    if isinstance(lane_condition.type, ir.VectorType):
+        case_values = tuple(map(value_emitter.to_lane_vector, case_values))
+    false_case, true_case = value_emitter.to_scalars_or_vectors(*case_values)
+    return operation.llvm_builder.select(lane_condition, true_case, false_case)
+
+
+def emit_finiteness_test(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+    """Emit the test whether |x| < infinity, and return its LLVM truth value."""
+    infinity = operation.value_emitter.make_llvm_constant(x.type, np.inf)
+    return emit_comparison("<", operation, _emit_intrinsic_call(operation, "fabs", x), infinity)
+
+
+def emit_float_function(
+    intrinsic_function_name: str, operation: ElementwiseOperation, x: LlvmValue
+) -> LlvmValue:
+    """Emit a function of a float, such as "sqrt", and return its LLVM value.
+
+    The function is one of LLVM's intrinsic functions, or a polynomial for `exp` and `log` in
+    float32.
+    """
+    _require_float_dtype(intrinsic_function_name, operation)
+    if operation.operand_dtype == np.float32 and intrinsic_function_name == "exp":
+        return _emit_float32_exponential(operation, x)
+    if operation.operand_dtype == np.float32 and intrinsic_function_name == "log":
+        return _emit_float32_logarithm(operation, x)
+    return _emit_intrinsic_call(operation, intrinsic_function_name, x)
+
+
+def _require_float_dtype(primitive_name: str, operation: ElementwiseOperation) -> None:
+    """Raise a NotImplementedError unless the operand's type is a float type."""
+    if operation.operand_dtype.kind != "f":
+        raise NotImplementedError(
+            f"{primitive_name} of {operation.operand_dtype} has no machine code: convert to floats."
+        )
+
+
+def _emit_binary_instruction(
+    integer_opcode: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
+) -> LlvmValue:
+    """Emit an instruction with two operands and return its LLVM value.
+
+    The opcode for integers is `integer_opcode`, such as "add". The opcode for floats is "fadd".
+    """
+    is_float = operation.operand_dtype.kind == "f"
+    llvm_opcode = (
+        f"f{integer_opcode} {' '.join(FUSED_MULTIPLY_ADD_FLAGS)}" if is_float else integer_opcode
+    )
+    return operation.value_emitter.emit_binary_instruction(
+        llvm_opcode, *operation.value_emitter.to_scalars_or_vectors(x, y)
+    )
+
+
+def emit_conversion(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+    """Emit the conversion of `x` to the type of the result, and return its LLVM value."""
+    value_emitter, operand_dtype, result_dtype = (
+        operation.value_emitter,
+        operation.operand_dtype,
+        operation.result_dtype,
+    )
+    if operand_dtype == result_dtype:
+        return x
+    if result_dtype.kind == "b":
+        return emit_comparison("!=", operation, x, value_emitter.make_llvm_constant(x.type, 0))
+    is_result_smaller = result_dtype.itemsize < operand_dtype.itemsize
+    builder_method_name = {
+        "ff": "fptrunc" if is_result_smaller else "fpext",
+        "bf": "uitofp",
+        "if": "sitofp",
+        "fi": "fptosi",
+        "bi": "zext",
+        "ii": "trunc" if is_result_smaller else "sext",
+    }[operand_dtype.kind + result_dtype.kind]
+    result_llvm_type = LLVM_NUMBER_TYPES[result_dtype.name]
+    if isinstance(x.type, ir.VectorType):
+        result_llvm_type = value_emitter.make_vector_type(result_llvm_type)
+    return getattr(operation.llvm_builder, builder_method_name)(x, result_llvm_type)
+
+
+def _emit_intrinsic_call(
+    operation: ElementwiseOperation, intrinsic_function_name: str, operand: LlvmValue
+) -> LlvmValue:
+    """Emit a call of an LLVM intrinsic function, such as "sqrt", and return its LLVM value.
+
+    The called variant of the function is the one for the operand's type.
+    """
+    llvm_type = operand.type
+    is_vector = isinstance(llvm_type, ir.VectorType)
+    llvm_element_type = llvm_type.element if is_vector else llvm_type
+    n_type_bits = 64 if llvm_element_type == LLVM_NUMBER_TYPES["float64"] else 32
+    intrinsic_name = (
+        f"llvm.{intrinsic_function_name}.{f'v{llvm_type.count}' if is_vector else ''}f{n_type_bits}"
+    )
+    llvm_module = operation.llvm_builder.module
+    if intrinsic_name not in llvm_module.globals:
+        ir.Function(llvm_module, ir.FunctionType(llvm_type, [llvm_type]), intrinsic_name)
+    return operation.llvm_builder.call(llvm_module.globals[intrinsic_name], [operand])
+
+
+def _emit_polynomial(
+    operation: ElementwiseOperation, x: LlvmValue, polynomial_coefficients: Sequence[float]
+) -> LlvmValue:
+    """Emit a polynomial in `x` by Horner's scheme and return its LLVM value. The coefficients begin
+    with the lowest power.
+    """
+    llvm_builder, make_llvm_constant = (
+        operation.llvm_builder,
+        operation.value_emitter.make_llvm_constant,
+    )
+    horner_sum = make_llvm_constant(x.type, polynomial_coefficients[-1])
+    for polynomial_coefficient in polynomial_coefficients[-2::-1]:
+        horner_sum = llvm_builder.fadd(
+            llvm_builder.fmul(horner_sum, x, flags=FUSED_MULTIPLY_ADD_FLAGS),
+            make_llvm_constant(x.type, polynomial_coefficient),
+            flags=FUSED_MULTIPLY_ADD_FLAGS,
+        )
+    return horner_sum
+
+
+def _get_integer_type(llvm_type: ir.Type) -> ir.Type:
+    """Return the type of 32-bit integers, or of vectors of them if `llvm_type` is a vector."""
+    return ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
+
+
+def _emit_float32_logarithm(operation: ElementwiseOperation, operand: LlvmValue) -> LlvmValue:
+    """Emit the natural logarithm of a positive normal float32 number, accurate to 1e-5, and return
+    its LLVM value.
+
+    LLVM's own logarithm would call the C library once per lane.
+    """
+    llvm_builder, llvm_type = operation.llvm_builder, operand.type
+    make_llvm_constant = operation.value_emitter.make_llvm_constant
+    llvm_integer_type = _get_integer_type(llvm_type)
+    float_bits = llvm_builder.bitcast(operand, llvm_integer_type)
+    make_integer_constant = lambda x: make_llvm_constant(llvm_integer_type, x)
+    binary_exponent = llvm_builder.sub(
+        llvm_builder.ashr(float_bits, make_integer_constant(23)), make_integer_constant(127)
+    )
+    mantissa_bits = llvm_builder.or_(
+        llvm_builder.and_(float_bits, make_integer_constant(0x7FFFFF)),
+        make_integer_constant(0x3F800000),
+    )
+    mantissa_minus_one = llvm_builder.fsub(
+        llvm_builder.bitcast(mantissa_bits, llvm_type), make_llvm_constant(llvm_type, 1.0)
+    )
+    return llvm_builder.fadd(
+        llvm_builder.fmul(
+            llvm_builder.sitofp(binary_exponent, llvm_type),
+            make_llvm_constant(llvm_type, np.log(2.0)),
+        ),
+        _emit_polynomial(operation, mantissa_minus_one, LOGARITHM_COEFFICIENTS),
+    )
+
+
+def _emit_float32_exponential(operation: ElementwiseOperation, operand: LlvmValue) -> LlvmValue:
+    """Emit the exponential of a float32 number between -87 and 88, and return its LLVM value.
+
+    The relative error is at most 1e-6.
+    """
+    llvm_builder, llvm_type = operation.llvm_builder, operand.type
+    make_llvm_constant = operation.value_emitter.make_llvm_constant
+    llvm_integer_type = _get_integer_type(llvm_type)
+    exponent_of_two = llvm_builder.fmul(operand, make_llvm_constant(llvm_type, 1.0 / np.log(2.0)))
+    integer_exponent = _emit_intrinsic_call(operation, "floor", exponent_of_two)
+    fractional_power_of_two = _emit_polynomial(
+        operation, llvm_builder.fsub(exponent_of_two, integer_exponent), POWER_OF_TWO_COEFFICIENTS
+    )
+    integer_power_of_two_bits = llvm_builder.shl(
+        llvm_builder.add(
+            llvm_builder.fptosi(integer_exponent, llvm_integer_type),
+            make_llvm_constant(llvm_integer_type, 127),
+        ),
+        make_llvm_constant(llvm_integer_type, 23),
+    )
+    return llvm_builder.fmul(
+        fractional_power_of_two, llvm_builder.bitcast(integer_power_of_two_bits, llvm_type)
+    )
+
+
+def _equals_llvm_constant(llvm_value: LlvmValue, expected_number: int) -> bool:
+    """Return whether an LLVM value is a constant that equals `expected_number` in every lane."""
+    if not isinstance(llvm_value, ir.Constant):
+        return False
+    constant_content = llvm_value.constant
+    if isinstance(constant_content, (list, tuple)):
+        return all(_equals_llvm_constant(entry, expected_number) for entry in constant_content)
+    return isinstance(constant_content, (int, float)) and constant_content == expected_number
+
+
+def _fit_polynomial(
+    fitted_function: Callable[[np.ndarray], np.ndarray], polynomial_degree: int
+) -> list[float]:
+    """Return the coefficients, lowest power first, of a polynomial that interpolates
+    `fitted_function`.
+
+    The interpolation points are Chebyshev's points on [0, 1].
+    """
+    x = 0.5 - 0.5 * np.cos(
+        np.pi * (np.arange(polynomial_degree + 1) + 0.5) / (polynomial_degree + 1)
+    )
+    return list(
+        map(float, np.polynomial.polynomial.polyfit(x, fitted_function(x), polynomial_degree))
+    )
+
+
+LOGARITHM_COEFFICIENTS = _fit_polynomial(np.log1p, 5)
+POWER_OF_TWO_COEFFICIENTS = _fit_polynomial(np.exp2, 5)
+
+ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
+    "abs": emit_absolute_value,
+    "add": emit_sum,
+    "add_any": emit_sum,
+    "and": partial(emit_bitwise_operation, "and_"),
+    "convert_element_type": emit_conversion,
+    "copy": _return_operand,
+    "div": emit_quotient,
+    "eq": partial(emit_comparison, "=="),
+    "ge": partial(emit_comparison, ">="),
+    "gt": partial(emit_comparison, ">"),
+    "integer_pow": emit_integer_power,
+    "is_finite": emit_finiteness_test,
+    "le": partial(emit_comparison, "<="),
+    "lt": partial(emit_comparison, "<"),
+    "max": partial(emit_extremum, ">"),
+    "min": partial(emit_extremum, "<"),
+    "mul": emit_product,
+    "ne": partial(emit_comparison, "!="),
+    "neg": emit_negative,
+    "not": partial(emit_bitwise_operation, "not_"),
+    "or": partial(emit_bitwise_operation, "or_"),
+    "select_n": emit_select,
+    "shift_left": partial(emit_bitwise_operation, "shl"),
+    "shift_right_arithmetic": partial(emit_bitwise_operation, "ashr"),
+    "shift_right_logical": partial(emit_bitwise_operation, "lshr"),
+    "square": lambda operation, x: _emit_binary_instruction("mul", operation, x, x),
+    "stop_gradient": _return_operand,
+    "sub": emit_difference,
+    "xor": partial(emit_bitwise_operation, "xor"),
+    **{
+        name: partial(emit_float_function, name)
+        for name in ("cos", "exp", "floor", "log", "sin", "sqrt")
+    },
+}

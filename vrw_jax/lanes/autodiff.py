@@ -1,0 +1,263 @@
+"""Derivatives of any order and mode for a function that supports only forward-mode AD.
+
+Loops of unknown length, such as adaptive solver steps until an event, have no reverse mode. The
+rule in this module computes the Jacobian in forward mode, with respect to the inputs that have
+tangents. It returns the product of the Jacobian and the tangent. The product is linear in the
+tangent, so `jax.grad` transposes a small matrix instead of a loop. The Jacobian itself has the same
+rule, so Hessians work in every combination of modes.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
+
+from vrw_jax.lanes.batching import BatchFunction, unbatch
+from vrw_jax.lanes.settings import with_default_jax_settings
+
+ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
+"""Function of floating-point arrays that returns (float outputs, other outputs without
+derivatives).
+"""
+
+
+def enable_all_ad_modes(
+    function: ForwardFunction,
+    function_to_differentiate: ForwardFunction | None = None,
+    make_jacobian: Callable[[tuple[int, ...]], ForwardFunction] | None = None,
+    compile_jacobian: Callable[[ForwardFunction, tuple], ForwardFunction] | None = None,
+    differentiated_arguments: tuple[tuple[int, ...], ...] = (),
+) -> ForwardFunction:
+    """Return `function` with derivatives in forward and reverse mode, to any order.
+
+    All arguments of `function` must be floating-point arrays. `jax.jvp` must be able to
+    differentiate it to the requested order, and its closure must not contain values that are
+    differentiated. If `function_to_differentiate` is given, derivatives are those of this function,
+    which may for example use tighter tolerances. `make_jacobian(argnums)` may provide another
+    function that returns (Jacobians with respect to the arguments `argnums`, float outputs), and
+    the other outputs. `compile_jacobian` compiles Jacobians of any order; its second argument are
+    the `argnums` of each order. Function and Jacobians are compiled once each: outside of `jit`,
+    forward mode, reverse mode and single directions all call the same compiled Jacobian.
+
+    - `differentiated_arguments`: `argnums` of the orders that `function` already has.
+    """
+    compiled_function = jax.jit(function)
+    wrapped_function = jax.custom_jvp(compiled_function)
+
+    @functools.cache
+    def get_differentiable_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
+        compute_output_jacobians = _differentiate_float_outputs(
+            function_to_differentiate or function, argnums
+        )
+
+        def compute_argument_jacobians(*arrays: Any) -> tuple[PyTree, PyTree]:
+            output_jacobians, (float_outputs, nonfloat_outputs) = compute_output_jacobians(*arrays)
+            argument_jacobians = jax.tree.transpose(
+                jax.tree.structure(float_outputs), jax.tree.structure(argnums), output_jacobians
+            )
+            return (argument_jacobians, float_outputs), nonfloat_outputs
+
+        if compile_jacobian is not None:
+            argnums_by_order = (*differentiated_arguments, argnums)
+            return enable_all_ad_modes(
+                compile_jacobian(compute_argument_jacobians, argnums_by_order),
+                compute_argument_jacobians,
+                compile_jacobian=compile_jacobian,
+                differentiated_arguments=argnums_by_order,
+            )
+        if make_jacobian is None:
+            return enable_all_ad_modes(compute_argument_jacobians)
+        return enable_all_ad_modes(make_jacobian(argnums), compute_argument_jacobians)
+
+    @with_default_jax_settings
+    def compute_function_jvp(primals: tuple, tangents: tuple) -> tuple:
+        perturbed_argnums = tuple(
+            i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)
+        )
+        if not perturbed_argnums:
+            function_result = wrapped_function(*primals)
+            return function_result, make_zero_tangent(function_result)
+        (argument_jacobians, float_outputs), nonfloat_outputs = get_differentiable_jacobian(
+            perturbed_argnums
+        )(*primals)
+        output_tangent = _apply_argument_jacobians(
+            float_outputs, argument_jacobians, tuple(tangents[i] for i in perturbed_argnums)
+        )
+        return (float_outputs, nonfloat_outputs), (
+            output_tangent,
+            make_zero_tangent(nonfloat_outputs),
+        )
+
+    wrapped_function.defjvp(compute_function_jvp, symbolic_zeros=True)
+
+    def call_differentiable_function(*arrays: Any) -> tuple:
+        # The rule costs as much as a solver step, so it is applied only to traced arguments.
+        if not any(isinstance(x, jax.core.Tracer) for x in arrays):
+            return compiled_function(*arrays)
+        # Inside `jit`, JAX 0.10 rejects a NumPy array that `vmap` maps as an argument of the rule.
+        return wrapped_function(
+            *(
+                jnp.array(array) if isinstance(getattr(array, "val", None), np.ndarray) else array
+                for array in arrays
+            )
+        )
+
+    return call_differentiable_function
+
+
+def _differentiate_float_outputs(
+    function: ForwardFunction, argnums: int | tuple[int, ...]
+) -> Callable[..., tuple]:
+    """Return a function that computes the Jacobians of the float outputs, and all outputs.
+
+    The Jacobians are with respect to the arguments `argnums`, as those of `jax.jacfwd`.
+    """
+
+    def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, tuple]:
+        outputs = function(*arrays)
+        return outputs[0], outputs
+
+    return jax.jacfwd(evaluate_with_aux, argnums=argnums, has_aux=True)
+
+
+@jax.jit
+def _apply_argument_jacobians(
+    output_template: PyTree, jacobians: PyTree, tangents: tuple
+) -> PyTree:
+    """Return the sum over arguments of Jacobian times tangent, leaf by leaf.
+
+    Products are written as sums, because a matrix product of small arrays is a library call.
+    """
+
+    def apply_leaf_jacobians(_: Array, *leaf_jacobians: Array) -> Array:
+        product_terms = [
+            jnp.sum(jacobian * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
+            for jacobian, tangent in zip(leaf_jacobians, tangents, strict=True)
+        ]
+        return sum(product_terms[1:], start=product_terms[0])
+
+    return jax.tree.map(apply_leaf_jacobians, output_template, *jacobians)
+
+
+ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
+"""Function that determines how a batch function is executed, given the order of its derivative."""
+
+
+def with_implicit_derivative(
+    function: BatchFunction,
+    compute_tangents: Callable,
+    execution_wrapper: ExecutionWrapper,
+    derivative_order: int = 0,
+) -> Callable:
+    """Return `function(p, z)` for one wheel, differentiable on the branch z = z(p).
+
+    The result is differentiable to any order and in any mode. `function(p, z)` itself acts on a
+    batch. `compute_tangents(p, z)` returns dz/dp for one wheel, with a leading axis over p. Its
+    result is correct if z = z(p), and it must be a function that `with_implicit_derivative` has
+    returned. The derivative rule returns the total derivative with respect to p times the tangent
+    of p. The rule ignores the tangent of z, because that can only be dz/dp times the tangent of p.
+    """
+    wrapped_function = jax.custom_jvp(unbatch(execution_wrapper(function, derivative_order)))
+
+    @wrapped_function.defjvp
+    @with_default_jax_settings
+    def compute_function_jvp(primals: tuple, tangents: tuple) -> tuple:
+        jacobian = make_implicit_jacobian(
+            function, compute_tangents, execution_wrapper, derivative_order + 1
+        )(*primals)
+        return wrapped_function(*primals), apply_jacobian(jacobian, tangents[0])
+
+    return wrapped_function
+
+
+def make_implicit_jacobian(
+    function: BatchFunction,
+    compute_tangents: Callable,
+    execution_wrapper: ExecutionWrapper,
+    derivative_order: int = 1,
+    make_jacobian: BatchFunction | None = None,
+) -> Callable:
+    """Return a function that computes d function(p, z(p)) / dp, with a leading axis over p.
+
+    The returned function is differentiable like that of `with_implicit_derivative`. If
+    `make_jacobian` is given, `make_jacobian(p, (z, dz/dp))` replaces the default computation of the
+    Jacobian by a faster one.
+    """
+
+    def compute_jvps_sequentially(p: Array, z_and_jacobian: tuple[PyTree, PyTree]) -> PyTree:
+        """Return the derivatives for a batch, computed one direction after another.
+
+        The compiled code is then as short as for one direction.
+        """
+        n_parameters, (z, z_jacobian) = p.shape[0], z_and_jacobian
+        unit_tangents = jnp.broadcast_to(
+            jnp.eye(n_parameters, dtype=p.dtype)[:, :, None], (n_parameters, *p.shape)
+        )
+        return lax.map(
+            lambda tangent: jax.jvp(function, (p, z), tangent)[1], (unit_tangents, z_jacobian)
+        )
+
+    def compute_branch_tangents(
+        p: Array, z_and_jacobian: tuple[PyTree, PyTree]
+    ) -> tuple[PyTree, PyTree]:
+        z, z_jacobian = z_and_jacobian
+        second_derivatives = jax.jacfwd(compute_tangents)(p, z)
+        return z_jacobian, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), second_derivatives)
+
+    jacobian_function = with_implicit_derivative(
+        make_jacobian or compute_jvps_sequentially,
+        compute_branch_tangents,
+        execution_wrapper,
+        derivative_order,
+    )
+    return lambda p, z: jacobian_function(p, lax.stop_gradient((z, compute_tangents(p, z))))
+
+
+def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, Any]:
+    """Return the outputs of `function` and the derivatives of its float outputs.
+
+    One program computes the outputs and the derivatives. The last axes of a derivative are those of
+    an argument. If there are several arguments, the derivative of each output leaf is a tuple with
+    one entry per argument.
+    """
+
+    partitioned_function = lambda *arrays: eqx.partition(function(*arrays), eqx.is_inexact_array)
+    all_argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
+    output_jacobian, outputs = _differentiate_float_outputs(partitioned_function, all_argnums)(
+        *arguments
+    )
+    return eqx.combine(*outputs), output_jacobian
+
+
+def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
+    """Return the product of the Jacobian and the tangent, leaf by leaf.
+
+    The leading axis of each Jacobian leaf runs over inputs.
+    """
+    return jax.tree.map(lambda jacobian_leaf: jnp.tensordot(tangent, jacobian_leaf, 1), jacobian)
+
+
+def make_zero_tangent(tree: PyTree) -> PyTree:
+    """Return the zero tangent for a tree of outputs.
+
+    Leaves for outputs that are not floats have the type float0.
+    """
+    make_zero_leaf_tangent = lambda x: (
+        jnp.zeros_like(x)
+        if jnp.issubdtype(jnp.result_type(x), jnp.inexact)
+        else np.zeros(jnp.shape(x), jax.dtypes.float0)
+    )
+    return jax.tree.map(make_zero_leaf_tangent, tree)
+
+
+def compute_square_root(x: Array) -> Array:
+    """Return the square root of max(x, 0). Its derivative is zero for x <= 0."""
+    is_argument_positive = x > 0.0
+    return jnp.where(is_argument_positive, jnp.sqrt(jnp.where(is_argument_positive, x, 1.0)), 0.0)

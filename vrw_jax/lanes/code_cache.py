@@ -1,0 +1,252 @@
+"""Cache of machine code by content: traces that give the same LLVM text share one compilation.
+
+Each program is one record of the store. The name of the record is a digest of the processor and of
+the text that LLVM compiles. A second record, the index, contains the name of the program. The name
+of the index is a digest of everything on which the function's trace depends. An edit of the source
+that changes no trace therefore costs a trace, but no compilation. JAX programs then call the code
+by the same name as before the edit.
+"""
+
+import contextlib
+import gc
+import hashlib
+import json
+import pickle
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import ContextVar
+from threading import RLock
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from vrw_jax.lanes import disk_cache
+from vrw_jax.lanes.array_emitter import RegisterLimits
+from vrw_jax.lanes.kernel import LANE_KERNEL_NAME, write_llvm_kernel
+from vrw_jax.lanes.machine import (
+    compile_llvm_for_processor,
+    describe_compiler_settings,
+    require_object_file,
+)
+
+ResultShapesAndDtypes = tuple[tuple[tuple[int, ...], np.dtype], ...]
+"""For each result of machine code, the lengths of all axes before the lanes, and the dtype."""
+
+
+class MachineCode(NamedTuple):
+    """Machine code of a function over lanes, which may still be compiled in the background."""
+
+    ffi_target_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
+    result_shapes_and_dtypes: ResultShapesAndDtypes
+    object_code_future: Future[bytes]
+
+
+class LaneProgram(NamedTuple):
+    """Machine code of a function, and the tree structure of the function's results."""
+
+    machine_code: MachineCode
+    result_structure: Any
+
+
+def get_lane_program(
+    lane_function: Callable,
+    argument_shapes: Any,
+    function_key: str | None,
+    lanes_per_group: int,
+    register_limits: RegisterLimits,
+) -> LaneProgram:
+    """Return machine code for a function of arrays with lanes on the last axis.
+
+    The code is taken from this process or from the disk cache. If neither contains it, the function
+    is traced, and compiled in the background.
+
+    - `argument_shapes`: shapes and dtypes of the arguments;
+    - `function_key`: key of the function, see `keys.make_key`; None if it has none, so that it is
+      traced at each call and never saved;
+    - `lanes_per_group`: number of lanes that the code computes at a time.
+    """
+    if function_key is None:
+        return _compile_lane_program(
+            lane_function, argument_shapes, None, lanes_per_group, register_limits
+        )
+    index_key = (
+        function_key,
+        [(x.shape, x.dtype.name, bool(getattr(x, "weak_type", False))) for x in argument_shapes],
+        lanes_per_group,
+        register_limits,
+        disk_cache.describe_trace_environment(),
+        describe_compiler_settings(),
+    )
+    index_name = f"lanes_index_{hashlib.sha256(repr(index_key).encode()).hexdigest()}"
+    if index_name not in _lane_program_by_index_name:
+        _lane_program_by_index_name[index_name] = _load_lane_program(
+            index_name
+        ) or _compile_lane_program(
+            lane_function, argument_shapes, index_name, lanes_per_group, register_limits
+        )
+    return _lane_program_by_index_name[index_name]
+
+
+def _load_lane_program(index_name: str) -> LaneProgram | None:
+    """Return the program that an index record names, or None."""
+    encoded_name, _, pickled_skeleton = (disk_cache.load_cache_record(index_name) or b"").partition(
+        b"\n"
+    )
+    if not pickled_skeleton:
+        return None
+    try:
+        skeleton = pickle.loads(pickled_skeleton)
+        machine_code = load_machine_code(encoded_name.decode("ascii"))
+    except Exception:  # Damaged bytes may raise any exception.
+        disk_cache.warn_of_unusable_cache_record(f"{index_name} is no index of code")
+        return None
+    return machine_code and LaneProgram(machine_code, jax.tree.structure(skeleton))
+
+
+def _compile_lane_program(
+    lane_function: Callable,
+    argument_shapes: Any,
+    index_name: str | None,
+    lanes_per_group: int,
+    register_limits: RegisterLimits,
+) -> LaneProgram:
+    """Trace a function, and compile it in the background unless its LLVM text is known."""
+    with _jax_tracing_lock, _pause_garbage_collection():
+        closed_jaxpr, result_structure = trace_for_machine_code(lane_function, *argument_shapes)
+        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
+    encoded_result_types = json.dumps(
+        [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
+    )
+    digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
+    code_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
+    is_saved = index_name is not None
+
+    def save_index() -> None:
+        skeleton = jax.tree.unflatten(result_structure, range(result_structure.num_leaves))
+        with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
+            if index_name is not None:  # A class inside a function cannot be pickled.
+                disk_cache.save_cache_record(
+                    index_name, code_name.encode() + b"\n" + pickle.dumps(skeleton)
+                )
+
+    def compile_and_save_code() -> bytes:
+        object_code = compile_llvm_for_processor(llvm_text)
+        if is_saved:
+            encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
+            disk_cache.save_cache_record(code_name, encoded_machine_code)
+            save_index()
+        return object_code
+
+    # Another trace may have given the same LLVM text.
+    machine_code = (
+        load_machine_code(code_name) if is_saved else _machine_code_by_name.get(code_name)
+    )
+    if machine_code is None:
+        machine_code = _machine_code_by_name[code_name] = MachineCode(
+            code_name,
+            _parse_result_shapes_and_dtypes(encoded_result_types),
+            _llvm_compiler_pool.submit(compile_and_save_code),
+        )
+    else:
+        save_index()
+    return LaneProgram(machine_code, result_structure)
+
+
+def load_machine_code(code_name: str) -> MachineCode | None:
+    """Return the machine code named `code_name` from this process or from the disk cache.
+
+    Return None if neither contains the code.
+    """
+    if code_name not in _machine_code_by_name:
+        cache_record_content = disk_cache.load_cache_record(code_name)
+        if cache_record_content is None:
+            return None
+        encoded_result_types, _, object_code = cache_record_content.partition(b"\n")
+        try:
+            result_shapes_and_dtypes = _parse_result_shapes_and_dtypes(encoded_result_types)
+            require_object_file(object_code, LANE_KERNEL_NAME)
+        except (
+            ValueError,
+            TypeError,
+        ) as damage_error:  # LLVM would end the process on such a file.
+            warnings.warn(
+                f"{code_name} holds no machine code ({damage_error}): compiled again.",
+                stacklevel=2,
+            )
+            return None
+        object_code_future: Future[bytes] = Future()
+        object_code_future.set_result(object_code)
+        _machine_code_by_name[code_name] = MachineCode(
+            code_name, result_shapes_and_dtypes, object_code_future
+        )
+    return _machine_code_by_name[code_name]
+
+
+_machine_code_by_name: dict[str, MachineCode] = {}
+"""Machine code of this process by its name. Programs with the same LLVM text share the code."""
+_lane_program_by_index_name: dict[str, LaneProgram] = {}
+"""Programs of this process by the name of their index record."""
+
+
+@contextlib.contextmanager
+def _pause_garbage_collection() -> Iterator[None]:
+    """Return a context in which Python collects no garbage.
+
+    Collections take a sixth of the tracing time, because a trace creates many objects that persist.
+    """
+    was_collection_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_collection_enabled:
+            gc.enable()
+
+
+_jax_tracing_lock = RLock()
+"""Lock that lets only one thread trace at a time. The later compilation by LLVM needs no lock."""
+
+
+_llvm_compiler_pool = ThreadPoolExecutor(1, "llvm")
+"""Thread that compiles in the background while Python traces.
+
+One thread suffices, because LLVM's lock lets only one thread compile.
+"""
+
+
+def _parse_result_shapes_and_dtypes(encoded_result_types: str | bytes) -> ResultShapesAndDtypes:
+    """Return `MachineCode.result_shapes_and_dtypes`, parsed from JSON."""
+    return tuple(
+        (tuple(axis_lengths), np.dtype(dtype_name))
+        for axis_lengths, dtype_name in json.loads(encoded_result_types)
+    )
+
+
+def trace_for_machine_code(
+    lane_function: Callable, *argument_shapes: Any
+) -> tuple[ClosedJaxpr, Any]:
+    """Return the jaxpr of a function for arguments with the shapes and dtypes `argument_shapes`,
+    and the tree structure of its results.
+
+    During the trace, `targets_machine_code` returns True.
+    """
+    tracing_flag_token = _is_tracing_for_machine_code.set(True)
+    try:  # The loops are traced in this mesh, so that JAX's trace cache finds them again.
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+            closed_jaxpr, result_shapes = jax.make_jaxpr(lane_function, return_shape=True)(
+                *argument_shapes
+            )
+            return closed_jaxpr, jax.tree.structure(result_shapes)
+    finally:
+        _is_tracing_for_machine_code.reset(tracing_flag_token)
+
+
+_is_tracing_for_machine_code: ContextVar[bool] = ContextVar("_tracing", default=False)
+
+
+def targets_machine_code() -> bool:
+    """Return whether the function that is being traced will become machine code."""
+    return _is_tracing_for_machine_code.get()

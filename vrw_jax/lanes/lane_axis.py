@@ -1,0 +1,464 @@
+"""Functions of one lane as functions of many: a lane axis is appended to the arrays of a trace.
+
+`jax.vmap` moves the batch to the first axis inside loops and products, which machine code does not
+accept. Here it is always the last axis. Values that are the same for all lanes, such as counters of
+loops, stay without this axis.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.extend.core import ClosedJaxpr, Literal
+
+from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
+from vrw_jax.lanes.lowering import CALLED_JAXPR_PARAMETERS, NOINLINE_FUNCTION_NAME, mark_noinline
+from vrw_jax.lanes.reductions import COMBINING_PRIMITIVE_BY_REDUCTION
+
+MAX_SELECTED_ENTRIES = 64
+"""Largest length of an axis that each lane indexes by itself, because every entry is read."""
+
+PRIMITIVES_WITH_LEADING_AXES = frozenset(
+    [
+        "concatenate",
+        "cumsum",
+        "expand_dims",
+        "optimization_barrier",
+        "split",
+        "squeeze",
+        "stack",
+        "unstack",
+    ]
+).union(COMBINING_PRIMITIVE_BY_REDUCTION)
+"""Primitives whose parameters name axes, so that another axis at the end changes nothing."""
+
+
+class LaneValue(NamedTuple):
+    """An array of a trace, and whether its last axis is that of the lanes."""
+
+    array: Any
+    has_lanes: bool
+
+
+def append_lane_axis(function: Callable[..., Any], n_shared: int = 0) -> Callable[..., Any]:
+    """Return a function of arrays with lanes on their last axis, from a function of one lane.
+
+    The first `n_shared` arguments are arrays without lanes, the same for all lanes. All results
+    have lanes.
+    """
+
+    def call_with_lanes(*arguments: Any) -> Any:
+        argument_leaves, structure = jax.tree.flatten(arguments)
+        n_shared_leaves = len(jax.tree.leaves(arguments[:n_shared]))
+        n_lanes = argument_leaves[-1].shape[-1]
+        values = [LaneValue(x, i >= n_shared_leaves) for i, x in enumerate(argument_leaves)]
+        one_lane = [
+            jax.ShapeDtypeStruct(
+                x.shape[:-1] if has_lanes else jnp.shape(x), x.dtype, weak_type=_is_weak(x)
+            )
+            for x, has_lanes in values
+        ]
+        closed_jaxpr, result_shapes = jax.make_jaxpr(function, return_shape=True)(
+            *jax.tree.unflatten(structure, one_lane)
+        )
+        results = _evaluate(n_lanes, closed_jaxpr, values)
+        return jax.tree.unflatten(
+            jax.tree.structure(result_shapes), [_with_lanes(n_lanes, x) for x in results]
+        )
+
+    return call_with_lanes
+
+
+def _is_weak(array: Any) -> bool:
+    return bool(getattr(jax.typeof(array), "weak_type", False))
+
+
+def _with_lanes(n_lanes: int, value: LaneValue, shape: tuple[int, ...] | None = None) -> Any:
+    """Return the array of a value with a lane axis, broadcast to `shape` and the lanes."""
+    array, has_lanes = value
+    own_shape = jnp.shape(array)[:-1] if has_lanes else jnp.shape(array)
+    shape = own_shape if shape is None else shape
+    if has_lanes and own_shape == shape:
+        return array
+    axes = (*range(len(own_shape)), *((len(shape),) if has_lanes else ()))
+    return lax.broadcast_in_dim(array, (*shape, n_lanes), axes)
+
+
+def _evaluate(
+    n_lanes: int, closed_jaxpr: ClosedJaxpr, arguments: Sequence[LaneValue]
+) -> list[LaneValue]:
+    """Return the results of a trace of one lane for arguments of which some have lanes."""
+    jaxpr = closed_jaxpr.jaxpr
+    values = dict(zip(jaxpr.invars, arguments, strict=True))
+    values |= {
+        v: LaneValue(x, False) for v, x in zip(jaxpr.constvars, closed_jaxpr.consts, strict=True)
+    }
+    read = lambda atom: LaneValue(atom.val, False) if isinstance(atom, Literal) else values[atom]
+    for equation in jaxpr.eqns:
+        operands = [read(atom) for atom in equation.invars]
+        name = equation.primitive.name
+        if any(x.has_lanes for x in operands) or name in RULES or name in CALLED_JAXPR_PARAMETERS:
+            results = _evaluate_with_lanes(n_lanes, equation, operands)
+        else:
+            results = _bind(equation, [x.array for x in operands], False)
+        values |= zip(equation.outvars, results, strict=True)
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _bind(equation: Any, arrays: Sequence[Any], has_lanes: bool, **changed: Any) -> list[LaneValue]:
+    """Return the results of the primitive of an equation, with some parameters changed."""
+    results = equation.primitive.bind(*arrays, **equation.params | changed)
+    if not equation.primitive.multiple_results:
+        results = [results]
+    return [LaneValue(x, has_lanes) for x in results]
+
+
+def _evaluate_with_lanes(
+    n_lanes: int, equation: Any, operands: Sequence[LaneValue]
+) -> list[LaneValue]:
+    name = equation.primitive.name
+    if name in RULES:
+        return RULES[name](n_lanes, equation, operands)
+    if name in CALLED_JAXPR_PARAMETERS:
+        return _call(n_lanes, equation, operands)
+    arrays = [_with_lanes(n_lanes, x) for x in operands]
+    if name in ELEMENTWISE_RULES:
+        shape = equation.outvars[0].aval.shape
+        return _bind(equation, [_with_lanes(n_lanes, x, shape) for x in operands], True)
+    if name in PRIMITIVES_WITH_LEADING_AXES:
+        return _bind(equation, arrays, True)
+    raise NotImplementedError(f"{name} has no rule for lanes")
+
+
+def _call(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    closed_jaxpr = equation.params[CALLED_JAXPR_PARAMETERS[equation.primitive.name]]
+    flags = [x.has_lanes for x in operands]
+    if equation.params.get("name") != NOINLINE_FUNCTION_NAME or not any(flags):
+        return _evaluate(n_lanes, closed_jaxpr, operands)
+    result_flags = _find_lanes(closed_jaxpr.jaxpr, flags)
+    evaluate_arrays = lambda *arrays: [
+        _with_lanes(n_lanes, value) if flag else value.array
+        for value, flag in zip(
+            _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, flags))),
+            result_flags,
+            strict=True,
+        )
+    ]
+    results = mark_noinline(evaluate_arrays)(*(x.array for x in operands))
+    return list(map(LaneValue, results, result_flags))
+
+
+def _broadcast(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    (array, has_lanes), *_ = operands
+    if not has_lanes:
+        return _bind(equation, [array], False)
+    shape, axes = (equation.params[x] for x in ("shape", "broadcast_dimensions"))
+    return _bind(
+        equation, [array], True, shape=(*shape, n_lanes), broadcast_dimensions=(*axes, len(shape))
+    )
+
+
+def _reshape(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    array, has_lanes = operands[0]
+    if not has_lanes:
+        return _bind(equation, [array], False)
+    return [LaneValue(lax.reshape(array, (*equation.params["new_sizes"], n_lanes)), True)]
+
+
+def _transpose(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    array, has_lanes = operands[0]
+    order = equation.params["permutation"]
+    return [
+        LaneValue(lax.transpose(array, (*order, len(order)) if has_lanes else order), has_lanes)
+    ]
+
+
+def _pad(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    (array, has_lanes), (padding, varies) = operands
+    widths = equation.params["padding_config"]
+    if varies:
+        raise NotImplementedError("pad by a value that differs between lanes has no rule")
+    return [
+        LaneValue(lax.pad(array, padding, (*widths, (0, 0, 0)) if has_lanes else widths), has_lanes)
+    ]
+
+
+def _slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    array, has_lanes = operands[0]
+    starts, limits, strides = (
+        equation.params[x] for x in ("start_indices", "limit_indices", "strides")
+    )
+    if has_lanes:
+        starts, limits = (*starts, 0), (*limits, n_lanes)
+        strides = None if strides is None else (*strides, 1)
+    return [LaneValue(lax.slice(array, starts, limits, strides), has_lanes)]
+
+
+def _dynamic_slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    """Return a part of an array. Where lanes have indices of their own, each selects its entry."""
+    (array, has_lanes), *indices = operands
+    sizes = equation.params["slice_sizes"]
+    for axis, ((index, varies), size) in enumerate(zip(indices, sizes, strict=True)):
+        if not varies:
+            array = lax.dynamic_slice_in_dim(array, index, size, axis)
+            continue
+        array, has_lanes = _with_lanes(n_lanes, LaneValue(array, has_lanes)), True
+        parts = [
+            lax.slice_in_dim(array, start, start + size, axis=axis)
+            for start in range(_require_short(array.shape[axis]) - size + 1)
+        ]
+        last = len(parts) - 1
+        select = lambda selected, i, index=index, parts=parts, last=last: jnp.where(
+            jnp.clip(index, 0, last) == i, parts[i], selected
+        )
+        array = functools.reduce(select, range(1, len(parts)), parts[0])
+    return [LaneValue(array, has_lanes)]
+
+
+def _update_slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    """Return an array with a part replaced, at an index that may differ between lanes."""
+    array, part, *indices = operands
+    if not array.has_lanes and not part.has_lanes and not any(x.has_lanes for x in indices):
+        return _bind(equation, [x.array for x in operands], False)
+    lane_array, lane_part = (_with_lanes(n_lanes, x) for x in (array, part))
+    varying_axes = [axis for axis, index in enumerate(indices) if index.has_lanes]
+    lane_start = jnp.zeros((), indices[0].array.dtype) if indices else 0
+    if not varying_axes:
+        starts = [*(x.array for x in indices), lane_start]
+        return [LaneValue(lax.dynamic_update_slice(lane_array, lane_part, starts), True)]
+    last_starts = [
+        _require_short(lane_array.shape[axis]) - lane_part.shape[axis] for axis in varying_axes
+    ]
+    result = lane_array
+    clipped = [
+        jnp.clip(indices[a].array, 0, n) for a, n in zip(varying_axes, last_starts, strict=True)
+    ]
+    for flat_start in range(math.prod(n + 1 for n in last_starts)):
+        starts, is_here = [x.array for x in indices], jnp.ones(n_lanes, bool)
+        for axis, last, index in zip(varying_axes, last_starts, clipped, strict=True):
+            flat_start, starts[axis] = divmod(flat_start, last + 1)
+            is_here &= index == starts[axis]
+        updated = lax.dynamic_update_slice(lane_array, lane_part, [*starts, lane_start])
+        result = jnp.where(is_here, updated, result)
+    return [LaneValue(result, True)]
+
+
+def _require_short(length: int) -> int:
+    if length > MAX_SELECTED_ENTRIES:
+        raise NotImplementedError(
+            f"an index that differs between lanes reads an axis of {length}, at most "
+            f"{MAX_SELECTED_ENTRIES} have a rule"
+        )
+    return length
+
+
+def _multiply(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    """Return a product of arrays as a sum of elementwise products."""
+    (summed_left, summed_right), (batch_left, batch_right) = equation.params["dimension_numbers"]
+    if not any(x.has_lanes for x in operands):
+        return _bind(equation, [x.array for x in operands], False)
+    left, right = (_with_lanes(n_lanes, x) for x in operands)
+    free_left, free_right = (
+        [i for i in range(x.ndim - 1) if i not in summed and i not in batch]
+        for x, summed, batch in (
+            (left, summed_left, batch_left),
+            (right, summed_right, batch_right),
+        )
+    )
+    left = lax.transpose(left, (*batch_left, *free_left, *summed_left, left.ndim - 1))
+    right = lax.transpose(right, (*batch_right, *free_right, *summed_right, right.ndim - 1))
+    n_batch, n_left, n_right, n_summed = map(len, (batch_left, free_left, free_right, summed_left))
+    result_dtype = equation.outvars[0].aval.dtype
+    left = jnp.expand_dims(left, tuple(range(n_batch + n_left, n_batch + n_left + n_right)))
+    right = jnp.expand_dims(right, tuple(range(n_batch, n_batch + n_left)))
+    first_summed = n_batch + n_left + n_right
+    products = left.astype(result_dtype) * right.astype(result_dtype)
+    summed = tuple(range(first_summed, first_summed + n_summed))
+    return [LaneValue(jnp.sum(products, axis=summed), True)]
+
+
+def _spread_lanes(
+    closed_jaxpr: ClosedJaxpr,
+    constants: Sequence[LaneValue],
+    carry: Sequence[LaneValue],
+    others: Any = (),
+) -> list[bool]:
+    """Return which carried arrays of a loop have lanes in some iteration."""
+    has_lanes = [x.has_lanes for x in carry]
+    fixed = [x.has_lanes for x in constants]
+    while True:
+        result_flags = _find_lanes(closed_jaxpr.jaxpr, [*fixed, *has_lanes, *others])
+        spread = [a or b for a, b in zip(has_lanes, result_flags, strict=False)]
+        if spread == has_lanes:
+            return has_lanes
+        has_lanes = spread
+
+
+def _find_lanes(jaxpr: Any, argument_flags: Sequence[bool]) -> list[bool]:
+    """Return which results of a trace have lanes."""
+    flags = dict(zip(jaxpr.invars, argument_flags, strict=True))
+    read = lambda atom: not isinstance(atom, Literal) and flags.get(atom, False)
+    for equation in jaxpr.eqns:
+        operands = list(map(read, equation.invars))
+        name, params = equation.primitive.name, equation.params
+        if name in CALLED_JAXPR_PARAMETERS:
+            results = _find_lanes(params[CALLED_JAXPR_PARAMETERS[name]].jaxpr, operands)
+        elif name == "while":
+            n_condition, n_body = params["cond_nconsts"], params["body_nconsts"]
+            constants = operands[n_condition : n_condition + n_body]
+            as_values = lambda some_flags: [LaneValue(None, flag) for flag in some_flags]
+            results = _spread_lanes(
+                params["body_jaxpr"],
+                as_values(constants),
+                as_values(operands[n_condition + n_body :]),
+            )
+            if any(_find_lanes(params["cond_jaxpr"].jaxpr, [*operands[:n_condition], *results])):
+                results = [True] * len(results)
+        elif name == "scan":
+            n_constants, n_carry = _count_scan_arguments(params)
+            as_values = lambda some_flags: [LaneValue(None, flag) for flag in some_flags]
+            others = operands[n_constants + n_carry :]
+            carry = _spread_lanes(
+                params["jaxpr"],
+                as_values(operands[:n_constants]),
+                as_values(operands[n_constants : n_constants + n_carry]),
+                others,
+            )
+            results = _find_lanes(params["jaxpr"].jaxpr, [*operands[:n_constants], *carry, *others])
+            results = [*carry, *results[n_carry:]]
+        else:
+            results = [any(operands)] * len(equation.outvars)
+        flags |= zip(equation.outvars, results, strict=True)
+    return list(map(read, jaxpr.outvars))
+
+
+def _count_scan_arguments(params: Any) -> tuple[int, int]:
+    if "ft_in" in params:  # JAX has this parameter from release 0.11 or 0.12 on.
+        constants, carry, _ = params["ft_in"].unpack()
+        return len(constants), len(carry)
+    return params["num_consts"], params["num_carry"]
+
+
+def _while(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    """Return what a loop carries. If lanes end at different iterations, the others wait."""
+    params = equation.params
+    n_condition, n_body = params["cond_nconsts"], params["body_nconsts"]
+    condition_constants = operands[:n_condition]
+    body_constants = operands[n_condition : n_condition + n_body]
+    carry = operands[n_condition + n_body :]
+    flags = _spread_lanes(params["body_jaxpr"], body_constants, carry)
+    condition_flags = _find_lanes(
+        params["cond_jaxpr"].jaxpr, [*(x.has_lanes for x in condition_constants), *flags]
+    )
+    varies = any(condition_flags)
+    flags = [True] * len(flags) if varies else flags
+    make_arrays = lambda values: [
+        _with_lanes(n_lanes, value) if flag else value.array
+        for value, flag in zip(values, flags, strict=True)
+    ]
+    make_values = lambda arrays: list(map(LaneValue, arrays, flags))
+
+    def find_condition(arrays: Sequence[Any]) -> Any:
+        values = [*condition_constants, *make_values(arrays)]
+        (condition,) = _evaluate(n_lanes, params["cond_jaxpr"], values)
+        return _with_lanes(n_lanes, condition) if varies else condition.array
+
+    def find_next(arrays: Sequence[Any]) -> list[Any]:
+        values = [*body_constants, *make_values(arrays)]
+        return make_arrays(_evaluate(n_lanes, params["body_jaxpr"], values))
+
+    start = make_arrays(carry)
+    if not varies:
+        return make_values(lax.while_loop(find_condition, find_next, start))
+
+    def advance(state: tuple) -> tuple:
+        is_running, arrays = state
+        arrays = [
+            jnp.where(is_running, new, old)
+            for new, old in zip(find_next(arrays), arrays, strict=True)
+        ]
+        return find_condition(arrays), arrays
+
+    initial_state = find_condition(start), start
+    return make_values(lax.while_loop(lambda state: jnp.any(state[0]), advance, initial_state)[1])
+
+
+def _scan(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    params = equation.params
+    n_constants, n_carry = _count_scan_arguments(params)
+    constants, carry = operands[:n_constants], operands[n_constants : n_constants + n_carry]
+    scanned = operands[n_constants + n_carry :]
+    scanned_flags = [x.has_lanes for x in scanned]
+    flags = _spread_lanes(params["jaxpr"], constants, carry, scanned_flags)
+    result_flags = _find_lanes(
+        params["jaxpr"].jaxpr, [*(x.has_lanes for x in constants), *flags, *scanned_flags]
+    )
+    result_flags[:n_carry] = flags
+    make_arrays = lambda values: [
+        _with_lanes(n_lanes, value) if flag else value.array
+        for value, flag in zip(values, result_flags, strict=False)
+    ]
+
+    def advance(arrays: list[Any], slices: list[Any]) -> tuple[list[Any], list[Any]]:
+        values = [
+            *constants,
+            *map(LaneValue, arrays, flags),
+            *map(LaneValue, slices, scanned_flags),
+        ]
+        results = make_arrays(_evaluate(n_lanes, params["jaxpr"], values))
+        return results[:n_carry], results[n_carry:]
+
+    final, stacked = lax.scan(
+        advance,
+        make_arrays(carry),
+        [x.array for x in scanned],
+        params["length"],
+        params["reverse"],
+    )
+    return list(map(LaneValue, [*final, *stacked], result_flags))
+
+
+def _choose_branch(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
+    """Return the results of the branch that each lane takes.
+
+    A branch runs, for all lanes, if any lane takes it.
+    """
+    (index, _), *arguments = operands
+    varies = any(x.has_lanes for x in operands)
+    branches, lane_axis = equation.params["branches"], (n_lanes,) * varies
+    index = jnp.clip(index.astype(int), 0, len(branches) - 1)
+    results = [
+        jnp.zeros((*variable.aval.shape, *lane_axis), variable.aval.dtype)
+        for variable in equation.outvars
+    ]
+    for i, branch in enumerate(branches):
+
+        def run_branch(state: tuple, i: int = i, branch: Any = branch) -> tuple:
+            values = _evaluate(n_lanes, branch, arguments)
+            arrays = [_with_lanes(n_lanes, x) if varies else x.array for x in values]
+            selected = [jnp.where(index == i, a, b) for a, b in zip(arrays, state[1], strict=True)]
+            return jnp.zeros((), bool), selected
+
+        is_taken = jnp.any(index == i)
+        _, results = lax.while_loop(lambda state: state[0], run_branch, (is_taken, results))
+    return [LaneValue(x, varies) for x in results]
+
+
+RULES: dict[str, Callable[[int, Any, Sequence[LaneValue]], list[LaneValue]]] = {
+    "broadcast_in_dim": _broadcast,
+    "cond": _choose_branch,
+    "dot_general": _multiply,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _update_slice,
+    "pad": _pad,
+    "reshape": _reshape,
+    "scan": _scan,
+    "slice": _slice,
+    "transpose": _transpose,
+    "while": _while,
+}
+"""Rules of primitives whose parameters or operands change with the lane axis, by name."""

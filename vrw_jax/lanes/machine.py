@@ -1,0 +1,175 @@
+"""Interface to LLVM: the target processor, object code for it, and loading of code into memory."""
+
+import functools
+import platform
+import re
+import struct
+import sys
+from enum import IntEnum
+
+from vrw_jax.lanes.llvm_library import is_llvmlite_installed, llvm
+
+LLVM_OPTIMIZATION_LEVEL = 2
+"""LLVM's optimization level (0 to 3) for register allocation and instruction scheduling."""
+LLVM_PASS_NAMES = (
+    "global_dead_code_eliminate",
+    "instruction_combine",
+    "simplify_cfg",
+    "aggressive_dce",
+    "sinking",
+)
+"""Names of the LLVM passes that simplify the module.
+
+They are chosen because the emitter repeats no computation and already uses vectors. LLVM's usual
+passes would take as long as the whole remaining compilation, for code at most a twentieth faster.
+"""
+
+ELF_FILE_SIGNATURE = b"\x7fELF\x02\x01"
+"""First bytes of the object files that LLVM writes on 64-bit Linux."""
+ELF_HEADER_LAYOUT = struct.Struct("<16sHHIQQQIHHHHHH")
+"""Layout of the header of an ELF file, in the format of Python's `struct`."""
+ELF_SECTION_LAYOUT = struct.Struct("<IIQQQQIIQQ")
+"""Layout of one entry of the section table of an ELF file, in the format of Python's `struct`."""
+
+
+class ElfSectionType(IntEnum):
+    """Types of ELF sections that the check of an object file distinguishes."""
+
+    ELF_STRING_TABLE = 3
+    ELF_ZERO_FILLED_MEMORY = 8  # memory for which the file contains no bytes
+
+
+@functools.cache
+def describe_processor() -> tuple[str, str, str]:
+    """Return the target of machine code: the target triple, the processor's name, and the list of
+    the processor's features.
+
+    Without llvmlite, return the kind of machine and two empty strings.
+    """
+    if not is_llvmlite_installed:
+        return platform.machine(), "", ""
+    processor_features = llvm.get_host_cpu_features().flatten()
+    return llvm.get_process_triple(), llvm.get_host_cpu_name(), processor_features
+
+
+def describe_compiler_settings() -> str:
+    """Return a string that identifies everything on which object code depends, except the LLVM
+    text.
+    """
+    return repr(
+        (llvm.llvm_version_info, describe_processor(), LLVM_OPTIMIZATION_LEVEL, LLVM_PASS_NAMES)
+    )
+
+
+def has_512_bit_vectors() -> bool:
+    """Return whether the processor has vector registers of 512 bits."""
+    return "+avx512f" in describe_processor()[2]
+
+
+def compile_llvm_for_processor(llvm_text: str) -> bytes:
+    """Return the object code, for this processor, that LLVM compiles from LLVM text."""
+    return _emit_object_code(llvm.parse_assembly(llvm_text), _make_llvm_target_machine())
+
+
+def compile_llvm_for_webassembly(
+    llvm_text: str, entry_function_name: str, exported_function_name: str
+) -> bytes:
+    """Return the object code, for WebAssembly with vectors of 128 bits, that LLVM compiles from
+    LLVM text.
+
+    The object file must still be linked. The only exported function is `entry_function_name`, under
+    the name `exported_function_name`.
+    """
+    llvm_module = llvm.parse_assembly(llvm_text)
+    for llvm_symbol in (*llvm_module.functions, *llvm_module.global_variables):
+        if not llvm_symbol.is_declaration and llvm_symbol.name != entry_function_name:
+            llvm_symbol.linkage = "internal"
+    llvm_module.get_function(entry_function_name).name = exported_function_name
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    llvm_target_machine = llvm.Target.from_triple("wasm32-unknown-unknown").create_target_machine(
+        cpu="generic",
+        features="+simd128",
+        opt=LLVM_OPTIMIZATION_LEVEL,
+        reloc="static",
+        codemodel="default",
+    )
+    return _emit_object_code(llvm_module, llvm_target_machine)
+
+
+def _emit_object_code(
+    llvm_module: "llvm.ModuleRef", llvm_target_machine: "llvm.TargetMachine"
+) -> bytes:
+    """Run the passes in `LLVM_PASS_NAMES` on an LLVM module, and return its object code."""
+    llvm_module.triple = llvm_target_machine.triple
+    llvm_module.data_layout = str(llvm_target_machine.target_data)
+    llvm_pass_manager = llvm.create_new_module_pass_manager()
+    for llvm_pass_name in LLVM_PASS_NAMES:
+        getattr(llvm_pass_manager, f"add_{llvm_pass_name}_pass")()
+    llvm_pass_manager.run(
+        llvm_module,
+        llvm.create_pass_builder(llvm_target_machine, llvm.create_pipeline_tuning_options()),
+    )
+    return llvm_target_machine.emit_object(llvm_module)
+
+
+def require_object_file(object_code: bytes, function_name: str) -> None:
+    """Raise a ValueError unless `object_code` is a complete object file that contains the function
+    `function_name`.
+
+    LLVM ends the process if a file is damaged, so this function checks the file's tables first.
+    Only files in the ELF format are checked completely. In other formats the check only looks for
+    the name.
+    """
+    if not re.search(f"\0_?{function_name}\0".encode(), object_code):
+        raise ValueError(f"it has no function {function_name}")
+    if llvm.get_object_format() != "ELF" or sys.byteorder != "little":
+        return
+    if len(object_code) < ELF_HEADER_LAYOUT.size or not object_code.startswith(ELF_FILE_SIGNATURE):
+        raise ValueError("it is no object file")
+    *_, section_table_offset, _, _, _, _, section_entry_size, n_sections, name_section_index = (
+        ELF_HEADER_LAYOUT.unpack_from(object_code)
+    )
+    if (
+        section_entry_size != ELF_SECTION_LAYOUT.size
+        or section_table_offset + n_sections * section_entry_size > len(object_code)
+        or name_section_index >= n_sections
+    ):
+        raise ValueError("its table of sections is cut off")
+    elf_sections = [
+        ELF_SECTION_LAYOUT.unpack_from(object_code, section_table_offset + i * section_entry_size)
+        for i in range(n_sections)
+    ]
+    for _, section_type, _, _, section_offset, section_length, *_ in elf_sections:
+        if (
+            section_type != ElfSectionType.ELF_ZERO_FILLED_MEMORY
+            and section_offset + section_length > len(object_code)
+        ):
+            raise ValueError("a section is cut off")
+    if elf_sections[name_section_index][1] != ElfSectionType.ELF_STRING_TABLE:
+        raise ValueError("it has no table of names")
+
+
+class LoadedMachineCode:
+    """Machine code loaded into the memory of this process."""
+
+    def __init__(self, object_code: bytes) -> None:
+        self._llvm_engine = llvm.create_mcjit_compiler(
+            llvm.parse_assembly(""), _make_llvm_target_machine()
+        )
+        self._llvm_engine.add_object_file(llvm.ObjectFileRef.from_data(object_code))
+        self._llvm_engine.finalize_object()
+
+    def find_function_address(self, function_name: str) -> int:
+        """Return the memory address of a loaded function."""
+        return self._llvm_engine.get_function_address(function_name)
+
+
+def _make_llvm_target_machine() -> "llvm.TargetMachine":
+    """Return LLVM's target machine for this processor."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target_triple, processor_name, processor_features = describe_processor()
+    return llvm.Target.from_triple(target_triple).create_target_machine(
+        cpu=processor_name, features=processor_features, opt=LLVM_OPTIMIZATION_LEVEL, jit=True
+    )

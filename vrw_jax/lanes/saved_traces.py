@@ -1,0 +1,172 @@
+"""Traced functions saved next to JAX's compilation cache, so that later processes need not trace
+them.
+
+JAX's persistent cache avoids compilation but not tracing. To trace a limit cycle with derivatives
+takes longer than a scan of thousands of samples. If the persistent cache is on, its folder also
+contains traces. The key of a trace contains everything on which the trace depends, including the
+library's source code.
+"""
+
+import functools
+import hashlib
+from collections.abc import Callable
+from contextvars import ContextVar
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import export
+from jax.sharding import SingleDeviceSharding
+
+from vrw_jax.lanes import disk_cache as store
+from vrw_jax.lanes.ffi_primitive import MACHINE_CODE_PRIMITIVE
+from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
+from vrw_jax.lanes.machine import describe_processor
+from vrw_jax.lanes.program import is_machine_code_available, load_saved_machine_code
+from vrw_jax.lanes.settings import make_fusion_emitter_options
+
+
+def compile_exported_function(
+    traced_function: Callable,
+    example_arguments: tuple,
+    target_device: jax.Device,
+) -> Callable:
+    """Compile `traced_function` on `target_device` for the shapes of `example_arguments`.
+
+    The program is always compiled from the exported trace, whether it was loaded from disk or not.
+    All runs therefore compile the same program.
+    """
+    exported_trace = _load_or_export_trace(traced_function, example_arguments)
+    device_sharding = SingleDeviceSharding(target_device)
+    argument_shapes = [
+        jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device_sharding)
+        for x in exported_trace.in_avals
+    ]
+    compiled_program = (
+        jax.jit(exported_trace.call)
+        .lower(*argument_shapes)
+        .compile(make_fusion_emitter_options(False))
+    )
+    return lambda *arguments: compiled_program(*jax.tree.leaves(arguments))
+
+
+def wrap_with_saved_trace(
+    traced_function: Callable, find_key: Callable[..., str | None] | None = None
+) -> Callable:
+    """Return a function that calls `traced_function` through its saved trace.
+
+    If no trace exists yet, it is exported and saved. Without a cache folder, `traced_function` is
+    called directly. The returned function is called while a program is traced, and it must not be
+    mapped or differentiated. As with `compile_exported_function`, first and later runs use the
+    exported trace. `find_key` returns the key of the function and of further values.
+    """
+
+    def evaluate_saved_trace(*arguments: Any) -> Any:
+        if _is_exporting_trace.get() or not store.find_cache_folder():
+            return traced_function(*arguments)
+        return _load_or_export_trace(traced_function, arguments, find_key).call(
+            *jax.tree.leaves(arguments)
+        )
+
+    return evaluate_saved_trace
+
+
+_saved_programs: dict[str, Callable] = {}
+"""Functions compiled from their saved traces, by their keys."""
+
+
+def evaluate_by_saved_trace(traced_function: Callable, *arguments: Any) -> Any:
+    """Return `traced_function(*arguments)`, computed from the saved trace of the function.
+
+    Arguments that JAX traces call the function itself, which may then be mapped or differentiated.
+    The result consists of tuples, lists and dictionaries of arrays.
+    """
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
+        return traced_function(*arguments)
+    try:
+        program_key = make_key(traced_function, store.describe_trace_environment())
+    except UnresolvableFunctionError:
+        return jax.jit(traced_function)(*arguments)
+    if program_key not in _saved_programs:
+        _saved_programs[program_key] = jax.jit(wrap_with_saved_trace(traced_function))
+    return _saved_programs[program_key](*arguments)
+
+
+def _load_or_export_trace(
+    traced_function: Callable,
+    example_arguments: tuple,
+    find_key: Callable[..., str | None] | None = None,
+) -> export.Exported:
+    """Return the exported trace of a function, as a function of the flattened arguments.
+
+    The trace is loaded from disk if a record exists. Otherwise the function is traced for the
+    shapes of `example_arguments`.
+    """
+    argument_leaves, argument_structure = jax.tree.flatten(example_arguments)
+    argument_shapes = [
+        jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)) for x in argument_leaves
+    ]
+    # A trace calls the machine code of one processor, but several may share the folder.
+    platform_and_processor = (
+        jax.default_backend(),
+        describe_processor() if is_machine_code_available() else None,
+    )
+    try:
+        find_key = find_key or functools.partial(make_key, traced_function)
+        function_key = find_key(argument_structure)
+    except UnresolvableFunctionError:
+        function_key = None
+    trace_key_parts = (
+        function_key,
+        [(x.shape, x.dtype.name) for x in argument_shapes],
+        platform_and_processor,
+        store.describe_trace_environment(),
+    )
+    cache_record_name = f"vrw_trace_{hashlib.sha256(repr(trace_key_parts).encode()).hexdigest()}"
+    cache_record_content = store.load_cache_record(cache_record_name) if function_key else None
+    if cache_record_content is not None:
+        encoded_ffi_target_names, _, serialized_trace = cache_record_content.partition(b"\n")
+        try:
+            if load_saved_machine_code(encoded_ffi_target_names.decode().split()):
+                return export.deserialize(bytearray(serialized_trace))
+        except Exception:  # JAX documents no type of error for bytes that are no trace.
+            store.warn_of_unusable_cache_record(f"{cache_record_name} is no trace")
+    flattened_function = jax.jit(
+        lambda *argument_leaves: traced_function(
+            *jax.tree.unflatten(argument_structure, argument_leaves)
+        )
+    )
+    # Cached traces that are called inside become part of this trace.
+    export_flag_token = _is_exporting_trace.set(True)
+    try:
+        # The export below finds this trace in JAX's cache.
+        ffi_target_names = sorted(
+            _find_ffi_target_names(flattened_function.trace(*argument_shapes).jaxpr)
+        )
+        disabled_checks = list(map(export.DisabledSafetyCheck.custom_call, ffi_target_names))
+        exported_trace = export.export(flattened_function, disabled_checks=disabled_checks)(
+            *argument_shapes
+        )
+    finally:
+        _is_exporting_trace.reset(export_flag_token)
+    if function_key:
+        store.save_cache_record(
+            cache_record_name,
+            " ".join(ffi_target_names).encode() + b"\n" + bytes(exported_trace.serialize()),
+        )
+    return exported_trace
+
+
+def _find_ffi_target_names(jaxpr: Any) -> set[str]:
+    """Return the names of all machine-code functions that a traced program calls."""
+    ffi_target_names: set[str] = set()
+    for jaxpr_equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        if jaxpr_equation.primitive is MACHINE_CODE_PRIMITIVE:
+            ffi_target_names.add(jaxpr_equation.params["machine_code"].ffi_target_name)
+        for equation_parameter in jax.tree.leaves(list(jaxpr_equation.params.values())):
+            if hasattr(getattr(equation_parameter, "jaxpr", equation_parameter), "eqns"):
+                ffi_target_names |= _find_ffi_target_names(equation_parameter)
+    return ffi_target_names
+
+
+_is_exporting_trace: ContextVar[bool] = ContextVar("_exporting", default=False)

@@ -1,0 +1,913 @@
+"""Compute the effects of an event: the impact, and the contact modes of the subsequent motion.
+
+All functions work elementwise, for one wheel or a batch.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Int
+
+from vrw_jax.base.types import Elementwise
+from vrw_jax.lanes.batching import run_if_any_element_active, select_trees_by_condition
+from vrw_jax.models.contact_jvp import (
+    ContactConfiguration,
+    WheelForceSolution,
+    find_slot_contacts,
+    solve_contact_configuration,
+    solve_contact_forces,
+    solve_impact,
+)
+from vrw_jax.models.contact_mechanics import (
+    ContactInverseInertia,
+    ContactSlots,
+    FreeMotion,
+    Friction,
+    LegArray,
+    SlotArray,
+    WheelMotion,
+    align_with_batch,
+    compute_contact_foot_velocities,
+    compute_foot_heights,
+    compute_foot_velocities,
+    compute_free_acceleration,
+    compute_free_velocity,
+    compute_kinetic_energy,
+    compute_leg_directions,
+    find_contact_slots,
+    make_inverse_inertia,
+    select_slot_friction,
+    stop_gradients,
+)
+from vrw_jax.models.contact_modes import (
+    ALL_MODES_MASK,
+    MAX_VIOLATION,
+    PAPER_RULE_SENTINEL,
+    AllowedContactModes,
+    ChosenModeCombination,
+    ContactSignTolerances,
+    choose_combination,
+    is_release_consistent,
+)
+from vrw_jax.models.contact_state import ContactState, GuardLayout
+from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.params import Symbols
+
+
+class ContactEvent(NamedTuple):
+    """Kind of an event, as flags for legs and contact slots.
+
+    One flag of one leg or contact slot is True. `_merge_touching_contacts` may set further flags.
+    """
+
+    is_foot_landing: Bool[Array, "n_legs ..."]  # whether the foot meets the ground
+    is_leg_meeting_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
+    # whether the stopper force of a leg in the air vanishes
+    is_leg_leaving_stopper: Bool[Array, "n_legs ..."]
+    is_foot_lifting_off: Bool[Array, "2 ..."]  # whether the normal force on the foot vanishes
+    # whether the foot in the slot begins to slide uphill
+    is_starting_to_slide_up: Bool[Array, "2 ..."]
+    is_starting_to_slide_down: Bool[Array, "2 ..."]
+    is_stopping_to_slide: Bool[Array, "2 ..."]  # whether the foot in the slot stops sliding
+    # whether the stopper force of the slot's leg vanishes
+    is_releasing_stopper: Bool[Array, "2 ..."]
+
+    @property
+    def is_impact(self) -> Bool[Array, "..."]:
+        """Return whether velocities jump at the event."""
+        return jnp.any(self.is_foot_landing, axis=0) | jnp.any(self.is_leg_meeting_stopper, axis=0)
+
+
+def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> ContactEvent:
+    """Return the kind of the event at which the guard with the index `guard_index` is zero."""
+    n_legs = guard_layout.n_legs
+    select_flags = lambda first_guard_index, n_guards: (
+        guard_index == first_guard_index + align_with_batch(np.arange(n_guards), guard_index)
+    )
+    return ContactEvent(
+        is_foot_landing=select_flags(guard_layout.first_landing_guard, n_legs),
+        is_leg_meeting_stopper=select_flags(guard_layout.first_stopper_guard, n_legs),
+        is_leg_leaving_stopper=select_flags(guard_layout.first_airborne_release_guard, n_legs),
+        is_foot_lifting_off=select_flags(guard_layout.first_liftoff_guard, 2),
+        is_starting_to_slide_up=select_flags(guard_layout.first_slip_up_guard, 2),
+        is_starting_to_slide_down=select_flags(guard_layout.first_slip_down_guard, 2),
+        is_stopping_to_slide=select_flags(guard_layout.first_slip_end_guard, 2),
+        is_releasing_stopper=select_flags(guard_layout.first_stopper_release_guard, 2),
+    )
+
+
+class ContactLaw(NamedTuple):
+    """Parameters of wheel and ground, and options of the contact law, for all events in a walk."""
+
+    s: Symbols
+    # coefficient of all feet, or a pair for the foot that landed last and the others
+    friction: Friction
+    has_one_sided_stoppers: bool  # whether stoppers of legs in the air only push
+    counts_all_solutions: bool  # whether all admissible solutions are counted
+    rest_speed: Elementwise  # speed below which a contact is at rest after an impact, m/s
+    restitution: Elementwise | None = None  # Newton's coefficient of the feet
+    next_line_tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
+
+
+@dataclass(frozen=True)
+class StopperPivotOptions:
+    """Options of the search for the stoppers that hold legs in the air.
+
+    Few pivots suffice unless friction couples legs.
+    """
+
+    max_block_pivots: int = 8
+    """Number of pivots that switch all legs with a wrong sign."""
+    max_single_pivots: int = 16
+    """Number of later pivots that switch one leg each."""
+    max_enumerated_legs: int = 8
+    """Largest number of legs whose combinations are enumerated if pivoting fails."""
+
+
+STOPPER_PIVOT_OPTIONS = StopperPivotOptions()
+
+
+class _KinematicLevelSolution(NamedTuple):
+    """Solution in terms of velocities or accelerations, for an assumed set of closed stoppers.
+
+    The stoppers are those of legs in the air.
+    """
+
+    chosen_combination: ChosenModeCombination
+    force_solution: WheelForceSolution
+    stopper_forces: LegArray  # force or impulse of the stoppers, N or N s
+    outward_leg_motion: LegArray  # acceleration or rate of the leg lengths, m/s^2 or m/s
+    motion_after_impact: WheelMotion  # motion after the impact
+
+
+def _solve_stopper_lcp(
+    solve_kinematic_level: Callable[..., _KinematicLevelSolution],
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    is_at_stopper: Array,
+    is_stopper_tested: Array,
+    tolerances: ContactSignTolerances,
+) -> tuple[_KinematicLevelSolution, Array]:
+    """Return the solution with complementary stopper forces, and whether each stopper is closed.
+
+    The stopper of a tested leg is closed if it pushes. It is open if the leg moves inwards. The
+    first pivots switch all legs with a wrong sign together. Later pivots switch only the last of
+    these legs, which prevents cycles. The method is principal pivoting, which is finite if no
+    friction couples the legs (Murty 1974, Kostreva 1978).
+
+    - `solve_kinematic_level`: function that solves for velocities or accelerations, for an assumed
+      set of closed stoppers. Its arguments are the contact law, the motion, the flags of the closed
+      stoppers and, if it is known, the combination of contact modes, else None.
+
+    If stoppers are bilateral, all stoppers in `is_at_stopper` are closed and may pull.
+
+    If pivoting fails, all combinations are enumerated, and the solution with the smallest violation
+    is returned. This solution is admissible if its violation is at most `MAX_VIOLATION`.
+    """
+    if not contact_law.has_one_sided_stoppers:
+        return solve_kinematic_level(contact_law, motion, is_at_stopper, None), is_at_stopper
+    constant_inputs = stop_gradients((contact_law, motion))
+    tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
+    n_combinations = 1 << jnp.minimum(
+        jnp.sum(is_stopper_tested, axis=0, dtype=jnp.int32),
+        STOPPER_PIVOT_OPTIONS.max_enumerated_legs,
+    )
+    leg_index = align_with_batch(np.arange(len(is_at_stopper), dtype=np.int32), n_combinations)
+
+    def is_unfinished(pivot_state: tuple) -> Array:
+        _, combination_code, n_attempts, best_solution = pivot_state
+        return (n_attempts == 0) | ((best_solution[0] > 1.0) & (combination_code < n_combinations))
+
+    def pivot_legs(pivot_state: tuple) -> tuple:
+        is_stopper_holding, combination_code, n_attempts, best_solution = pivot_state
+        level_solution = solve_kinematic_level(
+            constant_inputs[0], constant_inputs[1], is_stopper_holding, None
+        )
+        sign_violation = jnp.where(
+            is_stopper_holding,
+            -level_solution.stopper_forces / tolerances.force_tolerance,
+            level_solution.outward_leg_motion / tolerances.motion_tolerance,
+        )
+        sign_violation = jnp.where(is_stopper_tested, lax.stop_gradient(sign_violation), 0.0)
+        has_wrong_sign = sign_violation > 1.0
+        max_violation = jnp.maximum(
+            jnp.max(sign_violation, axis=0), level_solution.chosen_combination.sign_violation
+        )
+        best_solution = select_trees_by_condition(
+            max_violation < best_solution[0],
+            (max_violation, is_stopper_holding, level_solution.chosen_combination),
+            best_solution,
+        )
+        is_last_wrong_leg = leg_index == jnp.max(jnp.where(has_wrong_sign, leg_index, -1), axis=0)
+        switched_legs = is_stopper_holding ^ jnp.where(
+            n_attempts < STOPPER_PIVOT_OPTIONS.max_block_pivots, has_wrong_sign, is_last_wrong_leg
+        )
+        is_pivoting = (
+            (combination_code < 0)
+            & jnp.any(has_wrong_sign, axis=0)
+            & (
+                n_attempts
+                < STOPPER_PIVOT_OPTIONS.max_block_pivots + STOPPER_PIVOT_OPTIONS.max_single_pivots
+            )
+        )
+        combination_code = jnp.where(is_pivoting, combination_code, combination_code + 1)
+        enumerated_legs = jnp.where(
+            is_stopper_tested, ((combination_code >> tested_leg_rank) & 1) == 1, is_at_stopper
+        )
+        return select_trees_by_condition(
+            is_unfinished(pivot_state),
+            (
+                jnp.where(is_pivoting, switched_legs, enumerated_legs),
+                combination_code,
+                n_attempts + 1,
+                best_solution,
+            ),
+            pivot_state,
+        )
+
+    int_zeros = jnp.zeros_like(n_combinations)
+    slot_zeros = jnp.stack([n_combinations, n_combinations]) * 0
+    infinite_sign_violation = jnp.full_like(constant_inputs[1].theta, jnp.inf)
+    initial_state = (
+        is_at_stopper,
+        int_zeros - 1,
+        int_zeros,
+        (
+            infinite_sign_violation,
+            is_at_stopper,
+            ChosenModeCombination(slot_zeros, slot_zeros > 0, infinite_sign_violation, int_zeros),
+        ),
+    )
+    final_state = lax.while_loop(
+        lambda pivot_state: jnp.any(is_unfinished(pivot_state)), pivot_legs, initial_state
+    )
+    max_violation, is_stopper_holding, chosen_combination = final_state[3]
+    chosen_combination = chosen_combination._replace(
+        n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
+    )
+    return solve_kinematic_level(
+        contact_law, motion, is_stopper_holding, chosen_combination
+    ), is_stopper_holding
+
+
+class ContactEventResult(NamedTuple):
+    """Motion and contact state after an event, with impulses and lost energy."""
+
+    motion: WheelMotion
+    contact_state: ContactState
+    impact_energy_loss: Elementwise  # J
+    normal_impulse: SlotArray  # impulses on the feet in the contact slots, N s
+    tangential_impulse: SlotArray
+    stopper_impulse: Elementwise  # minimum over airborne locked legs, N s; inf without impact
+    n_solutions: Int[Array, "..."]  # number of admissible combinations: minimum of both levels
+    is_painleve_paradox: Bool[Array, "..."]  # whether no forces can continue the motion
+    max_n_solutions: Int[Array, "..."]
+    has_third_foot: Bool[Array, "..."]  # whether a third foot would have to be loaded
+
+
+def _apply_impact_velocities(
+    motion: WheelMotion, force_solution: WheelForceSolution
+) -> WheelMotion:
+    """Return the motion with the velocities after an impact."""
+    vx, vz, dtheta = force_solution.hub_motion
+    return motion._replace(vx=vx, vz=vz, dtheta=dtheta, dL=force_solution.length_motion)
+
+
+def _apply_restitution(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_slots: ContactSlots,
+    inverse_inertia: ContactInverseInertia,
+    free_motion: FreeMotion,
+) -> FreeMotion:
+    """Return the velocities without impulses, corrected for the rebound of striking feet.
+
+    The rebound speeds follow from Newton's law of restitution.
+    """
+    if contact_law.restitution is None:
+        return free_motion
+    rebound_speeds = (
+        contact_law.restitution
+        * compute_contact_foot_velocities(
+            motion, inverse_inertia.leg_directions, contact_slots
+        ).normal_to_slope
+    )
+    # A foot whose rebound is slower than the rest speed is at rest.
+    rebound_speeds = jnp.where(rebound_speeds < -contact_law.rest_speed, rebound_speeds, 0.0)
+    return free_motion._replace(
+        foot_transverse_motion=free_motion.foot_transverse_motion
+        - inverse_inertia.sin * rebound_speeds,
+        foot_radial_motion=free_motion.foot_radial_motion + inverse_inertia.cos * rebound_speeds,
+    )
+
+
+def _limit_energy_gain(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    newton_solution: _KinematicLevelSolution,
+    inelastic_solution: _KinematicLevelSolution,
+) -> _KinematicLevelSolution:
+    """Return the impact with the largest part of Newton's rebound that adds no energy.
+
+    With Coulomb friction, Newton's law of restitution can increase the energy (Kane 1984). The
+    inelastic impact never increases the energy. The result is on the straight line from the
+    inelastic impact to Newton's impact, on which the energy is a quadratic function. Impulses stay
+    in the friction cone, because the cone is convex.
+    """
+    compute_energy = lambda motion_state: compute_kinetic_energy(contact_law.s, motion_state)
+    energy_inelastic = compute_energy(inelastic_solution.motion_after_impact)
+    energy_newton = compute_energy(newton_solution.motion_after_impact)
+    energy_midpoint = compute_energy(
+        jax.tree.map(
+            lambda a, b: 0.5 * (a + b),
+            inelastic_solution.motion_after_impact,
+            newton_solution.motion_after_impact,
+        )
+    )
+    parabola_curvature = 2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_newton)
+    parabola_linear_term = 4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_newton
+    allowed_energy_gain = jnp.maximum(compute_energy(motion) - energy_inelastic, 0.0)
+    has_energy_gain = energy_newton > compute_energy(motion)
+    sqrt_discriminant = jnp.sqrt(
+        jnp.where(
+            has_energy_gain,
+            parabola_linear_term * parabola_linear_term
+            + 4.0 * parabola_curvature * allowed_energy_gain,
+            1.0,
+        )
+    )
+    rebound_fraction = jnp.where(
+        has_energy_gain,
+        2.0
+        * allowed_energy_gain
+        / jnp.where(has_energy_gain, parabola_linear_term + sqrt_discriminant, 1.0),
+        1.0,
+    )
+    interpolate_rebound = lambda a, b: jnp.where(has_energy_gain, a + rebound_fraction * (b - a), b)
+    return _KinematicLevelSolution(
+        newton_solution.chosen_combination,
+        *jax.tree.map(interpolate_rebound, inelastic_solution[1:], newton_solution[1:]),
+    )
+
+
+def _solve_velocity_level(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> tuple[_KinematicLevelSolution, ContactSlots, Bool[Array, "n ..."]]:
+    """Return the solution of an impact in which all contacts strike at once.
+
+    Coulomb's law applies to impulses. The result is (solution, contact slots, whether each leg in
+    the air is held by its stopper). A one-sided stopper holds a leg only if it does not have to
+    pull. By the rule of the paper, resting feet stay at rest when a leg reaches its stopper.
+    """
+    s = contact_law.s
+    contact_slots = find_contact_slots(
+        (contact_state.contact_modes != ContactMode.OFF) | contact_event.is_foot_landing
+    )
+    friction = select_slot_friction(contact_law.friction, contact_slots)
+    is_at_stopper = contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper
+    is_loaded = jnp.any(contact_slots.slot_masks, axis=1)
+    is_slot_locked = contact_slots.gather_flags_from_legs(is_at_stopper)
+    slot_modes = contact_slots.gather_from_legs(contact_state.contact_modes)
+    is_landing = jnp.any(contact_event.is_foot_landing, axis=0)
+    is_kept_at_rest = (
+        (slot_modes == ContactMode.STICK) & ~is_landing & (friction == PAPER_RULE_SENTINEL)
+    )
+    allowed_slot_modes = jnp.where(is_loaded, ALL_MODES_MASK, 1 << ContactMode.OFF).astype(
+        jnp.int32
+    )
+    allowed_slot_modes = jnp.where(is_kept_at_rest, 1 << slot_modes, allowed_slot_modes)
+    allowed_contact_modes = AllowedContactModes(
+        allowed_slot_modes=jnp.where(
+            contact_event.is_impact, allowed_slot_modes, 0
+        ),  # Without an impact, no mode is examined.
+        can_hold_stopper=is_slot_locked,
+        is_foot_mode_fixed=is_kept_at_rest,
+        untested_slot_modes=jnp.where(is_loaded, 0, 1 << ContactMode.OFF).astype(jnp.int32),
+        is_open_stopper_untested=~is_slot_locked,
+    )
+    tolerances = ContactSignTolerances(
+        s.m * contact_law.rest_speed / MAX_VIOLATION, contact_law.rest_speed / MAX_VIOLATION
+    )
+
+    def solve_kinematic_level(
+        contact_law: ContactLaw,
+        motion: WheelMotion,
+        is_airborne_leg_locked: Array,
+        chosen_combination: ChosenModeCombination | None,
+    ) -> _KinematicLevelSolution:
+        s, friction = contact_law.s, select_slot_friction(contact_law.friction, contact_slots)
+        leg_directions = compute_leg_directions(s, motion.theta)
+        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked)
+        free_motion = compute_free_velocity(s, motion, contact_slots, inverse_inertia)
+        rebound_motion = _apply_restitution(
+            contact_law, motion, contact_slots, inverse_inertia, free_motion
+        )
+        if chosen_combination is None:
+            chosen_combination = choose_combination(
+                s,
+                inverse_inertia,
+                rebound_motion,
+                allowed_contact_modes,
+                friction,
+                tolerances,
+                contact_law.counts_all_solutions,
+            )
+        contact_configuration = ContactConfiguration(
+            s,
+            motion,
+            friction,
+            contact_slots,
+            *chosen_combination[:2],
+            is_airborne_leg_locked,
+        )
+        force_solution = (
+            solve_impact(contact_configuration)
+            if contact_law.restitution is None
+            else solve_contact_configuration(contact_configuration, inverse_inertia, rebound_motion)
+        )
+        motion_after = _apply_impact_velocities(motion, force_solution)
+        hub_velocity_jump_x, hub_velocity_jump_z = (
+            motion_after.vx - motion.vx,
+            motion_after.vz - motion.vz,
+        )
+        contact_impulse = s.m * (
+            leg_directions.sin * hub_velocity_jump_x
+            + leg_directions.cos * hub_velocity_jump_z
+            + motion.dL
+        )
+        return _KinematicLevelSolution(
+            chosen_combination, force_solution, contact_impulse, motion_after.dL, motion_after
+        )
+
+    is_airborne_leg_locked = is_at_stopper & ~contact_slots.is_in_slot
+    is_stopper_tested = is_airborne_leg_locked & contact_event.is_impact
+    level_solution, is_held_airborne = _solve_stopper_lcp(
+        solve_kinematic_level,
+        contact_law,
+        motion,
+        is_airborne_leg_locked,
+        is_stopper_tested,
+        tolerances,
+    )
+    return level_solution, contact_slots, is_held_airborne
+
+
+def _list_modes_after_event(
+    contact_event: ContactEvent, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
+) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
+    """Return the contact modes that may follow an event, and the modes that need no test.
+
+    The result contains two sets of modes for each contact slot, with one bit per mode.
+
+    - `slot_modes`: contact mode of the foot in each contact slot before the event;
+    - `is_consistent`: whether the released foot moves in the release direction (see
+      `is_release_consistent`);
+    - `follows_paper_rule`: whether the rule of the paper applies to infinite friction.
+    """
+    current_mode_bit, off_mode_bit = 1 << slot_modes, 1 << ContactMode.OFF
+    possible_modes = jnp.where(
+        slot_modes == ContactMode.STICK, ALL_MODES_MASK, current_mode_bit | off_mode_bit
+    )
+    reversed_mode_bit = jnp.where(
+        slot_modes == ContactMode.SLIP_DOWN, 1 << ContactMode.SLIP_UP, 1 << ContactMode.SLIP_DOWN
+    )
+    possible_modes = jnp.where(
+        contact_event.is_stopping_to_slide,
+        1 << ContactMode.STICK | off_mode_bit | reversed_mode_bit,
+        possible_modes,
+    )
+    untested_modes = jnp.where(
+        (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide, 0, current_mode_bit
+    )
+    for event_flags, following_mode, ended_mode in (
+        (contact_event.is_foot_lifting_off, off_mode_bit, current_mode_bit),
+        (contact_event.is_starting_to_slide_up, 1 << ContactMode.SLIP_UP, 1 << ContactMode.STICK),
+        (
+            contact_event.is_starting_to_slide_down,
+            1 << ContactMode.SLIP_DOWN,
+            1 << ContactMode.STICK,
+        ),
+    ):
+        tested_mode_bits = (
+            ALL_MODES_MASK
+            & ~ended_mode
+            & jnp.where(is_consistent | follows_paper_rule, ALL_MODES_MASK, ~following_mode)
+        )
+        possible_modes = jnp.where(
+            event_flags, jnp.where(is_consistent, following_mode, tested_mode_bits), possible_modes
+        )
+        untested_modes = jnp.where(
+            event_flags, jnp.where(is_consistent, following_mode, 0), untested_modes
+        )
+    return possible_modes, untested_modes
+
+
+FORCE_ROUNDOFF_FRACTION = 1e-9
+"""Fraction of the wheel's weight below which a force is treated as zero.
+
+The same fraction of gravity applies to accelerations. The value is chosen because forces are
+accurate to round-off.
+"""
+
+
+def _solve_acceleration_level(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_modes: Int[Array, "n ..."],
+    is_at_stopper: Array,
+    contact_event: ContactEvent,
+) -> tuple[ChosenModeCombination, ContactSlots, Array, Bool[Array, "n ..."]]:
+    """Return the contact modes and stoppers for the motion after an event.
+
+    The accelerations determine modes and stoppers. The result is (combination, contact slots,
+    whether each foot was at rest, whether each leg in the air is held by its stopper), without
+    derivatives.
+
+    The contact that the event has ended is not tested again, because its force is zero within
+    round-off. Its new mode is the mode of its release if that mode is consistent (see
+    `is_release_consistent`).
+    """
+    contact_law, motion = stop_gradients((contact_law, motion))
+    s = contact_law.s
+    friction, contact_slots, slot_modes, is_slot_locked, is_airborne_leg_locked = (
+        find_slot_contacts(contact_law.friction, contact_modes, is_at_stopper)
+    )
+    was_resting = (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide
+    # When such a foot is released, its tangential force jumps to zero.
+    follows_paper_rule = (slot_modes == ContactMode.STICK) & (friction == PAPER_RULE_SENTINEL)
+    is_starting_to_slide_up = contact_event.is_starting_to_slide_up
+    is_starting_to_slide_down = contact_event.is_starting_to_slide_down
+    is_released = (
+        contact_event.is_foot_lifting_off | is_starting_to_slide_up | is_starting_to_slide_down
+    )
+    is_in_any_slot = lambda event_flags: jnp.any(event_flags, axis=0).astype(jnp.int32)
+    release_direction = is_in_any_slot(is_starting_to_slide_down) - is_in_any_slot(
+        is_starting_to_slide_up
+    )
+    may_leave_stopper = ~is_slot_locked | contact_event.is_releasing_stopper
+    tolerances = ContactSignTolerances(
+        FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g
+    )
+
+    def solve_kinematic_level(
+        contact_law: ContactLaw,
+        motion: WheelMotion,
+        is_airborne_leg_locked: Array,
+        chosen_combination: ChosenModeCombination | None,
+    ) -> _KinematicLevelSolution:
+        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked)
+        free_motion = compute_free_acceleration(s, motion, contact_slots, inverse_inertia)
+        if chosen_combination is None:
+            is_consistent = is_release_consistent(
+                s,
+                inverse_inertia,
+                free_motion,
+                (slot_modes, is_slot_locked),
+                friction,
+                is_released,
+                release_direction,
+            )
+            possible_modes, untested_slot_modes = _list_modes_after_event(
+                contact_event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
+            )
+            allowed_contact_modes = AllowedContactModes(
+                possible_modes,
+                ~may_leave_stopper,
+                was_resting & False,
+                untested_slot_modes,
+                may_leave_stopper,
+            )
+            chosen_combination = choose_combination(
+                s,
+                inverse_inertia,
+                free_motion,
+                allowed_contact_modes,
+                friction,
+                tolerances,
+                contact_law.counts_all_solutions,
+            )
+        contact_configuration = ContactConfiguration(
+            s,
+            motion,
+            friction,
+            contact_slots,
+            *chosen_combination[:2],
+            is_airborne_leg_locked,
+        )
+        force_solution = solve_contact_configuration(
+            contact_configuration, inverse_inertia, free_motion
+        )
+        hub_acceleration_x, hub_acceleration_z, _ = force_solution.hub_motion
+        outward_leg_motion = (
+            free_motion.leg_motion
+            + inverse_inertia.leg_directions.sin * hub_acceleration_x
+            + inverse_inertia.leg_directions.cos * hub_acceleration_z
+        )
+        return _KinematicLevelSolution(
+            chosen_combination, force_solution, s.m * outward_leg_motion, outward_leg_motion, motion
+        )
+
+    level_solution, is_held_airborne = _solve_stopper_lcp(
+        solve_kinematic_level,
+        contact_law,
+        motion,
+        is_airborne_leg_locked,
+        is_airborne_leg_locked,
+        tolerances,
+    )
+    return level_solution.chosen_combination, contact_slots, was_resting, is_held_airborne
+
+
+def _bring_slow_contacts_to_rest(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_slots: ContactSlots,
+    contact_modes: Array,
+    is_at_stopper: Array,
+    was_at_stopper: Array,
+) -> tuple[WheelMotion, Array, Array]:
+    """Return the motion after an impact with slow contacts at rest, and the new modes and stoppers.
+
+    The modes are those of the touching feet. A contact slower than `ContactLaw.rest_speed` after
+    the impact is brought to rest. Otherwise its bounces would be too small to resolve, and their
+    number would be unlimited. The forces then determine the contacts in the subsequent motion.
+
+    - `contact_modes`: contact mode of each foot after the impact;
+    - `is_at_stopper`, `was_at_stopper`: whether each leg is on its stopper after and before the
+      impact.
+    """
+    leg_directions = compute_leg_directions(contact_law.s, motion.theta)
+    tangential_speed, normal_speed = compute_foot_velocities(motion, leg_directions)
+    stays_in_contact = contact_slots.is_in_slot & (normal_speed < contact_law.rest_speed)
+    mode_against_slip = jnp.where(
+        tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP
+    )
+    modes_after_rest = jnp.where(
+        jnp.abs(tangential_speed) < contact_law.rest_speed, ContactMode.STICK, mode_against_slip
+    )
+    modes_after_rest = jnp.where(
+        stays_in_contact,
+        jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, modes_after_rest),
+        ContactMode.OFF,
+    )
+    is_leg_locked = is_at_stopper | (was_at_stopper & (jnp.abs(motion.dL) < contact_law.rest_speed))
+    has_contact_changed = jnp.any(
+        (modes_after_rest != contact_modes) | (is_leg_locked != is_at_stopper), axis=0
+    )
+    s, frozen_motion, friction = stop_gradients((contact_law.s, motion, contact_law.friction))
+
+    def find_reversed_slip(_: Array) -> Array:
+        """Return whether the projection reverses the slip of each foot.
+
+        A foot with reversed slip also comes to rest.
+        """
+        slip_speed_after, _ = compute_foot_velocities(
+            project_motion(s, frozen_motion, modes_after_rest, is_leg_locked, friction),
+            leg_directions,
+        )
+        return ((modes_after_rest == ContactMode.SLIP_DOWN) & (slip_speed_after < 0.0)) | (
+            (modes_after_rest == ContactMode.SLIP_UP) & (slip_speed_after > 0.0)
+        )
+
+    is_slip_reversed = has_contact_changed & run_if_any_element_active(
+        jnp.any(has_contact_changed), find_reversed_slip, is_leg_locked & False
+    )
+    modes_after_rest = jnp.where(is_slip_reversed, ContactMode.STICK, modes_after_rest)
+    return (
+        select_trees_by_condition(
+            has_contact_changed,
+            project_motion(
+                contact_law.s, motion, modes_after_rest, is_leg_locked, contact_law.friction
+            ),
+            motion,
+        ),
+        modes_after_rest,
+        is_leg_locked,
+    )
+
+
+def _merge_touching_contacts(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> ContactEvent:
+    """Return the event extended by all other contacts that touch.
+
+    A contact touches if its distance is below the smallest resolved bounce and it does not
+    separate. If such contacts were resolved one after another, each impact would cause the next one
+    without end.
+    """
+    s, leg_directions = contact_law.s, compute_leg_directions(contact_law.s, motion.theta)
+    bounce_height = contact_law.rest_speed**2 / (2.0 * s.g)
+    foot_heights = compute_foot_heights(motion, leg_directions, contact_law.next_line_tilt)
+    is_touching = (foot_heights <= bounce_height) & (
+        compute_foot_velocities(motion, leg_directions).normal_to_slope <= contact_law.rest_speed
+    )
+    is_foot_landing = contact_event.is_foot_landing | (
+        is_touching & (contact_state.contact_modes == ContactMode.OFF) & contact_event.is_impact
+    )
+    fits_two_slots = (
+        jnp.sum(
+            is_foot_landing | (contact_state.contact_modes != ContactMode.OFF),
+            axis=0,
+            dtype=jnp.int32,
+        )
+        <= 2
+    )
+    has_more_contacts = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -contact_law.rest_speed)
+    is_leg_meeting_stopper = contact_event.is_leg_meeting_stopper | (
+        has_more_contacts & ~contact_state.is_leg_locked & contact_event.is_impact
+    )
+    return contact_event._replace(
+        is_foot_landing=jnp.where(fits_two_slots, is_foot_landing, contact_event.is_foot_landing),
+        is_leg_meeting_stopper=is_leg_meeting_stopper,
+    )
+
+
+def _replace_liftoff_by_slip(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> ContactEvent:
+    """Return the event with lift-off replaced by sliding, in the limit of large friction.
+
+    A resting foot whose normal force vanishes begins to slide against the direction of its
+    tangential force.
+    """
+    contact_law, motion = stop_gradients((contact_law, motion))
+    contact_configuration = ContactConfiguration(
+        contact_law.s, motion, *find_slot_contacts(contact_law.friction, *contact_state[:2])
+    )
+    is_starting_to_slide = (
+        contact_event.is_foot_lifting_off
+        & (contact_configuration.slot_modes == ContactMode.STICK)
+        & (contact_configuration.friction == jnp.inf)
+    )
+    is_force_uphill = (
+        run_if_any_element_active(
+            jnp.any(is_starting_to_slide),
+            lambda _: solve_contact_forces(contact_configuration).tangential_forces,
+            jnp.zeros_like(contact_configuration.friction),
+        )
+        > 0.0
+    )
+    return contact_event._replace(
+        is_foot_lifting_off=contact_event.is_foot_lifting_off & ~is_starting_to_slide,
+        is_starting_to_slide_up=contact_event.is_starting_to_slide_up
+        | (is_starting_to_slide & is_force_uphill),
+        is_starting_to_slide_down=contact_event.is_starting_to_slide_down
+        | (is_starting_to_slide & ~is_force_uphill),
+    )
+
+
+def resolve_event(
+    contact_law: ContactLaw,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> ContactEventResult:
+    """Return motion and contact state after an event, with the impulses and the lost energy."""
+    contact_event = _merge_touching_contacts(
+        contact_law,
+        motion,
+        contact_state,
+        _replace_liftoff_by_slip(contact_law, motion, contact_state, contact_event),
+    )
+    s, is_impact = contact_law.s, contact_event.is_impact
+    was_touching = (contact_state.contact_modes != ContactMode.OFF) | contact_event.is_foot_landing
+    was_at_stopper = (
+        contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper
+    ) & ~contact_event.is_leg_leaving_stopper
+    velocity_solution, contact_slots, is_stopper_holding = _solve_velocity_level(
+        contact_law, motion, contact_state, contact_event
+    )
+    if contact_law.restitution is not None:
+        inelastic_solution = _solve_velocity_level(
+            contact_law._replace(restitution=None), motion, contact_state, contact_event
+        )[0]
+        velocity_solution = _limit_energy_gain(
+            contact_law, motion, velocity_solution, inelastic_solution
+        )
+    impact_modes = contact_slots.scatter_to_legs(
+        velocity_solution.chosen_combination.slot_modes
+    ).astype(jnp.int32)
+    stays_at_stopper = jnp.where(
+        contact_slots.is_in_slot,
+        contact_slots.scatter_to_legs(velocity_solution.chosen_combination.is_stopper_holding) > 0,
+        was_at_stopper & is_stopper_holding,
+    )
+    if contact_law.restitution is not None:  # Only a part of the impulse may act.
+        stays_at_stopper = stays_at_stopper & (
+            jnp.abs(velocity_solution.motion_after_impact.dL) < contact_law.rest_speed
+        )
+    slow_contact_result = _bring_slow_contacts_to_rest(
+        contact_law,
+        velocity_solution.motion_after_impact,
+        contact_slots,
+        impact_modes,
+        stays_at_stopper,
+        was_at_stopper,
+    )
+    motion_after, contact_modes, is_at_stopper = select_trees_by_condition(
+        is_impact, slow_contact_result, (motion, contact_state.contact_modes, was_at_stopper)
+    )
+    leg_directions = compute_leg_directions(s, motion.theta)
+    is_without_slot = was_touching & ~contact_slots.is_in_slot
+    impact_energy_loss = compute_kinetic_energy(s, motion) - compute_kinetic_energy(s, motion_after)
+    stopper_impulse = jnp.where(is_stopper_holding, velocity_solution.stopper_forces, jnp.inf)
+
+    acceleration_solution, contact_slots, was_resting, is_stopper_holding = (
+        _solve_acceleration_level(
+            contact_law, motion_after, contact_modes, is_at_stopper, contact_event
+        )
+    )
+    contact_modes = contact_slots.scatter_to_legs(acceleration_solution.slot_modes).astype(
+        jnp.int32
+    )
+    is_leg_locked = jnp.where(
+        contact_slots.is_in_slot,
+        contact_slots.scatter_to_legs(acceleration_solution.is_stopper_holding) > 0,
+        is_at_stopper & is_stopper_holding,
+    )
+    is_sliding = (acceleration_solution.slot_modes == ContactMode.SLIP_DOWN) | (
+        acceleration_solution.slot_modes == ContactMode.SLIP_UP
+    )
+    contact_state = ContactState(
+        contact_modes=contact_modes,
+        is_leg_locked=is_leg_locked,
+        has_just_lifted=was_touching & (contact_modes == ContactMode.OFF),
+        has_just_unlocked=(contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper)
+        & ~is_leg_locked,
+        has_just_slid=contact_slots.scatter_to_legs(is_sliding & was_resting) > 0,
+    )
+    n_impact_solutions = velocity_solution.chosen_combination.n_solutions
+    n_force_solutions = acceleration_solution.n_solutions
+    zero_without_impact = lambda slot_impulses: jnp.where(is_impact, slot_impulses, 0.0)
+    return ContactEventResult(
+        motion=motion_after._replace(
+            L=jnp.where(is_leg_locked, s.L0, motion_after.L),
+            dL=jnp.where(is_leg_locked, 0.0, motion_after.dL),
+        ),
+        contact_state=contact_state,
+        impact_energy_loss=jnp.where(is_impact, impact_energy_loss, 0.0),
+        normal_impulse=zero_without_impact(velocity_solution.force_solution.normal_forces),
+        tangential_impulse=zero_without_impact(velocity_solution.force_solution.tangential_forces),
+        stopper_impulse=jnp.where(is_impact, jnp.min(stopper_impulse, axis=0), jnp.inf),
+        n_solutions=jnp.where(
+            is_impact, jnp.minimum(n_impact_solutions, n_force_solutions), n_force_solutions
+        ),
+        is_painleve_paradox=(n_force_solutions == 0) & ((n_impact_solutions > 0) | ~is_impact),
+        max_n_solutions=jnp.where(
+            is_impact, jnp.maximum(n_impact_solutions, n_force_solutions), n_force_solutions
+        ),
+        has_third_foot=jnp.any(
+            is_without_slot
+            & (compute_foot_velocities(motion_after, leg_directions).normal_to_slope < 0.0),
+            axis=0,
+        )
+        & is_impact,
+    )
+
+
+def project_motion(
+    s: Symbols,
+    motion: WheelMotion,
+    contact_modes: Int[Array, "n ..."],
+    is_leg_locked: Bool[Array, "n ..."],
+    friction: Friction | float = 0.0,
+) -> WheelMotion:
+    """Return the motion projected onto the constraints of its contacts.
+
+    After the projection, loaded feet are on the slope and sticking feet are at rest. Bilateral
+    impulses without friction project the velocities. A motion that satisfies the constraints is
+    returned unchanged within round-off.
+
+    - `friction`: friction coefficient for sliding feet in the projection.
+    """
+    leg_directions = compute_leg_directions(s, motion.theta)
+    L = jnp.where(
+        (contact_modes != ContactMode.OFF) & ~is_leg_locked, motion.z / leg_directions.cos, motion.L
+    )
+    motion = motion._replace(L=jnp.where(is_leg_locked, s.L0, L))
+    contact_configuration = ContactConfiguration(
+        s, motion, *find_slot_contacts(friction, contact_modes, is_leg_locked)
+    )
+    is_sticking = contact_configuration.slot_modes == ContactMode.STICK
+    is_first_held, is_second_held = contact_configuration.is_stopper_holding
+    # Two resting feet on two held legs would constrain the hub twice.
+    is_overdetermined = jnp.all(is_sticking & contact_configuration.is_stopper_holding, axis=0)
+    contact_configuration = contact_configuration._replace(
+        is_stopper_holding=jnp.stack([is_first_held, is_second_held & ~is_overdetermined])
+    )
+    projected_motion = _apply_impact_velocities(motion, solve_impact(contact_configuration))
+    return projected_motion._replace(dL=jnp.where(is_leg_locked, 0.0, projected_motion.dL))

@@ -1,0 +1,614 @@
+"""Dynamics of the wheel between two events, and the guards that detect the next event.
+
+A *contact state* consists of the contact modes of all feet and the stopper flags of all legs. The
+contact state is constant between two events.
+"""
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.base.types import Elementwise, Scalar
+from vrw_jax.models.contact_jvp import (
+    ContactConfiguration,
+    WheelForceSolution,
+    compute_slip_signs,
+    find_slot_contacts,
+    solve_contact_forces,
+)
+from vrw_jax.models.contact_mechanics import (
+    ContactSlots,
+    Friction,
+    LegArray,
+    PlaneVelocities,
+    SlotArray,
+    WheelMotion,
+    align_with_batch,
+    compute_contact_foot_velocities,
+    compute_foot_heights,
+    compute_free_leg_acceleration,
+    compute_leg_directions,
+    make_opaque_one,
+    prevent_fusion,
+    stop_gradients,
+    sum_over_legs,
+)
+from vrw_jax.models.contact_modes import replace_infinite_friction
+from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.rest import are_coordinates_at_rest, are_rates_negligible
+from vrw_jax.wheel.units import compute_wheel_units
+
+PackedState = Float[Array, "dim ..."]
+"""Motion and loss accumulators as one vector of 10 + 2 n entries.
+
+The entries are the hub coordinates (x, z, theta), their rates, the leg lengths, their rates, and
+the `EnergyLossAccumulators`.
+"""
+
+
+class EnergyLossAccumulators(NamedTuple):
+    """Time, energy losses and slip since the last event, integrated together with the motion."""
+
+    time_since_event: Scalar  # time since the last event, s
+    damping_loss: Scalar  # energy lost in the dampers, J
+    friction_loss: Scalar  # energy lost by sliding, J
+    slip_length: Scalar  # path length of all sliding feet, m
+
+
+def pack_state(motion: WheelMotion, accumulators: EnergyLossAccumulators) -> PackedState:
+    """Return the motion and the loss accumulators as one vector of 10 + 2 n entries."""
+    return jnp.concatenate([jnp.stack(motion[:6]), motion.L, motion.dL, jnp.stack(accumulators)])
+
+
+def unpack_state(packed_state: PackedState) -> tuple[WheelMotion, EnergyLossAccumulators]:
+    """Return the motion and the loss accumulators in a packed state.
+
+    The function is the inverse of `pack_state`.
+    """
+    n_legs = (packed_state.shape[0] - 10) // 2
+    x, z, theta, vx, vz, dtheta = packed_state[:6]
+    L, dL = packed_state[6 : 6 + n_legs], packed_state[6 + n_legs : 6 + 2 * n_legs]
+    motion = WheelMotion(x, z, theta, vx, vz, dtheta, L, dL)
+    return motion, EnergyLossAccumulators(*packed_state[6 + 2 * n_legs :])
+
+
+class ContactState(NamedTuple):
+    """Contact modes of the feet, stopper flags of the legs, and their changes at the last event."""
+
+    contact_modes: Int[Array, " n_legs"]  # `ContactMode` of every foot
+    is_leg_locked: Bool[Array, " n_legs"]  # whether a leg is on its stopper
+    has_just_lifted: Bool[Array, " n_legs"]  # whether a foot has left the ground at the last event
+    has_just_unlocked: Bool[Array, " n_legs"]  # whether a leg has left its stopper then
+    has_just_slid: Bool[Array, " n_legs"]  # whether a foot at rest has begun to slide then
+    # sign of each of the `NormalForceRates` in this state; None if force peaks are not measured
+    force_rate_signs: Array | None = None
+
+    @classmethod
+    def without_recent_changes(cls, contact_modes: Array, is_leg_locked: Array) -> "ContactState":
+        """Return the contact state without changes at the last event, and without signs."""
+        no_leg_flags = is_leg_locked & False
+        return cls(contact_modes, is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags)
+
+
+class ContactModeDynamics(NamedTuple):
+    """Parameters and contact state that determine the dynamics of the wheel between two events."""
+
+    s: Symbols
+    friction: SlotArray  # friction coefficient of the feet in the contact slots
+    contact_slots: ContactSlots
+    slot_modes: Int[Array, "2"]  # `ContactMode` of the foot in each contact slot
+    is_stopper_holding: Bool[Array, "2"]  # whether the leg in each contact slot is on its stopper
+    is_airborne_leg_locked: Bool[Array, " n_legs"]  # whether a leg is in the air on its stopper
+    has_one_sided_stoppers: bool  # whether legs in the air may leave their stoppers
+    contact_state: ContactState
+    has_accumulators: bool  # whether a batch integrates the accumulators
+    tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
+
+    @property
+    def measures_force_peaks(self) -> bool:
+        """Return whether guards detect the extrema of normal forces."""
+        return self.contact_state.force_rate_signs is not None
+
+    @property
+    def guard_layout(self) -> "GuardLayout":
+        """Return the positions of the guards in the result of `evaluate_guards`."""
+        return make_guard_layout(self.s.n, self.has_one_sided_stoppers, self.measures_force_peaks)
+
+    def configure_contacts(self, motion: WheelMotion) -> ContactConfiguration:
+        """Return the contact configuration for this motion, from which the forces are computed."""
+        return ContactConfiguration(
+            self.s,
+            motion,
+            self.friction,
+            self.contact_slots,
+            self.slot_modes,
+            self.is_stopper_holding,
+            self.is_airborne_leg_locked,
+        )
+
+
+def make_contact_mode_dynamics(
+    s: Symbols,
+    friction: Friction,
+    has_one_sided_stoppers: bool,
+    contact_state: ContactState,
+    has_accumulators: bool = False,
+    tilt: Elementwise | None = None,
+) -> ContactModeDynamics:
+    """Return the dynamics of the wheel in the contact state `contact_state`.
+
+    - `friction`: friction coefficient for all feet, or a pair for the foot that landed last and for
+      all other feet;
+    - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers;
+    - `has_accumulators`: whether losses and slip are integrated together with the motion;
+    - `tilt`: angle by which the next straight line of uneven ground is steeper, rad.
+    """
+    return ContactModeDynamics(
+        s,
+        *find_slot_contacts(friction, *contact_state[:2]),
+        has_one_sided_stoppers,
+        contact_state,
+        has_accumulators,
+        tilt,
+    )
+
+
+class ContactForces(NamedTuple):
+    """Contact forces and accelerations, with the foot velocities."""
+
+    force_solution: WheelForceSolution
+    slot_foot_velocities: PlaneVelocities
+    # stopper force on each leg, N; 0 for a leg with a loaded foot or not on its stopper
+    airborne_stopper_forces: LegArray
+
+
+def compute_forces(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+) -> ContactForces:
+    """Return the forces of ground and stoppers (N), and the resulting accelerations."""
+    s, opaque_one = contact_mode_dynamics.s, make_opaque_one(motion.theta)
+    sin, cos = leg_directions = compute_leg_directions(s, motion.theta)
+    leg_acceleration = prevent_fusion(
+        compute_free_leg_acceleration(s, motion, leg_directions), opaque_one
+    )
+    slot_foot_velocities = prevent_fusion(
+        compute_contact_foot_velocities(
+            motion, leg_directions, contact_mode_dynamics.contact_slots
+        ),
+        opaque_one,
+    )
+    force_solution = solve_contact_forces(contact_mode_dynamics.configure_contacts(motion))
+    hub_acceleration_x, hub_acceleration_z, _ = force_solution.hub_motion
+    # This is the acceleration of each leg's length without forces of slots and stoppers, m/s^2.
+    free_leg_acceleration = leg_acceleration + sin * hub_acceleration_x + cos * hub_acceleration_z
+    airborne_stopper_forces = jnp.where(
+        contact_mode_dynamics.is_airborne_leg_locked, s.m * free_leg_acceleration, 0.0
+    )
+    return ContactForces(force_solution, slot_foot_velocities, airborne_stopper_forces)
+
+
+def compute_accumulator_rates(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion, contact_forces: ContactForces
+) -> EnergyLossAccumulators:
+    """Return the time derivatives of the loss accumulators.
+
+    They are 1 for the time, the powers dissipated in dampers and by sliding in W, and the sum of
+    the slip speeds in m/s.
+    """
+    slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
+    slip_speeds = slip_signs * contact_forces.slot_foot_velocities.along_slope
+    friction_forces = -contact_forces.force_solution.tangential_forces * slip_signs
+    return EnergyLossAccumulators(
+        time_since_event=jnp.ones_like(motion.x),
+        damping_loss=contact_mode_dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
+        friction_loss=jnp.sum(friction_forces * slip_speeds, axis=0),
+        slip_length=jnp.sum(slip_speeds, axis=0),
+    )
+
+
+def evaluate_vector_field(
+    contact_mode_dynamics: ContactModeDynamics, packed_state: PackedState
+) -> PackedState:
+    """Return the time derivative of a packed state in the contact state of
+    `contact_mode_dynamics`.
+    """
+    motion, _ = unpack_state(packed_state)
+    contact_forces = compute_forces(contact_mode_dynamics, motion)
+    coordinate_rates = WheelMotion(
+        motion.vx,
+        motion.vz,
+        motion.dtheta,
+        *contact_forces.force_solution.hub_motion,
+        jnp.where(contact_mode_dynamics.contact_state.is_leg_locked, 0.0, motion.dL),
+        contact_forces.force_solution.length_motion,
+    )
+    return prevent_fusion(
+        pack_state(
+            coordinate_rates,
+            compute_accumulator_rates(contact_mode_dynamics, motion, contact_forces),
+        ),
+        make_opaque_one(motion.theta),
+    )
+
+
+class GuardLayout(NamedTuple):
+    """Index of the first guard of each kind in the result of `compute_guard_values`."""
+
+    first_landing_guard: int  # height of a foot in the air, one per leg: zero at a landing
+    first_stopper_guard: int  # distance to the stopper, one per leg
+    first_liftoff_guard: int  # normal force, one per contact slot
+    first_slip_up_guard: int  # friction margin before the foot slides uphill, one per contact slot
+    # friction margin before the foot slides downhill, one per contact slot
+    first_slip_down_guard: int
+    first_slip_end_guard: int  # speed of a sliding foot, one per contact slot
+    first_stopper_release_guard: int  # stopper force of a loaded leg, one per contact slot
+    rolling_rate_guard: int  # rate of rolling, dtheta
+    collapse_guard: int  # length of the shortest leg minus a
+    first_airborne_release_guard: int  # stopper force in the air, one per leg, if one-sided
+    first_force_rate_guard: int  # absolute value of each of the `NormalForceRates`, if requested
+    n_guards: int
+
+    @property
+    def n_legs(self) -> int:
+        """Return the number of legs of the wheel."""
+        return self.first_stopper_guard - self.first_landing_guard
+
+    @property
+    def foremost_landing_guard(self) -> int:
+        """Return the index of the guard that detects the landing of the foremost foot.
+
+        This landing ends a step.
+        """
+        return self.first_stopper_guard - 1
+
+
+def make_guard_layout(
+    n_legs: int, has_one_sided_stoppers: bool, measures_force_peaks: bool = False
+) -> GuardLayout:
+    """Return the guard layout for a wheel with `n_legs` legs.
+
+    - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers;
+    - `measures_force_peaks`: whether guards detect the extrema of normal forces.
+    """
+    guard_group_sizes = (
+        n_legs,
+        n_legs,
+        2,
+        2,
+        2,
+        2,
+        2,
+        1,
+        1,
+        n_legs if has_one_sided_stoppers else 0,
+        len(NormalForceRates._fields) if measures_force_peaks else 0,
+    )
+    guard_group_offsets = np.concatenate([[0], np.cumsum(guard_group_sizes)])
+    return GuardLayout(*(int(guard_offset) for guard_offset in guard_group_offsets))
+
+
+class NormalForceRates(NamedTuple):
+    """Rates of normal forces on the feet.
+
+    A rate is zero at an extremum of a force, and the second rate at an extremum of the first rate.
+    """
+
+    fore_force_rate: Elementwise  # rate of the force on the foot of Leg 1, N/s
+    total_force_rate: Elementwise  # rate of the sum of the forces on all feet, N/s
+    fore_force_second_rate: Elementwise  # second rate of the force on the foot of Leg 1, N/s^2
+
+
+class NormalForces(NamedTuple):
+    """Normal forces of the ground on the feet, or the rates of these forces."""
+
+    fore_force: Elementwise  # force on the foot of Leg 1, N
+    total_force: Elementwise  # sum of the forces on all feet, N
+
+
+def compute_normal_forces(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+) -> NormalForces:
+    """Return the normal forces of the ground on the feet, N."""
+    return split_normal_forces(
+        contact_mode_dynamics,
+        solve_contact_forces(contact_mode_dynamics.configure_contacts(motion)).normal_forces,
+    )
+
+
+def split_normal_forces(
+    contact_mode_dynamics: ContactModeDynamics, slot_normal_forces: SlotArray
+) -> NormalForces:
+    """Return the normal forces on the feet, computed from those in the contact slots, N."""
+    first_force, second_force = slot_normal_forces
+    # A loaded fore foot is in the first contact slot.
+    is_fore_loaded = contact_mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
+    return NormalForces(jnp.where(is_fore_loaded, first_force, 0.0), first_force + second_force)
+
+
+def compute_normal_force_rates(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
+) -> tuple[NormalForces, NormalForces]:
+    """Return the normal forces on the feet, N, and their rates between two events, N/s."""
+    return _differentiate_in_time(compute_normal_forces, contact_mode_dynamics, motion)
+
+
+def compute_force_rates(contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion) -> Array:
+    """Return the `NormalForceRates` in the motion between two events, as one array (3, ...)."""
+    (_, force_rates), (_, second_rates) = _differentiate_in_time(
+        compute_normal_force_rates, contact_mode_dynamics, motion
+    )
+    return jnp.stack(
+        NormalForceRates(force_rates.fore_force, force_rates.total_force, second_rates.fore_force)
+    )
+
+
+def _differentiate_in_time(
+    function: Callable[[ContactModeDynamics, WheelMotion], Any],
+    contact_mode_dynamics: ContactModeDynamics,
+    motion: WheelMotion,
+) -> tuple[Any, Any]:
+    """Return a function of the motion, and its time derivative in the motion between two events."""
+    force_solution = solve_contact_forces(contact_mode_dynamics.configure_contacts(motion))
+    coordinate_rates = motion.vx, motion.vz, motion.dtheta
+    motion_rate = WheelMotion(
+        *coordinate_rates, *force_solution.hub_motion, motion.dL, force_solution.length_motion
+    )
+    return jax.jvp(partial(function, contact_mode_dynamics), (motion,), (motion_rate,))
+
+
+def flag_zero_force_rates(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> Array:
+    """Return which of the `NormalForceRates` is zero at the event of a guard, (3, ...)."""
+    rate_indices = align_with_batch(np.arange(len(NormalForceRates._fields)), guard_index)
+    return guard_index == guard_layout.first_force_rate_guard + rate_indices
+
+
+def update_force_rate_signs(
+    contact_mode_dynamics: ContactModeDynamics,
+    motion: WheelMotion,
+    previous_signs: Array,
+    is_rate_zero: Bool[Array, "3 ..."],
+) -> Array:
+    """Return the sign of each of the `NormalForceRates` after an event, 1.0 or -1.0, (3, ...).
+
+    The result has no derivatives.
+
+    - `previous_signs`: signs before the event;
+    - `is_rate_zero`: which rates are zero at the event, and change their sign.
+    """
+    force_rates = compute_force_rates(*stop_gradients((contact_mode_dynamics, motion)))
+    return jnp.where(is_rate_zero, -previous_signs, jnp.where(force_rates < 0.0, -1.0, 1.0))
+
+
+class ContactQuantities(NamedTuple):
+    """Contact forces and slip speeds that the guards depend on in addition to the motion."""
+
+    normal_forces: SlotArray
+    tangential_forces: SlotArray
+    stopper_forces: SlotArray
+    slip_speeds: SlotArray  # tangential speeds of the feet in the contact slots, m/s
+    airborne_stopper_forces: (
+        LegArray | None
+    )  # stopper force of legs in the air, if stoppers are one-sided
+    force_rates: Array | None = (
+        None  # `NormalForceRates` as one array (3, ...), if peaks are measured
+    )
+
+
+def collect_contact_quantities(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion, contact_forces: ContactForces
+) -> ContactQuantities:
+    """Return contact forces and slip speeds from which `evaluate_guards` computes the guards."""
+    force_solution = contact_forces.force_solution
+    return ContactQuantities(
+        force_solution.normal_forces,
+        force_solution.tangential_forces,
+        force_solution.stopper_forces,
+        contact_forces.slot_foot_velocities.along_slope,
+        contact_forces.airborne_stopper_forces
+        if contact_mode_dynamics.has_one_sided_stoppers
+        else None,
+        compute_force_rates(contact_mode_dynamics, motion)
+        if contact_mode_dynamics.measures_force_peaks
+        else None,
+    )
+
+
+def evaluate_guards(
+    contact_mode_dynamics: ContactModeDynamics,
+    motion: WheelMotion,
+    contact_quantities: ContactQuantities,
+    is_after_start: Array,
+) -> list[Array]:
+    """Return the values of the guards in the order of `GuardLayout`, as one array for each kind.
+
+    - `is_after_start`: whether the time is after the start of the contact state.
+
+    At the event that starts a contact state, a guard may be zero. It is the guard of a foot that
+    lifts off, of a leg that leaves its stopper, or of a foot that starts to slide. The value of
+    this guard at the start is replaced by 1.
+    """
+    s, contact_state = contact_mode_dynamics.s, contact_mode_dynamics.contact_state
+    is_airborne = (contact_state.contact_modes == ContactMode.OFF) & (
+        is_after_start | ~contact_state.has_just_lifted
+    )
+    is_leg_free = ~contact_state.is_leg_locked & (is_after_start | ~contact_state.has_just_unlocked)
+    has_just_slid = contact_mode_dynamics.contact_slots.gather_flags_from_legs(
+        contact_state.has_just_slid
+    )
+    friction = contact_mode_dynamics.friction
+    friction_coefficients = replace_infinite_friction(friction)
+    normal_forces = contact_quantities.normal_forces
+    tangential_forces = contact_quantities.tangential_forces
+    # In the limit of large friction, a resting foot begins to slide when its normal force vanishes
+    # (see `impacts.resolve_event`). A sliding foot lifts off when its friction vanishes.
+    uses_friction_limit = friction == jnp.inf
+    slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
+    supporting_force = jnp.where(
+        uses_friction_limit & (slip_signs != 0.0), -slip_signs * tangential_forces, normal_forces
+    )
+    has_friction_cone = (contact_mode_dynamics.slot_modes == ContactMode.STICK) & jnp.isfinite(
+        friction
+    )
+    is_sliding = (slip_signs != 0.0) & (is_after_start | ~has_just_slid)
+    replace_if_not_evaluated = lambda is_evaluated, guard_value: jnp.where(
+        is_evaluated, guard_value, 1.0
+    )
+    guards = [
+        replace_if_not_evaluated(
+            is_airborne,
+            compute_foot_heights(
+                motion, compute_leg_directions(s, motion.theta), contact_mode_dynamics.tilt
+            ),
+        ),
+        replace_if_not_evaluated(is_leg_free, s.L0 - motion.L),
+        replace_if_not_evaluated(
+            contact_mode_dynamics.slot_modes != ContactMode.OFF, supporting_force
+        ),
+        replace_if_not_evaluated(
+            has_friction_cone, friction_coefficients * normal_forces - tangential_forces
+        ),
+        replace_if_not_evaluated(
+            has_friction_cone, friction_coefficients * normal_forces + tangential_forces
+        ),
+        replace_if_not_evaluated(is_sliding, slip_signs * contact_quantities.slip_speeds),
+        replace_if_not_evaluated(
+            contact_mode_dynamics.is_stopper_holding, contact_quantities.stopper_forces
+        ),
+        motion.dtheta[None],
+        (jnp.min(motion.L, axis=0) - s.a)[None],
+    ]
+    if contact_quantities.airborne_stopper_forces is not None:
+        guards.append(
+            replace_if_not_evaluated(
+                contact_mode_dynamics.is_airborne_leg_locked,
+                contact_quantities.airborne_stopper_forces,
+            )
+        )
+    if contact_quantities.force_rates is not None and contact_state.force_rate_signs is not None:
+        # If only the fore foot is loaded, the extrema of its force are those of the total force.
+        is_fore_loaded = contact_state.contact_modes[0] != ContactMode.OFF
+        is_first_loaded, is_second_loaded = contact_mode_dynamics.slot_modes != ContactMode.OFF
+        is_total_different = is_second_loaded | (is_first_loaded & ~is_fore_loaded)
+        guards.append(
+            replace_if_not_evaluated(
+                jnp.stack([is_fore_loaded, is_total_different, is_fore_loaded]),
+                contact_state.force_rate_signs * contact_quantities.force_rates,
+            )
+        )
+    return guards
+
+
+def compute_guard_scales(contact_mode_dynamics: ContactModeDynamics) -> Array:
+    """Return the scale of each guard in the order of `GuardLayout`, in the guard's unit."""
+    s = contact_mode_dynamics.s
+    force_scale, speed_scale = s.Mt * s.g, jnp.sqrt(s.g * s.L0)
+    guard_scales = (
+        [s.L0] * 2 * s.n
+        + [force_scale] * 6
+        + [speed_scale] * 2
+        + [force_scale] * 2
+        + [speed_scale / s.L0, s.L0]
+    )
+    guard_scales += [force_scale] * s.n * contact_mode_dynamics.has_one_sided_stoppers
+    if contact_mode_dynamics.measures_force_peaks:
+        force_rate_scale = force_scale * speed_scale / s.L0
+        guard_scales += [force_rate_scale] * 2 + [force_rate_scale * speed_scale / s.L0]
+    return jnp.stack(guard_scales)
+
+
+def compute_state_units(s: Symbols) -> tuple[Array, Array]:
+    """Return the wheel's units for (hub x, hub z, theta, leg lengths) and for their rates."""
+    wheel_units = compute_wheel_units(s)
+    stack_units = lambda linear_unit, angular_unit: jnp.stack(
+        [linear_unit, linear_unit, angular_unit, *[linear_unit] * s.n]
+    )
+    return (
+        stack_units(wheel_units.length_unit, jnp.ones_like(s.L0)),
+        stack_units(wheel_units.velocity_unit, wheel_units.rate_unit),
+    )
+
+
+def is_wheel_at_rest(
+    s: Symbols,
+    coordinate_rates: Array,
+    coordinate_accelerations: Iterable[Array],
+    atol: Elementwise,
+) -> Bool[Array, "..."]:
+    """Return whether the wheel is at rest, from rates and accelerations of all coordinates.
+
+    - `atol`: absolute tolerance in the wheel's units.
+    """
+    rate_units, time_unit = compute_state_units(s)[1], compute_wheel_units(s).time_unit
+    return are_coordinates_at_rest(
+        coordinate_rates, coordinate_accelerations, rate_units, time_unit, atol
+    )
+
+
+def choose_stopping_guard(
+    contact_mode_dynamics: ContactModeDynamics,
+    coordinate_rates: Array,
+    guard_index: Int[Array, "..."],
+    atol: Elementwise,
+) -> Int[Array, "..."]:
+    """Return the index of the guard that ends the interval when the wheel stops rolling.
+
+    If all rates are zero to within `atol` and a foot slides, the result is the guard for the end of
+    the slide. Otherwise it is `guard_index`. The reason is that round-off determines which of the
+    two guards is zero first. After the slide has ended, the friction on the stopped foot determines
+    whether the wheel rests or falls back.
+    """
+    guard_layout = contact_mode_dynamics.guard_layout
+    slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
+    has_just_slid = contact_mode_dynamics.contact_slots.gather_flags_from_legs(
+        contact_mode_dynamics.contact_state.has_just_slid
+    )
+    has_slid_to_rest = guard_index == guard_layout.rolling_rate_guard
+    has_slid_to_rest &= are_rates_negligible(
+        coordinate_rates, compute_state_units(contact_mode_dynamics.s)[1], atol
+    )
+    for stopped_slot in reversed(range(2)):
+        has_slide_ended = (
+            has_slid_to_rest & (slip_signs[stopped_slot] != 0.0) & ~has_just_slid[stopped_slot]
+        )
+        guard_index = jnp.where(
+            has_slide_ended, guard_layout.first_slip_end_guard + stopped_slot, guard_index
+        )
+    return guard_index
+
+
+def compute_packed_units(s: Symbols) -> PackedState:
+    """Return the wheel's unit for each entry of `pack_state`."""
+    wheel_units, (position_units, rate_units) = compute_wheel_units(s), compute_state_units(s)
+    accumulator_units = EnergyLossAccumulators(
+        wheel_units.time_unit,
+        wheel_units.energy_unit,
+        wheel_units.energy_unit,
+        wheel_units.length_unit,
+    )
+    motion_units = position_units[:3], rate_units[:3], position_units[3:], rate_units[3:]
+    return lax.stop_gradient(jnp.concatenate([*motion_units, jnp.stack(accumulator_units)]))
+
+
+def compute_guard_values(
+    contact_mode_dynamics: ContactModeDynamics, packed_state: PackedState
+) -> Float[Array, " n_guards"]:
+    """Return the values of all guards for a packed state.
+
+    A guard is positive inside the contact state and zero at its end. A guard that is not evaluated
+    has the value 1.
+    """
+    motion, accumulators = unpack_state(packed_state)
+    contact_quantities = collect_contact_quantities(
+        contact_mode_dynamics, motion, compute_forces(contact_mode_dynamics, motion)
+    )
+    guard_groups = evaluate_guards(
+        contact_mode_dynamics, motion, contact_quantities, accumulators.time_since_event > 0.0
+    )
+    return jnp.concatenate(prevent_fusion(guard_groups, make_opaque_one(motion.theta)))

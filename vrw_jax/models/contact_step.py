@@ -1,0 +1,408 @@
+"""Compute steps of one wheel with unilateral contact, by machine code or by diffrax.
+
+`build_contact_step_function` returns a function of one wheel, which `jax.vmap` maps to batch
+elements of the kernel. For derivatives, each tangent has its own batch element in addition to that
+of the motion. To sample a step, a JAX program advances from event to event and records the start of
+each interval. Every interval is then integrated again, from sample to sample.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from vrw_jax.base.options import StepOptions
+from vrw_jax.flow.integrate import sample_at_equal_times
+from vrw_jax.flow.tableaus import ButcherTableau, load_explicit_tableau
+from vrw_jax.lanes.autodiff import ForwardFunction
+from vrw_jax.lanes.batching import make_opaque_loop_condition, unbatch
+from vrw_jax.lanes.lane_function import compile_batch_function
+from vrw_jax.models.batch_step import split_jacobian_by_leaf
+from vrw_jax.models.contact_diffrax import sample_by_diffrax
+from vrw_jax.models.contact_integrator import (
+    ContactIntervalPoint,
+    attempt_solver_step,
+    init_contact_interval,
+    unpack_motion,
+)
+from vrw_jax.models.contact_kernel import (
+    STATUS_UNFINISHED,
+    BatchWalkResult,
+    BatchWalkSettings,
+    init_lane_states,
+    process_and_integrate,
+    run_walks,
+)
+from vrw_jax.models.contact_mechanics import WheelMotion, find_contact_slots
+from vrw_jax.models.contact_record import GaitStepSummary
+from vrw_jax.models.contact_state import (
+    ContactModeDynamics,
+    ContactState,
+    EnergyLossAccumulators,
+    pack_state,
+    unpack_state,
+)
+from vrw_jax.models.contact_tangents import walk_with_tangents
+from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.params import stack_parameters
+
+
+class ContactStepConfig(NamedTuple):
+    """Static configuration of a step, and functions of the leaves of its arguments."""
+
+    argument_tree_structure: Any  # tree structure of (wheel, params, x, options)
+    is_detailed: bool
+    uses_diffrax: bool = False  # whether diffrax replaces the batch kernel
+    engine_name: str = "lanes"  # name of the engine in the results
+    measures_force_peaks: bool = False
+
+    def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Return the argument leaves with the tighter solver tolerances for derivatives."""
+        *traced_settings, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
+        return tuple(jax.tree.leaves((*traced_settings, options.with_derivative_tolerances())))
+
+    def compile_lane_function(self, lane_function: Callable) -> Callable:
+        """Return a compiled function of one wheel from a function of a batch.
+
+        The batch is on the last axis of the arrays of `lane_function`.
+        """
+
+        def evaluate_one_wheel(*arrays: Any) -> Any:
+            lane_outputs = lane_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
+            return jax.tree.map(lambda x: x[..., 0], lane_outputs)
+
+        if self.uses_diffrax:
+            return evaluate_one_wheel
+        return unbatch(compile_batch_function(lane_function))
+
+    def unpack_argument_leaves(
+        self, leaves: tuple[Array, ...]
+    ) -> tuple[BatchWalkSettings, Array, Array]:
+        """Return the settings of walks of one step, and input columns and section states."""
+        wheel, params, x, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
+        uneven_ground_columns = () if wheel.uneven is None else wheel.uneven
+        restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
+        input_columns = jnp.stack(
+            [*stack_parameters(params), wheel.friction, *uneven_ground_columns, *restitution]
+        )
+        tableau = None if self.uses_diffrax else load_explicit_tableau(options.solver)
+        assert self.uses_diffrax or tableau is not None  # The caller has checked the solver.
+        walk_settings = BatchWalkSettings(
+            params.n_legs,
+            1,
+            wheel.max_events,
+            wheel.has_one_sided_stoppers,
+            wheel.uses_paper_rule,
+            self.is_detailed,
+            options,
+            tableau,
+            wheel.uneven is not None,
+            wheel.restitution is not None,
+            self.engine_name,
+            self.measures_force_peaks,
+        )
+        return walk_settings, input_columns, x
+
+    def compute_walk_outputs(self, *leaves: Array) -> tuple:
+        """Return the results of one step of all batch elements, divided by
+        `_partition_walk_result`.
+
+        The argument leaves have the batch on their last axis.
+        """
+        return _partition_walk_result(run_walks(*self.unpack_argument_leaves(leaves)))
+
+    def compute_walk_tangents(
+        self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
+    ) -> tuple:
+        """Return the tangents of a step's floating-point results, these results, and other results.
+
+        Each batch element has one tangent of its argument leaves.
+        """
+        walk_settings, input_columns, x = self.unpack_argument_leaves(leaves)
+        _, input_column_tangents, section_state_tangents = self.unpack_argument_leaves(tangents)
+        walk_result, result_tangents = walk_with_tangents(
+            walk_settings,
+            input_columns,
+            x,
+            input_column_tangents[None],
+            section_state_tangents[None],
+            n_tangents=jnp.ones_like(input_columns[0], jnp.int32),
+        )
+        result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
+        return _partition_walk_result(walk_result._replace(step_result=result_tangents))[
+            0
+        ], *_partition_walk_result(walk_result)
+
+
+def _partition_walk_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
+    """Return the results of a step, divided into floating-point arrays and other arrays.
+
+    If details are requested, the results are those in `UnilateralStep`. Otherwise they are section
+    state, durations, outcome and number of solver steps.
+    """
+    step_result = walk_result.step_result
+    if isinstance(step_result, GaitStepSummary):
+        step_result = (
+            step_result.section_state,
+            step_result.durations,
+            walk_result.outcome,
+            walk_result.n_solver_steps,
+        )
+    return eqx.partition(step_result, eqx.is_inexact_array)
+
+
+def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFunction:
+    """Return a function from the leaves of (wheel, params, x, options) to the results of a step.
+
+    The results are divided into floating-point arrays and other arrays. All AD modes are built from
+    this function.
+    """
+    return step_config.compile_lane_function(step_config.compute_walk_outputs)
+
+
+def build_contact_step_jacobian(
+    step_config: ContactStepConfig, input_indices: tuple[int, ...]
+) -> ForwardFunction:
+    """Return a function from the leaves of a step's arguments to its Jacobian and results.
+
+    The function returns (Jacobian with respect to the leaves at `input_indices`, floating-point
+    results), and the other results of `build_contact_step_function`.
+    """
+
+    compute_walk_tangents = unbatch(compile_batch_function(step_config.compute_walk_tangents))
+
+    def evaluate_jacobian(*leaves: Array) -> tuple:
+        leaves = step_config.tighten_tolerances(leaves)
+        selected_entries, unravel = ravel_pytree([leaves[i] for i in input_indices])
+        unit_vectors = jnp.eye(selected_entries.size, dtype=selected_entries.dtype)
+        tangents = [jnp.zeros_like(leaf) for leaf in leaves]
+        for i, leaf_tangents in zip(input_indices, jax.vmap(unravel)(unit_vectors), strict=True):
+            tangents[i] = leaf_tangents
+        batch_axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
+        jacobian_columns, float_outputs, nonfloat_outputs = jax.vmap(
+            compute_walk_tangents, (None, batch_axes)
+        )(leaves, tuple(tangents))
+        float_outputs, nonfloat_outputs = jax.tree.map(
+            lambda x: x[0], (float_outputs, nonfloat_outputs)
+        )
+        return (
+            split_jacobian_by_leaf(jacobian_columns, leaves, input_indices),
+            float_outputs,
+        ), nonfloat_outputs
+
+    return evaluate_jacobian
+
+
+class ContactIntervalLog(NamedTuple):
+    """Start state and duration of each interval of a step; an interval is between two events."""
+
+    start_states: Array  # start of each interval, see `contact_state.PackedState`, (intervals, dim)
+    contact_modes: Array  # contact mode of every foot, (intervals, legs)
+    is_leg_locked: Array
+    durations: Array  # s
+
+
+def sample_contact_interval(
+    contact_mode_dynamics: ContactModeDynamics,
+    motion: WheelMotion,
+    initial_accumulators: Array,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+    tableau: ButcherTableau,
+) -> Array:
+    """Return samples of one interval at equally spaced times, (samples, entries, batch).
+
+    The first and the last sample are at the ends of the interval. The entries are coordinates,
+    rates, loss accumulators, normal forces and tangential forces in the contact slots. At the
+    start, the accumulators are `initial_accumulators`.
+
+    - `duration`: length of the interval, s.
+    """
+    initial_interval = init_contact_interval(contact_mode_dynamics, motion, options.dt0)
+
+    def take_sample_step(
+        sample_state: tuple[ContactIntervalPoint, Array], step_size: Array
+    ) -> tuple[tuple[ContactIntervalPoint, Array], Array]:
+        start_point, accumulators = sample_state
+        attempted_step = attempt_solver_step(
+            contact_mode_dynamics,
+            tableau,
+            options,
+            initial_interval._replace(contact_interval_point=start_point, h=step_size),
+        )
+        assert attempted_step.accumulator_increments is not None
+        return (
+            attempted_step.end_point,
+            accumulators + attempted_step.accumulator_increments,
+        ), attempted_step.mean_squared_error
+
+    def pack_sample(sample_state: tuple[ContactIntervalPoint, Array]) -> Array:
+        (q, v, dynamics_rows), accumulators = sample_state
+        slot_forces = dynamics_rows[len(q) + 1 : len(q) + 5]
+        return jnp.concatenate([q, v, accumulators, slot_forces])
+
+    return sample_at_equal_times(
+        take_sample_step,
+        pack_sample,
+        (initial_interval.contact_interval_point, initial_accumulators),
+        tableau,
+        duration,
+        n_samples,
+        options,
+    )
+
+
+@functools.cache
+def build_contact_step_sampler(
+    step_config: ContactStepConfig, n_samples: int
+) -> Callable[..., tuple]:
+    """Return a function that samples a step from the leaves of (wheel, params, x, options).
+
+    The function returns (log, summary and outcome of the step, states, tangential forces, normal
+    forces). The states are packed, (intervals, samples, entries), and the forces on all feet are in
+    N, (intervals, samples, legs). The samples are at equally spaced times from the start to the end
+    of each interval. The function has no derivatives.
+    """
+
+    init_lane_state = lambda *leaves: init_lane_states(*step_config.unpack_argument_leaves(leaves))[
+        1
+    ]
+
+    def advance_to_event(
+        leaves: tuple[Array, ...], lane_state: Any
+    ) -> tuple[Any, ContactIntervalLog]:
+        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
+        state_after_event, lane_state = process_and_integrate(
+            walk_settings,
+            walk_settings.replace_invalid_lanes(input_columns, x)[0],
+            lane_state,
+            waits_for_events=True,
+        )
+        assert state_after_event.step_energy_loss_accumulators is not None
+        start_interval = state_after_event.contact_interval_state
+        duration = lane_state.contact_interval_state.time_since_event
+        start_state = pack_state(
+            unpack_motion(start_interval.contact_interval_point),
+            EnergyLossAccumulators(
+                jnp.zeros_like(duration), *state_after_event.step_energy_loss_accumulators
+            ),
+        )
+        return lane_state, ContactIntervalLog(
+            start_state,
+            start_interval.contact_state.contact_modes,
+            start_interval.contact_state.is_leg_locked,
+            duration,
+        )
+
+    def sample_logged_interval(
+        leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
+    ) -> Any:
+        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
+        start_states, contact_modes, is_leg_locked, durations = contact_interval_log
+        contact_mode_dynamics = walk_settings.make_lane_contact_dynamics(
+            walk_settings.replace_invalid_lanes(input_columns, x)[0],
+            ContactState.without_recent_changes(contact_modes, is_leg_locked),
+        )
+        options, tableau = walk_settings.step_options, walk_settings.tableau
+        if tableau is None:
+            return sample_by_diffrax(
+                contact_mode_dynamics, start_states, durations, n_samples, options
+            )
+        motion, (_, *loss_accumulators) = unpack_state(start_states)
+        return sample_contact_interval(
+            contact_mode_dynamics,
+            motion,
+            jnp.stack(loss_accumulators),
+            durations,
+            n_samples,
+            options,
+            tableau,
+        )
+
+    def sample_whole_step(*leaves: Array) -> tuple:
+        walk_settings, input_columns, _ = step_config.unpack_argument_leaves(leaves)
+        max_events = walk_settings.max_events
+        initial_state = begin_compiled_walk(*leaves)
+        log_template = jax.eval_shape(advance_compiled_walk, leaves, initial_state)[1]
+        allocate_log_array = lambda leaf: jnp.zeros((max_events, *leaf.shape), leaf.dtype)
+
+        def record_interval_end(loop_state: tuple) -> tuple:
+            previous_state, contact_interval_log = loop_state
+            lane_state, interval_entry = advance_compiled_walk(leaves, previous_state)
+            entry_index = previous_state.step_counters.n_events
+            entry_index = jnp.where(
+                lane_state.step_counters.n_events > entry_index, entry_index, max_events
+            )
+            write_log_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
+                entry_leaf, mode="drop"
+            )
+            return lane_state, jax.tree.map(write_log_entry, contact_interval_log, interval_entry)
+
+        should_continue = lambda state: make_opaque_loop_condition(
+            state[0].walk_outcome == STATUS_UNFINISHED, state[0].step_counters.n_events
+        )
+        lane_state, contact_interval_log = lax.while_loop(
+            should_continue,
+            record_interval_end,
+            (initial_state, jax.tree.map(allocate_log_array, log_template)),
+        )
+        step_summary = walk_settings.summarize_step(lane_state, input_columns)
+        if step_config.uses_diffrax:
+            interval_samples = lax.map(
+                functools.partial(sample_logged_interval, leaves), contact_interval_log
+            )
+        else:
+            sample_rows = jax.vmap(functools.partial(sample_compiled_intervals, leaves))(
+                contact_interval_log
+            )
+            interval_samples = _unpack_sample_rows(
+                walk_settings.n_legs, contact_interval_log, sample_rows
+            )
+        return contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
+
+    begin_compiled_walk = step_config.compile_lane_function(init_lane_state)
+    advance_compiled_walk = step_config.compile_lane_function(advance_to_event)
+    sample_compiled_intervals = unbatch(compile_batch_function(sample_logged_interval))
+    return jax.jit(sample_whole_step)
+
+
+def _unpack_sample_rows(
+    n_legs: int, contact_interval_log: ContactIntervalLog, sample_rows: Array
+) -> tuple[Array, Array, Array]:
+    """Return packed states, tangential forces (N) and normal forces (N) of all legs, from samples.
+
+    The axes are (intervals, samples, entries). `sample_rows` contains results of
+    `sample_contact_interval`.
+    """
+    n_samples, n_coordinates = sample_rows.shape[1], 3 + n_legs
+    time_since_event = jnp.linspace(0.0, 1.0, n_samples) * contact_interval_log.durations[:, None]
+    q, v, accumulators, slot_forces = jnp.split(
+        sample_rows, (n_coordinates, 2 * n_coordinates, 2 * n_coordinates + 3), -1
+    )
+    contact_interval_quantities = [
+        q[..., :3],
+        v[..., :3],
+        q[..., 3:],
+        v[..., 3:],
+        time_since_event[..., None],
+        accumulators,
+    ]
+    contact_slots = jax.vmap(
+        lambda contact_modes: find_contact_slots(contact_modes != ContactMode.OFF)
+    )(contact_interval_log.contact_modes)
+    scatter_to_legs = jax.vmap(
+        jax.vmap(
+            lambda contact_slots, slot_pair: contact_slots.scatter_to_legs(slot_pair), (None, 0)
+        )
+    )
+    normal_forces, tangential_forces = (
+        scatter_to_legs(contact_slots, slot_forces[..., i : i + 2]) for i in (0, 2)
+    )
+    return jnp.concatenate(contact_interval_quantities, -1), tangential_forces, normal_forces

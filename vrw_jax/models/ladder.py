@@ -1,0 +1,371 @@
+"""Ladder of models: each step is computed with the simplest model whose assumptions hold.
+
+The step is first computed with the viscoelastic model, together with its margins. If a margin is
+violated, the step is computed again with the unilateral model. Under `vmap`, a model is selected
+for each batch element. The unilateral model computes nothing for elements for which the
+viscoelastic model is valid. The rigid model is never selected, because its assumption of rigid legs
+is violated for every finite stiffness.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_each_batch_element
+from vrw_jax.base.types import RealInput, Scalar
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
+from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET, FullState, embed_section_state
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES, make_flag_attributes
+from vrw_jax.models.rigid import RigidWheel
+from vrw_jax.models.step_inputs import PAPER_START_STATE, replace_invalid_inputs
+from vrw_jax.models.step_results import AbstractContactStep, AdvanceResult, StepResult
+from vrw_jax.models.unilateral_wheel import (
+    AbstractContactWheel,
+    UnilateralTrajectory,
+    UnilateralWheel,
+)
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams, convert_friction
+
+
+class ModelCode(enum.IntEnum):
+    """Integer code of the model with which a step is computed. Stores contain these codes."""
+
+    RIGID = 0
+    VISCOELASTIC = 1
+    UNILATERAL = 2
+
+
+START_NOT_EMBEDDABLE_REASON_CODE = 1 + len(SELECTION_MARGIN_NAMES)
+"""Reason code for a start that is not a section state of the viscoelastic model."""
+
+
+SELECTION_VARIABLE_ATTRIBUTES: dict[str, dict[str, object]] = {
+    "rung": {
+        "long_name": "model that was used",
+        **make_flag_attributes(
+            model_class.__name__ for model_class in (RigidWheel, ViscoelasticWheel, UnilateralWheel)
+        ),
+    },
+    "reason": {
+        "long_name": "why that model was used",
+        "units": "1",
+        "description": "0: all margins of the paper's wheel hold; above: the first that breaks, "
+        f"of {', '.join(SELECTION_MARGIN_NAMES)}; below: minus that wheel's outcome.",
+    },
+}
+"""Attributes of the dataset variables that `ModelChoice.collect_selection_codes` returns."""
+
+
+class ModelChoice(AbstractPrintable):
+    """Model that is selected for a step, and the reason. Under `vmap`, each field has a batch axis.
+
+    - `model_code`: code of the model, `ModelCode.VISCOELASTIC` or `ModelCode.UNILATERAL`;
+    - `reason_code`: 0 if the viscoelastic model is valid. If a margin is violated, the code is 1 +
+      the index of the first such margin in `SELECTION_MARGIN_NAMES`. If a leg other
+      than Leg 1 is loaded or off its stopper at the start, the code is
+      `START_NOT_EMBEDDABLE_REASON_CODE`. If the step computed with the viscoelastic model does not
+      reach a touchdown, the code is the negative of the outcome code;
+    - `margins`: values of the margins in `SELECTION_MARGIN_NAMES`, negative for a
+      violation;
+    - `friction`: friction coefficient of the ground.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> vrw.choose_model(vrw.WheelParams(), x, friction=50.0).margins.shape
+        (8,)
+    """
+
+    model_code: Int[Array, ""]
+    reason_code: Int[Array, ""]
+    margins: Float[Array, " n_margins"]
+    friction: Scalar
+
+    def summary_rows(self) -> list[LabelAndText]:
+        """Return labels and printed texts for the model, the reason and the margins."""
+        reason_codes = np.asarray(self.reason_code)
+        if reason_codes.ndim:
+            n_viscoelastic_choices = int(np.sum(reason_codes == 0))
+            return [
+                (
+                    "wheels",
+                    f"{reason_codes.size} in shape {reason_codes.shape}, "
+                    f"{n_viscoelastic_choices} served by the paper's",
+                )
+            ]
+        margin_text_rows = [
+            (
+                MARGIN_MEASURES[margin_name].label_with_symbol,
+                MARGIN_MEASURES[margin_name].format_with_unit(margin_value),
+            )
+            for margin_name, margin_value in zip(
+                SELECTION_MARGIN_NAMES, np.asarray(self.margins), strict=True
+            )
+        ]
+        return [("model", type(self.model).__name__), ("reason", self.why), *margin_text_rows]
+
+    def collect_selection_codes(self) -> dict[str, Array]:
+        """Return the code of the model and the code of the reason.
+
+        The keys are the names of the dataset variables.
+        """
+        return {"rung": self.model_code, "reason": self.reason_code}
+
+    @property
+    def model(self) -> AbstractWheel:
+        """Return the selected model. The choice must be for one wheel."""
+        if int(self.model_code) == ModelCode.VISCOELASTIC:
+            return ViscoelasticWheel(friction=float(self.friction))
+        return UnilateralWheel(friction=self.friction)
+
+    @property
+    def why(self) -> Any:
+        """Return a sentence that states why the model was selected; a batch has an array of
+        sentences.
+        """
+        return format_each_batch_element(describe_selection_reason, self.reason_code)
+
+
+def describe_selection_reason(reason_code: int) -> str:
+    """Return a sentence that explains a reason code of `ModelChoice`."""
+    if reason_code == 0:
+        return "The paper's model is valid: all its margins are positive in this step."
+    if reason_code < 0:
+        return f"The step of the paper's model fails: {Outcome(-reason_code).meaning}"
+    if reason_code == START_NOT_EMBEDDABLE_REASON_CODE:
+        return "The start is not the paper's: another leg is loaded or off its stopper."
+    violation_text = MARGIN_MEASURES[SELECTION_MARGIN_NAMES[reason_code - 1]].violation_text
+    return f"The paper's model is not valid: {violation_text}."
+
+
+def find_selection_reason(
+    step_measures: Mapping[str, Any], friction_coefficient_change: Any
+) -> tuple[Array, Array]:
+    """Return the reason for the choice of a model for each step, and the margins of each step.
+
+    The reasons are codes of `ModelChoice.reason_code`. The margins are those of the step computed
+    with the viscoelastic model, on the last axis, corrected by `friction_coefficient_change`.
+
+    - `step_measures`: measures and outcome codes of the steps, by name;
+    - `friction_coefficient_change`: friction coefficient of the ground minus that in
+      `step_measures`.
+    """
+    selection_margins = jnp.stack(
+        [
+            step_measures[margin_name]
+            + (friction_coefficient_change if "friction" in margin_name else 0.0)
+            for margin_name in SELECTION_MARGIN_NAMES
+        ],
+        -1,
+    )
+    is_margin_violated = ~(selection_margins >= 0.0)
+    violated_margin_code = jnp.where(
+        jnp.any(is_margin_violated, -1), 1 + jnp.argmax(is_margin_violated, -1), 0
+    )
+    step_outcome = jnp.asarray(step_measures["outcome"], violated_margin_code.dtype)
+    reason_code = jnp.where(step_outcome == Outcome.STEPPED, violated_margin_code, -step_outcome)
+    return reason_code, selection_margins
+
+
+class LadderStep(AbstractContactStep):
+    """One step, computed with the simplest valid model. Under `vmap`, each field has a batch axis.
+
+    - `choice`: selected model and reason, a `ModelChoice`;
+    - `section_state`: section state just before the next landing; zeros if there was no landing;
+    - `post_impact`: (theta, dtheta) just after the opening landing, rad, rad/s;
+    - `durations`: times with two, one and no loaded feet, s;
+    - `step_length`: distance between the places of the two landings, m;
+    - `energy_impacts`: energy lost in impacts, J;
+    - `energy_damping`: energy lost in the dampers, J;
+    - `energy_friction`: energy lost by sliding between impacts, J;
+    - `slip`: path length of sliding feet, m;
+    - `outcome`: code of the `Outcome`;
+    - `solver_steps`: number of attempted solver steps, summed over the two models.
+
+    Examples:
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> step = vrw.step(vrw.WheelParams(), x, model=vrw.LadderWheel(friction=50.0))
+        >>> print(f"{step.dls_fraction:.3f}")
+        0.532
+    """
+
+    choice: ModelChoice
+    section_state: FullState
+    post_impact: Float[Array, "2"]
+    durations: Float[Array, "3"]
+    step_length: Scalar
+    energy_impacts: Scalar
+    energy_damping: Scalar
+    energy_friction: Scalar
+    slip: Scalar
+    outcome: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+
+
+class LadderWheel(AbstractContactWheel):
+    """Ladder of models: the viscoelastic model where it is valid, and else the unilateral model.
+
+    A step is computed with the viscoelastic model if that model is valid for the step. Otherwise it
+    is computed with the unilateral model and the coefficient `friction`. Section states are those
+    of `UnilateralWheel`; section states of the paper, which have three entries, are also accepted.
+
+    - `friction`: friction coefficient of the ground, `inf` for feet that never slide.
+
+    Examples:
+        >>> wheel = vrw.LadderWheel(friction=50.0)
+        >>> x = vrw.limit_cycle(vrw.WheelParams()).section_state
+        >>> step = vrw.step(vrw.WheelParams(), x, model=wheel)
+        >>> step.choice.why
+        "The paper's model is valid: all its margins are positive in this step."
+    """
+
+    model_name: ClassVar[str] = "ladder"
+    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
+        config_name="auto",
+        gait_method=GaitMethod.SELECTION,
+        accepted_cli_commands=frozenset({"scan"}),
+        supports_uneven_ground=False,
+    )
+
+    friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
+
+    if TYPE_CHECKING:
+
+        def __init__(self, friction: RealInput = 0.7) -> None: ...
+
+    @property
+    def unilateral_model(self) -> UnilateralWheel:
+        """Return the unilateral model, which is used if the viscoelastic model is not valid for a
+        step.
+        """
+        return UnilateralWheel(friction=self.friction)
+
+    @property
+    def fallback_model(self) -> UnilateralWheel:
+        return self.unilateral_model
+
+    def choose_model(
+        self, params: WheelParams, x: FullState, options: StepOptions
+    ) -> tuple[ModelChoice, StepResult]:
+        """Return the selected model, and the step computed with the viscoelastic model."""
+        viscoelastic_model = ViscoelasticWheel()
+        ground_friction = self.friction.astype(x.dtype)
+        # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
+        is_leg_1 = jnp.arange(params.n_legs) == 0
+        locked_leg_code = float(LOCKED_CODE_OFFSET + ContactMode.OFF)
+        expected_contact_codes = jnp.where(is_leg_1, float(ContactMode.STICK), locked_leg_code)
+        is_start_embeddable = jnp.all(
+            jnp.round(x[4 + 2 * params.n_legs :]) == expected_contact_codes
+        )
+        viscoelastic_section_state = jnp.stack([x[0], x[1], x[4 + params.n_legs]])
+        viscoelastic_result = viscoelastic_model.take_step(
+            params, jnp.where(is_start_embeddable, viscoelastic_section_state, jnp.nan), options
+        )
+        reason_code, margins = find_selection_reason(
+            viscoelastic_result.measures(), ground_friction - viscoelastic_model.friction
+        )
+        reason_code = jnp.where(
+            is_start_embeddable, reason_code, START_NOT_EMBEDDABLE_REASON_CODE
+        ).astype(jnp.int32)
+        model_code = jnp.where(
+            reason_code == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
+        ).astype(jnp.int32)
+        return ModelChoice(model_code, reason_code, margins, ground_friction), viscoelastic_result
+
+    def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
+        model_choice, step_values = self._compute_step_values(
+            params, x, options, self.unilateral_model.advance
+        )
+        return AdvanceResult(
+            **step_values,
+            model_code=model_choice.model_code,
+            reason_code=model_choice.reason_code,
+        )
+
+    def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> LadderStep:
+        model_choice, step_values = self._compute_step_values(
+            params, x, options, self.unilateral_model.take_step
+        )
+        return LadderStep(choice=model_choice, **step_values)
+
+    def _compute_step_values(
+        self,
+        params: WheelParams,
+        x: FullState,
+        options: StepOptions,
+        compute_unilateral_step: Callable,
+    ) -> tuple[ModelChoice, dict[str, Any]]:
+        """Return the selected model, and the values of a step by their names in `LadderStep`.
+
+        The values are those that the result of `compute_unilateral_step` has.
+        """
+        model_choice, viscoelastic_result = self.choose_model(params, x, options)
+        is_viscoelastic_valid = model_choice.model_code == ModelCode.VISCOELASTIC
+        unilateral_result = compute_unilateral_step(
+            params, jnp.where(is_viscoelastic_valid, jnp.nan, x), options
+        )
+        dls_duration, sls1_duration, sls2_duration = viscoelastic_result.durations
+        durations_by_loaded_feet = [
+            dls_duration,
+            sls1_duration + sls2_duration,
+            jnp.zeros_like(dls_duration),
+        ]
+        # If the viscoelastic model is not valid, the paper's start state is embedded.
+        section_state = viscoelastic_result.section_state
+        valid_params, valid_section_state = replace_invalid_inputs(
+            is_viscoelastic_valid,
+            params,
+            section_state,
+            jnp.asarray(PAPER_START_STATE, section_state.dtype),
+        )
+        energy_loss = viscoelastic_result.energy
+        viscoelastic_values: dict[str, Any] = {
+            "section_state": embed_section_state(valid_params.symbols(), valid_section_state),
+            "post_impact": viscoelastic_result.post_impact,
+            "durations": jnp.stack(durations_by_loaded_feet),
+            "step_length": viscoelastic_result.step_length,
+            "energy_impacts": energy_loss.landing + energy_loss.stopper,
+            "energy_damping": energy_loss.damping,
+            "energy_friction": 0.0,
+            "slip": 0.0,
+            "outcome": viscoelastic_result.outcome,
+        }
+        step_values = {
+            value_name: jnp.where(
+                is_viscoelastic_valid, viscoelastic_value, getattr(unilateral_result, value_name)
+            )
+            for value_name, viscoelastic_value in viscoelastic_values.items()
+            if hasattr(unilateral_result, value_name)
+        }
+        step_values["solver_steps"] = (
+            viscoelastic_result.solver_steps + unilateral_result.solver_steps
+        )
+        return model_choice, step_values
+
+    def sample_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
+    ) -> UnilateralTrajectory:
+        """Return the motion during a step, in the form that the unilateral model returns.
+
+        If the viscoelastic model is selected, no foot slips, and the motion is that of the
+        viscoelastic model.
+        """
+        model_choice, _ = self.choose_model(params, x, options)
+        friction = jnp.where(
+            model_choice.model_code == ModelCode.VISCOELASTIC, jnp.inf, self.friction
+        )
+        unilateral_wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
+        trajectory = unilateral_wheel.sample_step(params, x, options, n_samples)
+        return dataclasses.replace(
+            trajectory, model_selection=model_choice.collect_selection_codes()
+        )

@@ -1,0 +1,560 @@
+"""Gait steps of batches of wheels: one function with a choice of engines.
+
+On a CPU the engine "lanes" is machine code that computes a few lanes (elements of the batch) at a
+time (`simd`). On a GPU it is an XLA program for thousands of lanes, which runs again in smaller
+batches for the unfinished lanes. Every lane runs the same code, and no data pass between lanes. The
+result for a batch element is therefore bitwise the same alone, in any batch and in any order.
+Wheels whose steps need similar work are neighbors in the batch.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax import lanes
+from vrw_jax.base import batch_sizes
+from vrw_jax.base.checks import (
+    check_choice,
+    check_int,
+    check_names,
+    check_numpy_reals,
+    check_type,
+    require_untraced_arguments,
+)
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.flow.tableaus import load_explicit_tableau
+from vrw_jax.lanes.batching import map_in_batches
+from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.batch_step import N_STEP_INPUTS, advance_gait_step, compute_jacobian_columns
+from vrw_jax.models.batch_stiffness import (
+    IMPLICIT_SOLVER_NAME,
+    STABLE_SOLVER_NAME,
+    STABLE_SOLVER_TIGHTENING_FACTOR,
+    SolverIndex,
+    select_cheapest_solver,
+)
+from vrw_jax.models.contact_batch import CONTACT_STEP_INPUT_NAMES, step_batch_with_contact
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.stepping import (
+    convert_model_argument,
+    convert_section_state,
+    convert_step_options,
+)
+from vrw_jax.models.unit_scaling import complete_jacobian_columns
+from vrw_jax.models.walk_batch import (
+    START_INPUT_NAME,
+    StepBatchResult,
+    StepwiseParameter,
+    WalkBatch,
+    complete_slopes_over_steps,
+    select_lanes,
+)
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import (
+    FRICTION_NAME,
+    PARAMETER_NAMES,
+    WheelParams,
+    make_wheel_from_parameters,
+)
+
+BatchEngineName = Literal["auto", "lanes", "diffrax"]
+BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngineName)
+
+PAPER_STEP_INPUT_NAMES = (START_INPUT_NAME, *PARAMETER_NAMES)
+"""Names of the inputs of a gait step with respect to which the paper's model has derivatives."""
+
+SLOPE_INPUT_INDEX = PARAMETER_NAMES.index("slope")
+"""Index of the slope among the inputs of a gait step.
+
+The inputs are the parameters, the section state and the slope of the ground after the next landing.
+"""
+NEXT_SLOPE_INPUT_INDEX = len(PARAMETER_NAMES) + 3
+"""Index, among the inputs of a gait step, of the slope of the ground after the next landing."""
+
+
+@announce_wait("batches of gait steps", "10 s")
+@with_default_jax_settings
+def step_batch(
+    params: WheelParams,
+    states: Array | np.ndarray,
+    n_steps: int = 1,
+    *,
+    model: AbstractWheel | None = None,
+    options: StepOptions | None = None,
+    engine: BatchEngineName = "auto",
+    derivatives: Sequence[str] = (),
+) -> StepBatchResult:
+    """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
+    requested.
+
+    The engine "lanes" is the fastest. It supports the viscoelastic wheel and explicit solvers. The
+    engine "diffrax" maps `model.advance` over the batch and accepts any solver. "auto" selects
+    "lanes" if possible; `StepBatchResult.engine` is the selected engine. `options` limits the error
+    of each solver step. The results of the two engines differ by about ten times the tolerance.
+
+    "auto" also replaces the requested solver if the airborne leg is so stiff that another solver is
+    cheaper. `StepBatchResult.solver_index` identifies the selected solver. The stiffness is c/m,
+    the ratio of damping to leg mass. Tsit5 is selected if stability limits the solver steps: from
+    c/m = 1,900 1/s at the default options, and from 300 1/s at a tolerance of 1e-6. Kvaerno5 in
+    "diffrax" is selected if Tsit5 failed, or if explicit solvers need too many solver steps: from
+    c/m = 4e5 1/s at the default options, and from 1.4e5 1/s at a tolerance of 1e-6.
+
+    Derivatives are those of the result of all gait steps and include their events. The derivatives
+    are zero for a wheel that fell. With unilateral contact (`UnilateralWheel`) the only engine is
+    "lanes", and friction is a scalar or an array over the batch. The function compiles its programs
+    itself, so it cannot be called inside `jax.jit`.
+
+    On uneven ground the slope has the shape (elements, n_steps) or (elements, n_steps + 1), with
+    one value per gait step as in `walk`. With unilateral contact, friction may have these shapes
+    too. Derivatives with respect to such an array have the axis over gait steps last.
+
+    Args:
+        params: parameters of the wheels. Each field is a scalar or has the shape (elements,); the
+            slope may also have the shapes above.
+        states: section states in the form of the paper's model, shape (elements, 3), rad, rad/s,
+            m/s, or in the form of `model`.
+        n_steps: largest number of gait steps.
+        model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
+        options: numerical options of the gait steps.
+        engine: "auto", "lanes" or "diffrax".
+        derivatives: inputs with respect to which derivatives are computed: "section_state" and
+            names of parameters; with unilateral contact "friction" too.
+
+    Returns:
+        A `StepBatchResult` for the last gait step of each element.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> params = vrw.WheelParams(damping=np.array([120.0, 150.0, 180.0]))
+        >>> result = vrw.step_batch(params, np.tile(vrw.paper_start(), (3, 1)), 10)
+        >>> result.durations.shape, result.n_stepped.tolist(), result.engine
+        ((3, 3), [10, 10, 10], 'lanes')
+    """
+    require_untraced_arguments(
+        "vrw.step_batch", "map vrw.return_map over the lanes", params, states
+    )
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    checked_model = convert_model_argument(model, allows_friction_arrays=True)
+    options = convert_step_options(options)
+    check_choice("engine", engine, BATCH_ENGINE_NAMES)
+    n_steps = check_int("n_steps", n_steps)
+    derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
+    checked_section_states = convert_section_state(states, "states", check_numpy_reals)
+    values_by_parameter = _check_parameter_shapes(
+        params, checked_section_states, checked_model, options, n_steps
+    )
+    checked_section_states = checked_section_states.astype(values_by_parameter[0].dtype, copy=False)
+    has_contact_kernel = checked_model.batch_kernel == "legs"
+    known_input_names = CONTACT_STEP_INPUT_NAMES if has_contact_kernel else PAPER_STEP_INPUT_NAMES
+    for derivative_name in derivatives:
+        if derivative_name not in known_input_names:
+            raise ValueError(
+                f"derivatives contain {derivative_name!r}, but a step depends on "
+                f"{', '.join(known_input_names)}: "
+                "give names of these."
+            )
+    compute_batch = step_batch_with_contact if has_contact_kernel else _step_batch_without_contact
+    return compute_batch(
+        checked_model,
+        values_by_parameter,
+        checked_section_states,
+        n_steps,
+        options,
+        engine,
+        params.n_legs,
+        derivatives,
+    )
+
+
+def _check_parameter_shapes(
+    params: WheelParams,
+    section_states: np.ndarray,
+    model: AbstractWheel,
+    options: StepOptions,
+    n_steps: int,
+) -> list[np.ndarray]:
+    """Return each parameter as a scalar or an array over the batch, in the order of
+    `PARAMETER_NAMES`.
+
+    The slope, and with unilateral contact the friction, may have a second axis over gait steps.
+    Raise ValueError if the shapes of states and parameters do not fit.
+    """
+    allowed_section_sizes = sorted({3, model.count_section_entries(params)})
+    if section_states.ndim != 2 or section_states.shape[1] not in allowed_section_sizes:
+        raise ValueError(
+            f"states have shape {section_states.shape}, but section states have the shape "
+            f"(elements, "
+            f"{' or '.join(map(str, allowed_section_sizes))}): write states[None] for a single one."
+        )
+    n_section_states = len(section_states)
+    values_by_parameter = [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES]
+    parameter_dtype = np.result_type(
+        *(parameter_values.dtype for parameter_values in values_by_parameter)
+    )
+    StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
+    for parameter_name, parameter_values in zip(
+        (*PARAMETER_NAMES, FRICTION_NAME),
+        (*values_by_parameter, getattr(model, FRICTION_NAME, np.zeros(()))),
+        strict=True,
+    ):
+        is_parameter_stepwise = (
+            parameter_name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
+        )
+        allowed_shapes: list[tuple[int, ...]] = [(), (n_section_states,)]
+        if is_parameter_stepwise:
+            allowed_shapes += [(n_section_states, n_steps), (n_section_states, n_steps + 1)]
+        if np.shape(parameter_values) not in allowed_shapes:
+            stepwise_advice = f" and {n_steps} or {n_steps + 1} of each over its steps"
+            raise ValueError(
+                f"{parameter_name} has shape {np.shape(parameter_values)}, but there are "
+                f"{n_section_states} states"
+                f"{f' and {n_steps} steps' * is_parameter_stepwise}: give one value for all, or "
+                "one for each"
+                f"{stepwise_advice * is_parameter_stepwise}."
+            )
+    common_dtype = np.promote_types(parameter_dtype, section_states.dtype)
+    return [np.asarray(parameter_values, common_dtype) for parameter_values in values_by_parameter]
+
+
+def _step_batch_without_contact(
+    model: Any,
+    values_by_parameter: list[np.ndarray],
+    section_states: np.ndarray,
+    n_steps: int,
+    options: StepOptions,
+    requested_engine: str,
+    n_legs: int,
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
+    n_wheels = len(section_states)
+    element_slopes = values_by_parameter[SLOPE_INPUT_INDEX]
+    ground_slopes: Any = [element_slopes]
+    stepwise_parameters = {}
+    is_ground_uneven = element_slopes.ndim == 2
+    if is_ground_uneven:
+        ground_slopes = complete_slopes_over_steps(element_slopes, n_steps)
+        n_slopes = element_slopes.shape[1]
+        stepwise_parameters["slope"] = StepwiseParameter(
+            (SLOPE_INPUT_INDEX, NEXT_SLOPE_INPUT_INDEX),
+            n_slopes,
+            lambda k: ((0, k, 1.0), (1, min(k + 1, n_slopes - 1), 1.0)),
+        )
+    values_by_parameter[SLOPE_INPUT_INDEX] = ground_slopes[0]
+    wheel_order = order_wheels_by_work(values_by_parameter, section_states)
+    parameter_matrix = np.stack(
+        [np.broadcast_to(x, n_wheels)[wheel_order] for x in values_by_parameter]
+    )
+    if is_ground_uneven:
+        ground_slopes = ground_slopes.take(wheel_order, -1)
+    walk_batch = WalkBatch(
+        section_states.T.take(wheel_order, -1),
+        derivative_names,
+        PARAMETER_NAMES,
+        stepwise_parameters,
+    )
+    select_engine = functools.partial(_select_batch_engine, model, n_legs, walk_batch.input_indices)
+    engine_by_solver = {SolverIndex.REQUESTED_SOLVER: select_engine(requested_engine, options)}
+    solver_indices = np.full(n_wheels, SolverIndex.REQUESTED_SOLVER, np.int32)
+    solver_names: tuple[str, ...] = (options.solver,)
+    engine_name = engine_by_solver[SolverIndex.REQUESTED_SOLVER].engine_name
+    if requested_engine == "auto" and engine_name == "lanes":
+        solver_names = (options.solver, STABLE_SOLVER_NAME, IMPLICIT_SOLVER_NAME)
+        solver_indices = select_cheapest_solver(
+            parameter_matrix, options.with_derivative_tolerances() if derivative_names else options
+        )
+        if np.any(solver_indices != SolverIndex.REQUESTED_SOLVER):
+            engine_by_solver[SolverIndex.STABLE_SOLVER] = select_engine(
+                "lanes",
+                dataclasses.replace(options, solver=STABLE_SOLVER_NAME).with_tightened_tolerances(
+                    STABLE_SOLVER_TIGHTENING_FACTOR
+                ),
+            )
+            engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = select_engine(
+                "diffrax", dataclasses.replace(options, solver=IMPLICIT_SOLVER_NAME)
+            )
+    for k in range(n_steps):
+        active_lanes = walk_batch.find_walking_lanes()
+        if is_ground_uneven:
+            parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
+        for solver_index, selected_engine in engine_by_solver.items():
+            lane_indices = active_lanes[solver_indices[active_lanes] == solver_index]
+            if not len(lane_indices):
+                continue
+            lanes = select_lanes(lane_indices, walk_batch)
+            next_slopes = (ground_slopes[k + 1][lanes],) if is_ground_uneven else ()
+            step_outputs = selected_engine.take_lane_steps(
+                parameter_matrix[:, lanes], walk_batch.section_state[:, lanes], *next_slopes
+            )
+            if solver_index == SolverIndex.STABLE_SOLVER:
+                # A phase may last longer than `select_cheapest_solver` assumes. The implicit
+                # solver, which is next, then repeats the step.
+                has_solver_failed = step_outputs[2] == Outcome.SOLVER_FAILED
+                solver_indices[lane_indices[has_solver_failed]] = SolverIndex.IMPLICIT_SOLVER
+                lane_indices = lane_indices[~has_solver_failed]
+                step_outputs = tuple(x[..., ~has_solver_failed] for x in step_outputs)
+            walk_batch.store_lane_steps(lane_indices, step_outputs)
+    return walk_batch.make_batch_result(wheel_order, solver_indices, engine_name, solver_names)
+
+
+def order_wheels_by_work(
+    values_by_parameter: list[np.ndarray], section_states: np.ndarray
+) -> np.ndarray:
+    """Return the batch indices sorted by the estimated work of a gait step, shape (elements,).
+
+    A group of lanes takes as long as its slowest lane, so wheels that need similar work become
+    neighbors. Most of the work is in SLS-I, in which stability limits the solver steps by m/c.
+    Leg 2 extends at the rate k (Ls - L)/c from its length at release. The exponents are rounded
+    from a fit to measured numbers of solver steps, for states near the gaits and far from them
+    (`python -m experiments.speed.straggler_steps`).
+    """
+    with np.errstate(all="ignore"):
+        float32_values = [np.asarray(x, np.float32) for x in values_by_parameter]
+        p = dict(zip(PARAMETER_NAMES, float32_values, strict=True))
+        theta, dtheta = section_states.T[:2].astype(np.float32)
+        log_solver_work = (
+            np.log(p["damping"] / p["leg_mass"])
+            - 0.25 * np.log(p["stiffness"] / p["leg_mass"])
+            + 0.8 * np.log(dtheta)
+            + 0.65 * np.log(p["locked_length"] / p["gravity"])
+            + theta
+            - 7.0 * p["natural_length"] / p["locked_length"]
+        )
+    return np.argsort(log_solver_work)
+
+
+class _BatchEngine(NamedTuple):
+    """Engine that computes one gait step for any number of lanes. The last axis of its NumPy arrays
+    is that of the lanes.
+    """
+
+    engine_name: str
+    take_lane_steps: Callable[..., tuple[np.ndarray, ...]]
+    """Function that computes one gait step. Its arguments are parameters, section states and, on
+    uneven ground, the slopes after the next landing.
+
+    The function returns section states, durations, outcomes, numbers of solver steps and, if
+    derivatives are requested, Jacobians.
+    """
+
+
+def _select_batch_engine(
+    model: Any,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    requested_engine: str,
+    options: StepOptions,
+) -> _BatchEngine:
+    """Return the requested engine, or the fastest engine that supports the model and the solver if
+    "auto" is requested.
+    """
+    has_lane_kernel = (
+        model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
+    )
+    if requested_engine == "lanes" and not has_lane_kernel:
+        raise ValueError(
+            f"the lane engine can't run {type(model).__name__} with {options.solver}: it supports "
+            "the viscoelastic wheel and explicit Runge-Kutta solvers; take engine='diffrax'."
+        )
+    if requested_engine == "diffrax" or not has_lane_kernel:
+        step_by_diffrax = functools.partial(
+            _step_lanes_by_diffrax, model, options.with_engine("diffrax"), n_legs, input_indices
+        )
+        return _BatchEngine("diffrax", step_by_diffrax)
+    step_by_kernel = functools.partial(
+        _step_lanes_by_kernel, model.stop_at_lift_off, options, n_legs, input_indices
+    )
+    return _BatchEngine("lanes", step_by_kernel)
+
+
+def _step_lanes_by_kernel(
+    stop_at_lift_off: bool,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    parameter_matrix: np.ndarray,
+    section_states: np.ndarray,
+    *next_slopes: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Return the results of one gait step for all lanes, computed by machine code or XLA.
+
+    The results are those of `_BatchEngine.take_lane_steps`.
+    """
+    compiled_step = _compile_lane_step(stop_at_lift_off, n_legs, input_indices, len(next_slopes))
+    kernel_results = compiled_step.run(
+        jax.tree.map(lambda x: np.asarray(x, parameter_matrix.dtype), options),
+        (*parameter_matrix, *section_states, *next_slopes),
+    )
+    _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
+    return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
+
+
+@functools.cache
+def _compile_lane_step(
+    stop_at_lift_off: bool, n_legs: int, input_indices: tuple[int, ...], n_next_slopes: int
+) -> CompiledBatchFunction:
+    """Return a compiled gait step of lanes, a function of options and inputs."""
+    n_parameters = len(PARAMETER_NAMES)
+
+    def step_lanes(
+        options: StepOptions, lane_step_inputs: Any, straggler_count: Array | None = None
+    ) -> tuple:
+        tableau = load_explicit_tableau(options.solver)
+        assert tableau is not None  # `_select_batch_engine` has checked the solver.
+        options = options.with_derivative_tolerances() if input_indices else options
+
+        def compute_step_outputs(*lane_step_inputs: Array) -> tuple:
+            params = make_wheel_from_parameters(
+                lane_step_inputs[:n_parameters], n_legs, *lane_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
+            )
+            x = lane_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
+            step_result, is_unfinished = advance_gait_step(
+                params, x, options, tableau, stop_at_lift_off, straggler_count
+            )
+            step_diagnostics = is_unfinished, step_result.outcome, step_result.solver_steps
+            return jnp.stack([*step_result.section_state, *step_result.durations]), step_diagnostics
+
+        if not input_indices:
+            step_outputs, step_diagnostics = compute_step_outputs(*lane_step_inputs)
+            return (*step_diagnostics, step_outputs)
+        # With respect to all inputs, two columns follow from the units.
+        differentiates_all_inputs = len(input_indices) == len(lane_step_inputs)
+        compute_jacobian_of_columns = (
+            complete_jacobian_columns if differentiates_all_inputs else compute_jacobian_columns
+        )
+        step_jacobian, step_outputs, step_diagnostics = compute_jacobian_of_columns(
+            compute_step_outputs, lane_step_inputs, input_indices
+        )
+        return (*step_diagnostics, step_outputs, step_jacobian)
+
+    n_kernel_inputs = N_STEP_INPUTS + n_next_slopes
+    return compile_batch_function(
+        step_lanes,
+        batch_sizes.XLA_LANE_BATCH_SIZE,
+        lanes.RegisterLimits(n_kernel_inputs) if input_indices else lanes.DEFAULT_REGISTER_LIMITS,
+        marks_unfinished_lanes=True,
+    )
+
+
+def _step_lanes_by_diffrax(
+    model: AbstractWheel,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    parameter_matrix: np.ndarray,
+    section_states: np.ndarray,
+    *next_slopes: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Return the results of one gait step for all lanes, computed by `model.advance` under
+    `jax.vmap`.
+
+    The results are those of `_BatchEngine.take_lane_steps`.
+    """
+    convert_options_dtype = functools.partial(
+        jax.tree.map, lambda step_option_leaf: np.asarray(step_option_leaf, parameter_matrix.dtype)
+    )
+    derivative_step_options = convert_options_dtype(options.with_derivative_tolerances())
+    options = convert_options_dtype(options)
+    step_input_matrix = np.vstack([parameter_matrix, section_states, *next_slopes]).T
+
+    def step_all_elements(
+        step_input_matrix: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]
+    ) -> Any:
+        step_element_block = functools.partial(
+            _step_elements_by_vmap, model, options, n_legs, input_indices
+        )
+        step_result_arrays = map_in_batches(
+            step_element_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), step_input_matrix
+        )
+        return jax.tree.map(lambda x: np.array(x).T, step_result_arrays)
+
+    def step_elements_with_jacobian(step_input_matrix: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the results of one gait step for all elements, with Jacobians.
+
+        A Jacobian is zero where no derivative exists. diffrax raises an error for the whole batch
+        if the implicit solver's linear equations for the derivative of one element cannot be
+        solved. Bisection isolates that element.
+        """
+        try:
+            step_result_arrays = step_all_elements(step_input_matrix, options, input_indices)
+        except eqx.EquinoxRuntimeError:
+            step_outputs = step_all_elements(step_input_matrix, derivative_step_options, ())
+            step_outcomes = step_outputs[2]
+            n_elements = len(step_input_matrix)
+            step_jacobian = np.zeros((len(input_indices), 6, n_elements), parameter_matrix.dtype)
+            step_result_arrays = (*step_outputs, step_jacobian)
+            stepped_element_indices = np.flatnonzero(step_outcomes == Outcome.STEPPED)
+            if len(stepped_element_indices) < n_elements:
+                retried_element_blocks = [stepped_element_indices]
+            elif n_elements > 1:
+                retried_element_blocks = np.array_split(stepped_element_indices, 2)
+            else:
+                retried_element_blocks, step_outcomes[:] = [], Outcome.SOLVER_FAILED
+            for element_indices in filter(len, retried_element_blocks):
+                block_step_results = step_elements_with_jacobian(step_input_matrix[element_indices])
+                for full_result_array, block_result_array in zip(
+                    step_result_arrays, block_step_results, strict=True
+                ):
+                    full_result_array[..., element_indices] = block_result_array
+        return step_result_arrays
+
+    return (
+        step_elements_with_jacobian(step_input_matrix)
+        if input_indices
+        else step_all_elements(step_input_matrix, options, ())
+    )
+
+
+@eqx.filter_jit
+def _step_elements_by_vmap(
+    model: AbstractWheel,
+    options: StepOptions,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    step_input_matrix: Array,
+) -> tuple[Array, ...]:
+    """Return section state, durations, outcome and number of solver steps of one gait step for each
+    element.
+
+    If there are `input_indices`, return also the Jacobians.
+
+    - `step_input_matrix`: inputs of the step, shape (elements, inputs);
+    - `input_indices`: indices of the inputs with respect to which the Jacobian is computed.
+    """
+    n_parameters = len(PARAMETER_NAMES)
+
+    def step_one_element(step_inputs: Array) -> tuple[Array, ...]:
+        def step_with_varied_inputs(varied_inputs: Array) -> tuple[Array, tuple[Array, ...]]:
+            updated_step_inputs = step_inputs.at[np.array(input_indices, int)].set(varied_inputs)
+            next_slope = updated_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
+            params = make_wheel_from_parameters(
+                updated_step_inputs[:n_parameters], n_legs, *next_slope
+            )
+            x = updated_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
+            step_result = model.advance(params, x, options)
+            return jnp.concatenate([step_result.section_state, step_result.durations]), (
+                step_result.section_state,
+                step_result.durations,
+                step_result.outcome,
+                step_result.solver_steps,
+            )
+
+        varied_inputs = step_inputs[np.array(input_indices, int)]
+        if not input_indices:
+            return step_with_varied_inputs(varied_inputs)[1]
+        step_jacobian, step_outputs = jax.jacfwd(step_with_varied_inputs, has_aux=True)(
+            varied_inputs
+        )
+        return *step_outputs, step_jacobian
+
+    return jax.vmap(step_one_element)(step_input_matrix)

@@ -1,0 +1,562 @@
+"""Single steps, the return map, and walks of many steps.
+
+All functions are pure and take a single wheel. They work with `jit`, `vmap` and every mode of
+differentiation. The function that computes a step is compiled once per model.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Int
+
+from vrw_jax.base.checks import check_int, check_reals, check_type, format_value
+from vrw_jax.base.options import EngineName, StepOptions
+from vrw_jax.base.printing import (
+    AbstractPrintable,
+    LabelAndText,
+    format_numbers,
+    format_outcome_counts,
+    format_quantity,
+)
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.status_codes import describe_step_ending
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.contact_record import UnilateralStep
+from vrw_jax.models.interface import AbstractWheel, StepGroundValues
+from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
+from vrw_jax.models.registry import describe_accepted_models
+from vrw_jax.models.step_inputs import SectionState
+from vrw_jax.models.step_results import AdvanceResult, StepResult
+from vrw_jax.models.unilateral_wheel import UnilateralWheel
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams
+
+SectionStateLike = Array | np.ndarray | Sequence[float]
+"""Section state in any form that users may pass.
+
+`convert_step_arguments` converts it to an array.
+"""
+ModelLike = AbstractWheel | Literal["auto"]
+"""Model in any form that users may pass. "auto" means `LadderWheel()`, which uses the simplest
+valid model.
+"""
+
+
+@with_default_jax_settings
+def paper_start() -> SectionState:
+    """Return a section state in the basin of attraction of the gait of Table 1 of the paper.
+
+    Returns:
+        The section state (theta-, dtheta-, dL1-), shape (3,), in rad, rad/s, m/s.
+
+    Examples:
+        >>> vrw.paper_start().round(4).tolist()
+        [0.1, 1.6, -0.1]
+    """
+    return ViscoelasticWheel().compute_default_start(WheelParams())
+
+
+def convert_model_argument(
+    model: ModelLike | None, allows_friction_arrays: bool = False
+) -> AbstractWheel:
+    """Return the given model, the paper's model for None, or a `LadderWheel` for "auto".
+
+    Raise a `TypeError` if the argument is not a model. Raise a `ValueError` if the model's friction
+    is an array although `allows_friction_arrays` is False.
+    """
+    if model is None:
+        return _make_default_model()
+    if isinstance(model, str) and model == "auto":
+        return LadderWheel()
+    if not isinstance(model, AbstractWheel):
+        raise TypeError(
+            f"model is {format_value(model)}, but a model of the wheel is needed: give "
+            f"{describe_accepted_models()}."
+        )
+    if not allows_friction_arrays and (
+        friction_shape := jnp.shape(getattr(model, "friction", 0.0))
+    ):
+        raise ValueError(
+            f"friction has shape {friction_shape}, but this call is for one ground: give one "
+            "number, or vary it in a design of vrw.scan; vrw.step_batch takes one for each "
+            "element, vrw.walk one for each of its steps."
+        )
+    return model
+
+
+def require_compliant_model(model: AbstractWheel, computation_text: str, command_name: str) -> None:
+    """Raise a `TypeError` if springs and dampers do not affect the motion of a model.
+
+    - `computation_text`: clause in the error message that states why compliant legs are required;
+    - `command_name`: command whose accepted models the error message lists.
+    """
+    if not model.is_compliant:
+        raise TypeError(
+            f"model is {model!r}, but {computation_text} compliant legs: give "
+            f"{describe_accepted_models(command_name)}."
+        )
+
+
+_make_default_model = functools.cache(ViscoelasticWheel)
+
+
+def require_single_wheel(params: Any, remedy_text: str) -> None:
+    """Raise a `TypeError` or a `ValueError` if `params` is not a single wheel.
+
+    - `remedy_text`: advice with which the error message ends.
+    """
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    WheelParams.require_single_wheel(params, remedy_text)  # An unbound call is much faster.
+
+
+def convert_step_options(options: StepOptions | None) -> StepOptions:
+    """Return the given step options, or `StepOptions()` for None.
+
+    Raise a `TypeError` if the argument has another type.
+    """
+    if options is not None:
+        check_type(
+            "options", options, StepOptions, "give vrw.StepOptions(), or vrw.StepOptions.tight()"
+        )
+        StepOptions.require_scalar_options(
+            options
+        )  # An unbound call is faster: binding takes 0.1 ms.
+    return _make_default_step_options(jnp.result_type(float)) if options is None else options
+
+
+@functools.cache
+def _make_default_step_options(dtype: np.dtype) -> StepOptions:
+    """Return the default step options for a floating-point type.
+
+    They are concrete even inside `jit`, and are created once per type.
+    """
+    with jax.ensure_compile_time_eval():
+        return StepOptions()
+
+
+def convert_section_state(
+    x: Any, state_argument_name: str = "the section state", state_converter: Callable = check_reals
+) -> Any:
+    """Return the section state as an array, converted by `state_converter`.
+
+    - `state_argument_name`: name of the argument in error messages;
+    - `state_converter`: function that checks and converts the state, and raises an error if the
+      state is invalid.
+    """
+    return state_converter(
+        state_argument_name,
+        x,
+        "give (theta-, dtheta-, dL1-), as vrw.paper_start(), or that of a cycle, "
+        "cycle.section_state",
+    )
+
+
+def convert_step_arguments(
+    params: WheelParams,
+    x: object,
+    model: ModelLike | None,
+    options: StepOptions | None,
+    engine: EngineName = "auto",
+    batch_remedy_text: str = "map over batches of parameters with jax.vmap, or use vrw.scan",
+    allows_default_start: bool = False,
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
+    """Return wheel, section state, model and options, converted to one floating-point type.
+
+    Raise a `TypeError` or a `ValueError` if an argument is invalid.
+
+    - `batch_remedy_text`: advice with which the error message for a batch of wheels ends;
+    - `allows_default_start`: whether None as `x` is the default start of the model.
+    """
+    require_single_wheel(params, batch_remedy_text)
+    model = convert_model_argument(model)
+    options = StepOptions.with_engine(convert_step_options(options), engine)
+    if x is None and allows_default_start:
+        x = model.compute_default_start(params)
+    section_state = convert_section_state(x)
+    section_size = model.count_section_entries(params)
+    if section_state.shape == (3,) and section_size != 3:
+        section_state = model.complete_section_state(params, section_state)
+    if section_state.shape != (section_size,):
+        full_state_shape_text = (
+            "" if section_size == 3 else f", or this model’s own of shape ({section_size},)"
+        )
+        raise ValueError(
+            f"the section state has shape {section_state.shape}, but it is (theta-, dtheta-, "
+            f"dL1-), shape (3,){full_state_shape_text}: for batches map over it with jax.vmap."
+        )
+    # Parameters made in single precision stay inaccurate after a conversion to double precision.
+    StepOptions.check_tolerances(options, jnp.result_type(*jax.tree.leaves(params)))
+    common_dtype = jnp.result_type(section_state, params.damping)
+    StepOptions.check_tolerances(options, common_dtype)
+
+    converted_arguments = params, section_state, options
+    if any(leaf.dtype != common_dtype for leaf in jax.tree.leaves(converted_arguments)):
+        converted_arguments = jax.tree.map(
+            lambda leaf: leaf.astype(common_dtype), converted_arguments
+        )
+    params, section_state, options = converted_arguments
+    return params, section_state, model, options
+
+
+@overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams,
+    x: SectionStateLike,
+    *,
+    model: UnilateralWheel,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> UnilateralStep: ...
+
+
+@overload
+def step(  # type: ignore[overload-overlap]
+    params: WheelParams,
+    x: SectionStateLike,
+    *,
+    model: LadderWheel | Literal["auto"],
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> LadderStep: ...
+
+
+@overload
+def step(
+    params: WheelParams,
+    x: SectionStateLike,
+    *,
+    model: AbstractWheel | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> StepResult: ...
+
+
+@announce_wait("a gait step", "5 s")
+@with_default_jax_settings
+def step(
+    params: WheelParams,
+    x: SectionStateLike,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> StepResult | UnilateralStep | LadderStep:
+    """Compute one step from touchdown to touchdown, with its indicators, margins and energies.
+
+    The `outcome` of the step describes how the step ended. A fall raises no exception. Numerical
+    errors of the results and of their first derivatives are below 1e-9 with the default options,
+    and below 1e-12 with `StepOptions.tight()`.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+
+    Returns:
+        A `StepResult`; a `UnilateralStep` with unilateral contact, or a `LadderStep` for "auto".
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())
+        >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
+        0.714 s, STEPPED
+    """
+    params, section_state, model, options = _convert_single_step_arguments(
+        params, x, model, options, engine
+    )
+    return model.take_step(params, section_state, options)
+
+
+@announce_wait("a gait step", "5 s")
+@with_default_jax_settings
+def return_map(
+    params: WheelParams,
+    x: SectionStateLike,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> Array:
+    """Return the section state after one step, or zeros if the step failed.
+
+    The function computes no margins. The map is differentiable in forward and reverse mode, to any
+    order.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+
+    Returns:
+        The section state just before the next touchdown, with the shape of `x`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> params, x = vrw.WheelParams(damping=150.0), vrw.paper_start()
+        >>> vrw.return_map(params, x).round(4).tolist()
+        [0.091, 1.7355, -0.1587]
+        >>> jax.jacfwd(vrw.return_map, argnums=1)(params, x).shape
+        (3, 3)
+    """
+    params, section_state, model, options = _convert_single_step_arguments(
+        params, x, model, options, engine
+    )
+    return model.advance(params, section_state, options).section_state
+
+
+class Walk(AbstractPrintable):
+    """Results of consecutive steps, without margins. Arrays have a leading axis over steps.
+
+    - `start`: section state at the start;
+    - `steps`: section state, durations and outcome of each step;
+    - `n_stepped`: number of steps before the first failure.
+
+    Examples:
+        >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
+        >>> walk.steps.section_state.shape
+        (5, 3)
+    """
+
+    start: Array
+    steps: AdvanceResult
+    n_stepped: Int[Array, ""]
+
+    @property
+    def outcome(self) -> Array:
+        """Return the outcome of the first failed step, or STEPPED if no step failed."""
+        last_step_index = self.steps.outcome.shape[-1] - 1
+        return jnp.take_along_axis(
+            self.steps.outcome, jnp.minimum(self.n_stepped, last_step_index)[..., None], axis=-1
+        )[..., 0]
+
+    @property
+    def ending(self) -> Any:
+        """Return a sentence that describes how the walk ended, or an array of sentences for a
+        batch.
+        """
+        return describe_step_ending(self.outcome, Outcome)
+
+    def summary_rows(self) -> list[LabelAndText]:
+        """Return labels and printed texts: outcome, number of steps, start, last state and time."""
+        walk_outcome = np.asarray(self.outcome)
+        if walk_outcome.ndim:
+            return [("walks", format_outcome_counts(walk_outcome, Outcome))]
+        last_step_index = max(int(self.n_stepped) - 1, 0)
+        return [
+            ("outcome", Outcome(int(walk_outcome)).meaning),
+            ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
+            ("start", f"{format_numbers(self.start)} (rad, rad/s, m/s)"),
+            ("last section state", format_numbers(self.steps.section_state[last_step_index])),
+            ("time", format_quantity(np.sum(self.steps.durations), "s")),
+        ]
+
+
+@eqx.filter_jit
+def _simulate_walk_by_scan(
+    model: AbstractWheel,
+    params: WheelParams,
+    x: Array,
+    options: StepOptions,
+    n_steps: int,
+    stepwise_ground: StepGroundValues | None,
+) -> Walk:
+    """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
+    step.
+
+    - `stepwise_ground`: ground of each step, see `convert_walk_arguments`; None for flat ground.
+    """
+
+    def advance_walk_by_one_step(
+        state_and_outcome: tuple, step_ground: StepGroundValues | None
+    ) -> tuple:
+        """Return the state and the outcome after one step, and the results of this step.
+
+        After a failure, the state and the outcome do not change.
+        """
+        x, outcome = state_and_outcome
+        is_walking = outcome == Outcome.STEPPED
+        step_model, step_params = (
+            (model, params) if step_ground is None else model.with_step_ground(params, step_ground)
+        )
+        step_result = step_model.advance(step_params, jnp.where(is_walking, x, jnp.nan), options)
+        outcome = jnp.where(is_walking, step_result.outcome, outcome)
+        step_result = dataclasses.replace(
+            step_result,
+            durations=jnp.where(is_walking, step_result.durations, 0.0),
+            outcome=outcome,
+            solver_steps=jnp.where(is_walking, step_result.solver_steps, 0),
+        )
+        return (step_result.section_state, outcome), step_result
+
+    step_results: AdvanceResult
+    _, step_results = lax.scan(
+        advance_walk_by_one_step, (x, jnp.int32(Outcome.STEPPED)), stepwise_ground, length=n_steps
+    )
+    return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
+
+
+@announce_wait("a gait step", "5 s")
+@with_default_jax_settings
+def walk(
+    params: WheelParams,
+    x: SectionStateLike,
+    n_steps: int,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+) -> Walk:
+    """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
+    step.
+
+    On uneven ground, `params.slope` is an array with one slope per step. The ground then consists
+    of straight lines between the footholds with these slopes. In the double support of step k both
+    feet are on line k. The step begins at the foothold where this line ends. The step ends when the
+    next foot meets line k + 1. Therefore n steps use n + 1 slopes; if n slopes are given, the last
+    one is used twice. A section state is in the frame of the line that ends at its landing; the
+    start is in the frame of line 0. Force components are tangential and normal to line k. With
+    unilateral contact, the friction of the model may also be an array with one coefficient per
+    step. The coefficient of each foot is that of the step in which it landed.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        n_steps: largest number of steps.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+
+    Returns:
+        A `Walk` whose fields have a leading axis over the steps.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
+        >>> int(walk.n_stepped), walk.steps.durations.shape
+        (5, (5, 3))
+    """
+    n_steps = check_int("n_steps", n_steps)
+    params, section_state, checked_model, options, stepwise_ground = convert_walk_arguments(
+        params, x, n_steps, model, options, engine
+    )
+    return _simulate_walk_by_scan(
+        checked_model, params, section_state, options, n_steps, stepwise_ground
+    )
+
+
+def _convert_single_step_arguments(
+    params: Any, x: object, model: ModelLike | None, options: StepOptions | None, engine: EngineName
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
+    """Return the wheel, the section state, the model and the options of one step on its ground."""
+    params, section_state, model, options, stepwise_ground = convert_walk_arguments(
+        params, x, 1, model, options, engine
+    )
+    if stepwise_ground is not None:
+        model, params = model.with_step_ground(params, tuple(x[0] for x in stepwise_ground))
+    return params, section_state, model, options
+
+
+def convert_walk_arguments(
+    params: Any,
+    x: object | None,
+    n_steps: int,
+    model: ModelLike | None,
+    options: StepOptions | None,
+    engine: EngineName,
+    **start_checks: Any,
+) -> tuple[WheelParams, Array, AbstractWheel, StepOptions, StepGroundValues | None]:
+    """Return wheel, section state, model and options of a walk, and the ground of each step.
+
+    They are converted to one floating-point type. The wheel and the model are those on the ground
+    of the first step. On flat ground, the ground of the steps is None.
+
+    - `start_checks`: further arguments of `convert_step_arguments`.
+    """
+    checked_model = convert_model_argument(model, allows_friction_arrays=True)
+    stepwise_ground = (
+        checked_model.split_ground_by_step(params, n_steps)
+        if isinstance(params, WheelParams)
+        else None
+    )
+    if stepwise_ground is not None:
+        checked_model, _ = checked_model.with_step_ground(
+            params, tuple(ground_by_step[0] for ground_by_step in stepwise_ground)
+        )
+        first_step_slope = jnp.reshape(params.slope, -1)[0]
+        params = eqx.tree_at(lambda wheel: wheel.slope, params, first_step_slope)
+    params, section_state, checked_model, options = convert_step_arguments(
+        params, x, checked_model, options, engine, **start_checks
+    )
+    if stepwise_ground is not None:
+        stepwise_ground = tuple(
+            ground_by_step.astype(section_state.dtype) for ground_by_step in stepwise_ground
+        )
+    return params, section_state, checked_model, options, stepwise_ground
+
+
+def start_walk_toward_gait(
+    model: AbstractWheel, params: WheelParams, options: StepOptions, n_steps: int = 100
+) -> Walk:
+    """Simulate a walk from the default start of the model toward an attracting gait.
+
+    - `n_steps`: number of steps. The walk need not reach the gait, because a search from its last
+      state follows.
+    """
+    return walk(params, model.compute_default_start(params), n_steps, model=model, options=options)
+
+
+@announce_wait("a gait step of each model", "20 s")
+@with_default_jax_settings
+def choose_model(
+    params: WheelParams,
+    start: SectionStateLike,
+    *,
+    friction: float | Array = 0.7,
+    options: StepOptions | None = None,
+) -> ModelChoice:
+    """Return the simplest model whose margins hold over one step from `start`.
+
+    `start` is the section state (theta-, dtheta-, dL1-) of the paper's model, or the full section
+    state of `UnilateralWheel`. `jax.vmap` can map the function over batches.
+
+    Args:
+        params: the wheel.
+        start: section state, shape (3,), or a full state of `UnilateralWheel`.
+        friction: friction coefficient of the ground.
+        options: numerical options of the steps.
+
+    Returns:
+        A `ModelChoice` with the chosen `model` and the reason.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> choice = vrw.choose_model(vrw.WheelParams(), vrw.paper_start(), friction=0.7)
+        >>> type(choice.model).__name__
+        'UnilateralWheel'
+    """
+    model = LadderWheel(friction=friction)
+    params, x, _, options = convert_step_arguments(params, start, model, options)
+    return model.choose_model(params, x, options)[0]

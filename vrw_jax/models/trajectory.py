@@ -1,0 +1,427 @@
+"""Labeled trajectories of walks: motion, forces, energy and positions, with units and provenance.
+
+The axis x points downhill along the slope, and z is normal to the slope. The origin is the first
+foothold. Angles and leg labels refer to the present step, so theta and the lengths jump at a
+landing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.base.checks import check_int, require_untraced_arguments
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import EngineName, StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.contact_mechanics import (
+    compute_foot_heights,
+    compute_foot_positions,
+    compute_kinetic_energy,
+    compute_leg_directions,
+    compute_potential_energy,
+)
+from vrw_jax.models.contact_state import PackedState, unpack_state
+from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
+from vrw_jax.models.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
+from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.step_inputs import complete_ground_line_slopes, separate_next_slope
+from vrw_jax.models.stepping import ModelLike, SectionStateLike, convert_walk_arguments
+from vrw_jax.models.unilateral_wheel import UnilateralTrajectory
+from vrw_jax.wheel.dynamics import compute_damping_power
+from vrw_jax.wheel.geometry import Motion, rotate_to_landing_leg, rotate_to_rear_leg
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams
+
+
+@announce_wait("gait steps and their samples", "5 s")
+@with_default_jax_settings
+def simulate(
+    params: WheelParams,
+    x: SectionStateLike | None = None,
+    n_steps: int = 10,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    engine: EngineName = "auto",
+    n_samples: int = 100,
+) -> xr.Dataset:
+    """Simulate a walk from the section state `x` and return it as a labeled trajectory over time.
+
+    If `x` is None, the walk begins at the default start of the model, near the gait of Table 1 of
+    the paper. Uneven ground is specified as in `vrw.walk`. Positions are then in the frame of the
+    first line of the ground. Angles and forces of a step are in the frame of the line under both
+    feet in double support. The attribute `line_slopes` contains the slopes of all lines.
+
+    Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
+    jumps is therefore listed twice, with the values before and after the jump. A failed step ends
+    the trajectory at the event, and the attributes `outcome` and `outcome_meaning` state the cause.
+    Numerical errors are those of `vrw.step`.
+
+    Args:
+        params: the wheel.
+        x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
+        n_steps: largest number of steps.
+        model: the model; by default that of the paper, `ViscoelasticWheel()`. "auto" chooses the
+            simplest valid model.
+        options: numerical options of the steps.
+        engine: engine that computes the steps; see `StepOptions`.
+        n_samples: number of times per phase, including both ends, at least 2.
+
+    Returns:
+        A dataset over `time` with coordinates, rates, foot positions, forces and energies, and
+        their units. With unilateral contact, some variables also have the dimension `leg`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> walk = vrw.simulate(vrw.WheelParams(damping=150.0), n_steps=1)
+        >>> walk.lambda_2.attrs["units"], walk.attrs["outcome"]
+        ('N', 'STEPPED')
+    """
+    require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x)
+    n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
+    given_params = params
+    params, x, model, options, stepwise_ground = convert_walk_arguments(
+        params,
+        x,
+        n_steps,
+        model,
+        options,
+        engine,
+        batch_remedy_text="simulate one at a time",
+        allows_default_start=True,
+    )
+    s = jax.tree.map(float, params).symbols()
+    line_slopes = given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
+    ground_lines = GroundLines(
+        np.asarray(complete_ground_line_slopes(line_slopes, n_steps), float), float(s.Mt * s.g)
+    )
+    models_and_wheels = [(model, params)] * n_steps
+    if stepwise_ground is not None:
+        models_and_wheels = [
+            model.with_step_ground(params, step_ground)
+            for step_ground in zip(*stepwise_ground, strict=True)
+        ]
+    specify_trajectory = (
+        specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
+    )
+    trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
+    sampled_columns, n_stepped, walk_outcome = sample_walk_steps(
+        trajectory_spec, x, n_steps, ground_lines
+    )
+    dataset_variables = make_labeled_variables(
+        {
+            variable_name: sampled_columns[variable_name]
+            for variable_name in trajectory_spec.variable_names
+        },
+        "time",
+    )
+    for variable_name in filter(sampled_columns.__contains__, SELECTION_VARIABLE_ATTRIBUTES):
+        dataset_variables[variable_name] = xr.Variable(
+            "time", sampled_columns[variable_name], SELECTION_VARIABLE_ATTRIBUTES[variable_name]
+        )
+    walk_attributes = {
+        "title": f"Walk of the {type(model).__name__}",
+        "n_steps": n_stepped,
+        "outcome": walk_outcome.name,
+        "outcome_meaning": walk_outcome.meaning,
+        "start": np.asarray(x).tolist(),
+    }
+    provenance_attributes = trajectory_spec.dataset_attributes | collect_provenance_attributes(
+        params, model, options
+    )
+    if stepwise_ground is not None:
+        provenance_attributes |= {
+            "frame": UNEVEN_GROUND_FRAME_TEXT,
+            "slopes": ground_lines.slopes.tolist(),
+        }
+        del provenance_attributes["parameter_slope"]
+    dataset = xr.Dataset(
+        dataset_variables,
+        trajectory_spec.extra_coordinates,
+        walk_attributes | provenance_attributes,
+    )
+    return dataset.set_coords(dataset_variables.keys() & {"step", "phase"})
+
+
+class SampledStep(NamedTuple):
+    """Samples of one step in each interval between two events.
+
+    Besides the variables of the trajectory, `sampled_columns` contains `landing_foot_x` and
+    `landing_foot_z`. Their last values are the position (m) at which the next foot lands.
+    """
+
+    sampled_columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
+    durations: np.ndarray  # duration of each interval, s; 0 if it did not occur
+    outcome: Outcome
+    next_section_state: Array  # section state at the end of the step
+
+
+class TrajectorySpecification(NamedTuple):
+    """Function that samples a step of a model, and the names and attributes of trajectory
+    variables.
+    """
+
+    step_sampler: Callable[[Array, int], SampledStep]  # arguments: section state, step index
+    variable_names: tuple[str, ...]  # names of the measures over time
+    slope_position_names: tuple[str, ...]  # names of the positions along the slope
+    extra_coordinates: dict[str, Any]  # additional coordinates of the dataset
+    dataset_attributes: dict[str, object]
+
+
+HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
+"""Energies that depend on the height of the reference point, which is the first foothold of the
+walk.
+"""
+
+
+UNEVEN_GROUND_FRAME_TEXT = (
+    "positions: x downhill along line 0, z normal to it, first foot at the origin; angles and "
+    "forces: along and normal to the line under both feet of the step's double support"
+)
+"""Text for the attribute `frame` of a trajectory on uneven ground."""
+
+
+class GroundLines(NamedTuple):
+    """Slopes of all lines of the ground, and the weight of the wheel."""
+
+    slopes: np.ndarray  # rad
+    wheel_weight: float  # N
+
+    def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
+        """Return the components of a vector in the frame of line 0 of the ground.
+
+        - `k`: index of the line of the ground in whose frame x and z are components of the vector.
+        """
+        angle_from_line_0 = self.slopes[k] - self.slopes[0]
+        sine_of_angle, cosine_of_angle = np.sin(angle_from_line_0), np.cos(angle_from_line_0)
+        return x * cosine_of_angle + z * sine_of_angle, z * cosine_of_angle - x * sine_of_angle
+
+    def compute_potential_energy(self, x: float, z: float) -> float:
+        """Return the potential energy of the wheel's weight at (x, z) in the frame of line 0, J."""
+        height = z * np.cos(self.slopes[0]) - x * np.sin(self.slopes[0])
+        return self.wheel_weight * height
+
+
+def sample_walk_steps(
+    trajectory_spec: TrajectorySpecification, x: Array, n_steps: int, ground_lines: GroundLines
+) -> tuple[dict[str, np.ndarray], int, Outcome]:
+    """Return samples of the walk from the section state x. The walk ends at the first failed step.
+
+    Return also the number of completed steps and the outcome of the last step. The samples have the
+    shape (time, ...); they are empty if no interval occurred.
+
+    The samples of a step are in the frame of the line of the ground under both feet in double
+    support. Positions (m) and energies (J) are converted to the frame of line 0. Its origin is the
+    first foothold.
+    """
+    columns_by_step = []
+    walk_outcome, k, step_start_time = Outcome.STEPPED, 0, 0.0
+    foothold_x, foothold_z = 0.0, 0.0
+    is_ground_uneven = np.ptp(ground_lines.slopes) > 0.0
+    while walk_outcome == Outcome.STEPPED and k < n_steps:
+        sampled_step = trajectory_spec.step_sampler(x, k)
+        has_occurred = sampled_step.durations > 0.0
+        occurred_intervals = (
+            slice(None) if has_occurred.all() else has_occurred
+        )  # slices copy nothing
+        columns = {
+            name: samples[occurred_intervals].reshape(-1, *samples.shape[2:])
+            for name, samples in sampled_step.sampled_columns.items()
+        }
+        landing_foot_x = columns.pop("landing_foot_x")
+        landing_foot_z = columns.pop("landing_foot_z")
+        for name in trajectory_spec.slope_position_names:
+            normal_name = f"{name[:-1]}z"
+            position_x, position_z = ground_lines.rotate_to_line_0(
+                k, columns[name], columns[normal_name]
+            )
+            columns[name], columns[normal_name] = position_x + foothold_x, position_z + foothold_z
+        for name in columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
+            columns[name] = columns[name] + ground_lines.compute_potential_energy(
+                foothold_x, foothold_z
+            )
+        columns["time"] = columns["time"] + step_start_time
+        columns["step"] = np.full(len(columns["time"]), k)
+        columns_by_step.append(columns)
+        walk_outcome = sampled_step.outcome
+        if walk_outcome == Outcome.STEPPED:
+            # On even ground, the height of a foot that lands is a numerical error.
+            displacement_x, displacement_z = ground_lines.rotate_to_line_0(
+                k, float(landing_foot_x[-1]), float(landing_foot_z[-1]) * is_ground_uneven
+            )
+            foothold_x, foothold_z = foothold_x + displacement_x, foothold_z + displacement_z
+            k += 1
+            step_start_time += float(sampled_step.durations.sum())
+            x = sampled_step.next_section_state
+    walk_columns = {
+        name: np.concatenate([columns[name] for columns in columns_by_step])
+        for name in columns_by_step[0]
+    }
+    return walk_columns, k, walk_outcome
+
+
+_sample_step = eqx.filter_jit(lambda model, *arguments: model.sample_step(*arguments))
+
+
+StepwiseModelsAndWheels = list[tuple[Any, WheelParams]]
+"""Model and wheel for each step."""
+
+
+def specify_phase_trajectory(
+    models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
+) -> TrajectorySpecification:
+    """Return the trajectory specification for a model whose steps have the paper's phases."""
+
+    def sample_phase_step(x: Array, k: int) -> SampledStep:
+        step_model, step_params = models_and_wheels[k]
+        trajectory = _sample_step(step_model, step_params, x, options, n_samples)
+        s = jax.tree.map(float, separate_next_slope(step_params)[0]).symbols()
+        phase_durations = np.asarray(trajectory.durations)
+        state, energies, foot_forces = (
+            np.moveaxis(np.asarray(samples), -1, 0)
+            for samples in (trajectory.state, trajectory.energy, trajectory.forces)
+        )
+        motion = Motion.from_angle(*state)
+        rear_leg_direction = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta)
+        landing_leg_direction = rotate_to_landing_leg(s, motion.sin_theta, motion.cos_theta)
+        # Positions are relative to the foot of Leg 1.
+        hub_x, hub_z = motion.L1 * motion.sin_theta, motion.L1 * motion.cos_theta
+        zero_names = ("x", "z", "dx", "dz", "foot_1_x", "foot_1_z")
+        step_columns = {
+            **dict.fromkeys(zero_names, np.zeros_like(hub_x)),
+            **dict(zip(("theta", "L1", "L2", "dtheta", "dL1", "dL2"), state, strict=True)),
+            "time": np.array(trajectory.time),
+            **{f"lambda_{i + 1}": foot_force for i, foot_force in enumerate(foot_forces)},
+            **dict(zip(ENERGY_NAMES, energies, strict=True)),
+            "total_energy": sum(energies),
+            "damping_power": compute_damping_power(s, motion),
+            "foot_2_x": hub_x - motion.L2 * rear_leg_direction.sin,
+            "foot_2_z": hub_z - motion.L2 * rear_leg_direction.cos,
+            "hub_x": hub_x,
+            "hub_z": hub_z,
+            "landing_foot_x": hub_x - s.L0 * landing_leg_direction.sin,
+            "landing_foot_z": hub_z - s.L0 * landing_leg_direction.cos,
+            "phase": np.tile(np.arange(len(phase_durations))[:, None], (1, n_samples)),
+        }
+        return SampledStep(
+            step_columns,
+            phase_durations,
+            Outcome(int(trajectory.outcome)),
+            trajectory.section_state,
+        )
+
+    return TrajectorySpecification(
+        sample_phase_step,
+        tuple(TRAJECTORY_MEASURES),
+        ("x", "foot_1_x", "foot_2_x", "hub_x"),
+        {},
+        {
+            "frame": "x downhill along the slope, z normal to it, first foot at the origin",
+            "start_meaning": "theta-, dtheta-, dL1- just before the first landing, rad, rad/s, m/s",
+        },
+    )
+
+
+CONTACT_MOTION_NAMES = ("time", "step", "hub_x", "hub_z", "theta", "dtheta")
+ENERGY_NAMES = ("kinetic_energy", "gravitational_energy", "elastic_energy")
+
+
+@eqx.filter_jit
+def _compute_contact_columns(
+    model: Any, params: WheelParams, x: Array, options: StepOptions, n_samples: int
+) -> tuple[UnilateralTrajectory, dict[str, Array]]:
+    """Compute a step with unilateral contact, and return its trajectory and its sampled variables.
+
+    The samples have the shape (phase, sample) or (phase, sample, leg).
+    """
+    s, trajectory = params.symbols(), model.sample_step(params, x, options, n_samples)
+
+    def compute_state_quantities(y: PackedState) -> dict[str, Array]:
+        """Return positions (m), rates and energies (J) for one state, by the name of the
+        variable.
+        """
+        wheel_motion, _ = unpack_state(y)
+        leg_directions_of_state = compute_leg_directions(s, wheel_motion.theta)
+        gravitational_energy, elastic_energy = compute_potential_energy(s, wheel_motion)
+        return {
+            "hub_x": wheel_motion.x,
+            "hub_z": wheel_motion.z,
+            "theta": wheel_motion.theta,
+            "dtheta": wheel_motion.dtheta,
+            "kinetic_energy": compute_kinetic_energy(s, wheel_motion),
+            "gravitational_energy": gravitational_energy,
+            "elastic_energy": elastic_energy,
+            "length": wheel_motion.L,
+            "length_rate": wheel_motion.dL,
+            "foot_x": compute_foot_positions(wheel_motion, leg_directions_of_state),
+            "foot_z": compute_foot_heights(wheel_motion, leg_directions_of_state),
+        }
+
+    state_quantities = jax.vmap(jax.vmap(compute_state_quantities))(trajectory.state)
+    return trajectory, state_quantities | {
+        "tangential": trajectory.tangential,
+        "normal": trajectory.normal,
+    }
+
+
+def specify_contact_trajectory(
+    models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
+) -> TrajectorySpecification:
+    """Return the trajectory specification for a model with unilateral contact.
+
+    Its variables are over time and leg. Leg labels are those of the current step. Each interval
+    between two events has `n_samples` times, including both ends. For a `LadderWheel`, the
+    variables `rung` and `reason` contain the codes of the model and of the reason at each time (see
+    `ModelChoice`).
+    """
+
+    friction_by_step = [float(model.friction) for model, _ in models_and_wheels]
+
+    def sample_contact_step(x: Array, k: int) -> SampledStep:
+        trajectory, step_columns = jax.tree.map(
+            np.array, _compute_contact_columns(*models_and_wheels[k], x, options, n_samples)
+        )
+        sample_shape = (len(trajectory.duration), n_samples)
+        repeat_over_samples = lambda values_by_leg: np.repeat(
+            values_by_leg[:, None], n_samples, axis=1
+        )
+        step_columns |= {
+            "time": trajectory.time,
+            "contact": repeat_over_samples(trajectory.contact),
+            "on_stopper": repeat_over_samples(trajectory.locked),
+            "landing_foot_x": np.full(sample_shape, trajectory.step_length),
+            "landing_foot_z": step_columns["foot_z"][..., -1],  # The foremost foot has landed.
+        }
+        step_columns |= {
+            variable_name: np.full(sample_shape, int(model_selection_code))
+            for variable_name, model_selection_code in trajectory.model_selection.items()
+        }
+        return SampledStep(
+            step_columns,
+            trajectory.duration,
+            Outcome(int(trajectory.outcome)),
+            jnp.asarray(trajectory.section_state),
+        )
+
+    return TrajectorySpecification(
+        sample_contact_step,
+        (*CONTACT_MOTION_NAMES, *ENERGY_NAMES, *CONTACT_MEASURES),
+        ("hub_x", "foot_x"),
+        {"leg": np.arange(1, models_and_wheels[0][1].n_legs + 1)},
+        {
+            "frame": "x downhill along the slope, z normal to it, first landing at the origin",
+            "friction": friction_by_step[0]
+            if len(set(friction_by_step)) == 1
+            else friction_by_step,
+        },
+    )

@@ -1,0 +1,351 @@
+"""Model of the wheel with unilateral contact and Coulomb friction, for any order of events."""
+
+import dataclasses
+import functools
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vrw_jax.base.checks import check_choice, check_int, check_reals, check_type
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Elementwise, RealInput, Scalar
+from vrw_jax.lanes.autodiff import ForwardFunction, enable_all_ad_modes
+from vrw_jax.models.batch_step import can_use_batch_kernel
+from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
+from vrw_jax.models.contact_record import UnilateralStep
+from vrw_jax.models.contact_section import (
+    FullState,
+    compute_full_section_size,
+    compute_section_units,
+    embed_section_state,
+)
+from vrw_jax.models.contact_step import (
+    ContactStepConfig,
+    build_contact_step_function,
+    build_contact_step_jacobian,
+    build_contact_step_sampler,
+)
+from vrw_jax.models.interface import AbstractWheel, StepGroundValues
+from vrw_jax.models.step_inputs import (
+    PAPER_START_STATE,
+    complete_ground_line_slopes,
+    require_stepwise_shape,
+)
+from vrw_jax.models.step_results import AdvanceResult
+from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, WheelParams, convert_friction
+from vrw_jax.wheel.units import WheelUnits
+
+STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
+"""Kinds of stoppers for legs in the air: they hold the leg with any force, or they only push."""
+FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
+"""Meaning of infinite friction: limit of large friction, or rule (A1)-(A4) of the paper."""
+
+
+class UnilateralTrajectory(eqx.Module):
+    """Motion during one step with unilateral contact, sampled between events.
+
+    The axes are (phase, sample). A phase that did not happen has duration 0. The origin is the
+    position of the landing at which the step starts.
+    """
+
+    time: Float[Array, "phases n"]  # time since the landing, s
+    state: Float[Array, "phases n dim"]  # see `contact_state.PackedState`
+    contact: Int[Array, "phases legs"]  # `ContactMode` of every foot
+    locked: Bool[Array, "phases legs"]  # whether each leg is on its stopper
+    tangential: Float[Array, "phases n legs"]  # force on every foot, N
+    normal: Float[Array, "phases n legs"]
+    duration: Float[Array, " phases"]  # s
+    section_state: FullState  # full section state after the step
+    step_length: Scalar
+    outcome: Int[Array, ""]
+    model_selection: dict[str, Array] = eqx.field(default_factory=dict)  # see `ModelChoice`
+
+
+class UnevenGround(NamedTuple):
+    """Uneven ground of one step: friction under earlier feet, and tilt of the next line."""
+
+    friction: Scalar  # friction coefficient of the feet that landed earlier
+    tilt: Scalar  # angle by which the next line is steeper, rad
+
+
+def _convert_restitution(restitution_coefficient: Any) -> Array | None:
+    """Return Newton's coefficient of restitution as an array; None if it is None or 0.
+
+    A value outside [0, 1] raises a ValueError.
+    """
+    if restitution_coefficient is None or (
+        isinstance(restitution_coefficient, float | int) and restitution_coefficient == 0
+    ):
+        return None
+    restitution = check_reals("restitution", restitution_coefficient)
+    if not isinstance(restitution, jax.core.Tracer) and not jnp.all(
+        (restitution >= 0.0) & (restitution <= 1.0)
+    ):
+        raise ValueError(
+            f"restitution is {restitution_coefficient}, but it is a ratio of speeds: give a number "
+            "from 0 to 1."
+        )
+    return restitution
+
+
+class AbstractContactWheel(AbstractWheel):
+    """Model whose section state is the full section state, with a contact mode for each leg."""
+
+    friction: eqx.AbstractVar[Scalar]
+    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
+    reports_contacts: ClassVar[bool] = True
+
+    def explain_impossible_gait(self, params: WheelParams) -> str:
+        """Return a sentence that states why one wheel can't have a gait, or "" if it may have one.
+
+        During a period T of a gait of total mass M, the momentum along the slope changes by
+        M g sin(slope) T plus the sum of the tangential impulses on the feet. The normal impulses
+        sum to M g cos(slope) T. Coulomb's law limits every tangential force and impulse to friction
+        times the normal one. The momentum is the same after a period only if friction is at least
+        tan(slope).
+        """
+        friction, required_friction = float(self.friction), math.tan(float(params.slope))
+        if friction >= required_friction:
+            return super().explain_impossible_gait(params)
+        return (
+            f"No steady gait can exist: friction is {friction:g}, below tan(slope) = "
+            f"{required_friction:.4g}, so the wheel slides down faster with each step."
+        )
+
+    def compute_default_start(self, params: WheelParams) -> FullState:
+        """Return a full section state near the gait of the wheel in Table 1 of the paper."""
+        return embed_section_state(
+            params.symbols(), jnp.asarray(PAPER_START_STATE, params.damping.dtype)
+        )
+
+    def count_section_entries(self, params: WheelParams) -> int:
+        return compute_full_section_size(params.n_legs)
+
+    def count_continuous_section_entries(self, params: WheelParams) -> int:
+        return compute_full_section_size(params.n_legs) - params.n_legs
+
+    def collect_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
+        return compute_section_units(wheel_units, n_legs)
+
+    def complete_section_state(self, params: WheelParams, x: Array) -> FullState:
+        """Return the full section state for `x`, shape (4 + 3 n,).
+
+        `x` may be a full section state or (theta-, dtheta-, dL1-), the section state of the paper.
+        """
+        return _embed_section_compiled(params, x) if x.shape == (3,) else x
+
+
+class UnilateralWheel(AbstractContactWheel):
+    """Model of the wheel with unilateral contact and Coulomb friction.
+
+    Feet push on the ground and slide by Coulomb's law. The events may have any order, and every
+    foot may land, slide or lift off.
+
+    - `friction`: friction coefficient of the ground, `inf` for infinite friction (see
+      `infinite_friction_rule`);
+    - `max_events`: largest number of events in one step. A contact slower than the rest speed comes
+      to rest. The rest speed grows with each event after a quarter of this number, or after 100
+      events if that is more;
+    - `stoppers`: if "bilateral", a leg in the air that has reached its stopper stays there until
+      its foot is loaded. If "one-sided", the leg leaves the stopper as soon as the stopper would
+      have to pull;
+    - `restitution`: ratio of a striking foot's normal speeds after and before the impact. The ratio
+      is reduced if it would increase the energy. None has the effect of 0 and compiles to a smaller
+      program;
+    - `infinite_friction_rule`: meaning of infinite friction. "limit" is the limit of large
+      friction. "paper" is the rule (A1) to (A4) of the paper, extended to cases that the rule does
+      not cover;
+    - `uneven`: differences between footholds on uneven ground. `vrw.walk` sets this field from the
+      slopes and friction coefficients of the steps.
+
+    Examples:
+        >>> wheel = vrw.UnilateralWheel(friction=0.7)
+        >>> step = vrw.step(vrw.WheelParams(damping=300.0), vrw.paper_start(), model=wheel)
+        >>> print(f"{step.slip:.2f} m of slip, {vrw.Outcome(int(step.outcome)).name}")
+        0.04 m of slip, STEPPED
+    """
+
+    model_name: ClassVar[str] = "unilateral"
+    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
+        config_name="unilateral",
+        gait_method=GaitMethod.CONTACT_WALKS,
+        accepted_cli_commands=frozenset({"scan", "tune", "branch", "explore"}),
+        fields_with_fixed_defaults=(
+            "restitution",
+            "infinite_friction_rule",
+            "uneven",
+            "max_events",
+        ),
+    )
+    batch_kernel: ClassVar[str] = "legs"
+
+    friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
+    max_events: int = eqx.field(
+        static=True, converter=partial(check_int, "max_events"), default=400
+    )
+    stoppers: str = eqx.field(static=True, default=STOPPERS_BILATERAL)
+    restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
+    infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
+    uneven: UnevenGround | None = None
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            friction: RealInput = 0.7,
+            max_events: int = 400,
+            stoppers: Literal["bilateral", "one-sided"] = "bilateral",
+            restitution: RealInput | None = None,
+            infinite_friction_rule: Literal["limit", "paper"] = "limit",
+            uneven: UnevenGround | None = None,
+        ) -> None: ...
+
+    def __check_init__(self) -> None:
+        check_choice("stoppers", self.stoppers, (STOPPERS_BILATERAL, STOPPERS_ONE_SIDED))
+        check_choice(
+            "infinite_friction_rule",
+            self.infinite_friction_rule,
+            (FRICTION_LIMIT, FRICTION_PAPER_RULE),
+        )
+        if self.uneven is not None:
+            check_type("uneven", self.uneven, UnevenGround, "leave it out, vrw.walk sets it")
+
+    @property
+    def has_one_sided_stoppers(self) -> bool:
+        """Return whether stoppers of legs in the air only push, so that legs can leave them."""
+        return self.stoppers == STOPPERS_ONE_SIDED
+
+    @property
+    def uses_paper_rule(self) -> bool:
+        """Return whether infinite friction means the rule (A1)-(A4) of the paper."""
+        return self.infinite_friction_rule == FRICTION_PAPER_RULE
+
+    def split_ground_by_step(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
+        """Return the ground under each step, or None on flat ground with one friction coefficient.
+
+        The result is (slope in rad, friction coefficient, friction coefficient of the feet that
+        landed earlier, tilt of the next line in rad), each of shape (n_steps,).
+        """
+        slope, friction = params.slope, self.friction
+        if slope.ndim == friction.ndim == 0:
+            return None
+        is_flat_ground = slope.ndim == 0
+        line_slopes = (
+            jnp.full(n_steps + 1, slope)
+            if is_flat_ground
+            else complete_ground_line_slopes(slope, n_steps)
+        )
+        if friction.ndim:
+            require_stepwise_shape(FRICTION_NAME, friction, n_steps)
+        friction = jnp.broadcast_to(friction[:n_steps] if friction.ndim else friction, n_steps)
+        previous_friction = jnp.append(friction[:1], friction[:-1])
+        return line_slopes[:-1], friction, previous_friction, line_slopes[1:] - line_slopes[:-1]
+
+    def with_step_ground(
+        self, params: WheelParams, step_ground: StepGroundValues
+    ) -> tuple["UnilateralWheel", WheelParams]:
+        slope, friction, previous_friction, tilt = step_ground
+        model = dataclasses.replace(
+            self, friction=friction, uneven=UnevenGround(previous_friction, tilt)
+        )
+        return model, eqx.tree_at(lambda wheel: wheel.slope, params, slope)
+
+    def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:
+        step_outputs, engine = self._compute_step(params, x, options, is_detailed=False)
+        section_state, durations, outcome, solver_steps = step_outputs
+        return AdvanceResult(section_state, durations, outcome, solver_steps, engine=engine)
+
+    def take_step(self, params: WheelParams, x: FullState, options: StepOptions) -> UnilateralStep:
+        return self._compute_step(params, x, options, is_detailed=True)[0]
+
+    def measure_force_peaks(
+        self, params: WheelParams, x: FullState, options: StepOptions
+    ) -> dict[str, Array]:
+        step_result, _ = self._compute_step(
+            params, x, options, is_detailed=True, measures_force_peaks=True
+        )
+        return step_result.force_peaks.compute_force_measures() | {
+            "landing_impulse": step_result.landing_normal[..., 0]
+        }
+
+    def _compute_step(
+        self,
+        params: WheelParams,
+        x: FullState,
+        options: StepOptions,
+        is_detailed: bool,
+        measures_force_peaks: bool = False,
+    ) -> tuple[Any, str]:
+        """Return the results of one step, and the name of the engine that computed them."""
+        leaves, argument_structure = self._flatten_arguments(params, x, options)
+        engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
+        compute_compiled_step = _compile_step(
+            argument_structure, is_detailed, engine, measures_force_peaks
+        )
+        return eqx.combine(*compute_compiled_step(*leaves)), engine
+
+    def _flatten_arguments(
+        self, params: WheelParams, x: FullState, options: StepOptions
+    ) -> tuple[list, Any]:
+        """Return the leaves and the tree structure of (wheel, params, x, options)."""
+        # `dataclasses.replace` would validate friction again, which may be traced.
+        model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
+        return jax.tree.flatten((model, params, x, options))
+
+    def sample_step(
+        self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
+    ) -> UnilateralTrajectory:
+        leaves, argument_structure = self._flatten_arguments(params, x, options)
+        config = ContactStepConfig(argument_structure, True, not can_use_batch_kernel(options))
+        contact_interval_log, step_summary, outcome, states, tangential_forces, normal_forces = (
+            build_contact_step_sampler(config, n_samples)(*leaves)
+        )
+        durations = contact_interval_log.durations
+        start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(durations)[:-1]])
+        sample_times = jnp.linspace(0.0, 1.0, n_samples) * durations[:, None]
+        return UnilateralTrajectory(
+            time=start_times[:, None] + sample_times,
+            state=states,
+            contact=contact_interval_log.contact_modes,
+            locked=contact_interval_log.is_leg_locked,
+            tangential=tangential_forces,
+            normal=normal_forces,
+            duration=durations,
+            section_state=step_summary.section_state,
+            step_length=step_summary.step_length,
+            outcome=outcome,
+        )
+
+
+_embed_section_compiled = jax.jit(lambda params, x: embed_section_state(params.symbols(), x))
+
+
+@functools.cache
+def _compile_step(
+    argument_structure: Any, is_detailed: bool, engine: str, measures_force_peaks: bool
+) -> ForwardFunction:
+    """Return the function that computes a step from the leaves of (wheel, params, x, options).
+
+    The function is differentiable in every AD mode.
+    """
+
+    diffrax_config = ContactStepConfig(
+        argument_structure, is_detailed, True, engine, measures_force_peaks
+    )
+    compute_step_by_diffrax = build_contact_step_function(diffrax_config)
+    step_with_tight_tolerances = lambda *leaves: compute_step_by_diffrax(
+        *diffrax_config.tighten_tolerances(leaves)
+    )
+    if engine == "diffrax":
+        return enable_all_ad_modes(compute_step_by_diffrax, step_with_tight_tolerances)
+    config = diffrax_config._replace(uses_diffrax=False)
+    return enable_all_ad_modes(
+        build_contact_step_function(config),
+        step_with_tight_tolerances,
+        partial(build_contact_step_jacobian, config),
+    )

@@ -1,0 +1,272 @@
+"""Basins of attraction and gait sensitivity norms of the gaits at points of a branch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.base.checks import check_int, check_names, check_type
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.branches.branch import Branch
+from vrw_jax.gaits.finder_selection import resolve_finder
+from vrw_jax.gaits.gait_search import limit_cycle
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.measures import MEASURES, make_measure_attributes
+from vrw_jax.models.step_batch import step_batch
+from vrw_jax.models.stepping import ModelLike, convert_model_argument, convert_step_options
+from vrw_jax.studies.basin_share import StartBox, compute_basin_share, parse_start_box
+from vrw_jax.studies.gait_arrival import StableGait
+from vrw_jax.studies.gait_sensitivity import compute_gait_sensitivity, parse_sensitivity_measures
+from vrw_jax.studies.smallest_disturbance import compute_smallest_disturbance
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+
+BASIN_VARIABLE_ATTRS = {
+    "basin_share": ("1", "share of the box of starts that ends up on the gait"),
+    "basin_share_error": ("1", "standard error of that share"),
+    "smallest_disturbance": ("rad/s", "smallest change of dtheta that leaves the basin"),
+    "smallest_disturbance_error": ("rad/s", "error of that change"),
+}
+"""Unit and meaning of each variable in the dataset that `measure_basins` returns."""
+
+
+@announce_wait("gaits and walks", "20 s")
+@with_default_jax_settings
+def measure_basins(
+    branch: Branch,
+    box: StartBox | None = None,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    n_points: int = 16,
+    n_starts: int = 1024,
+    max_steps: int = 200,
+) -> xr.Dataset:
+    """Return the sizes of the basins of attraction of the stable gaits on a branch.
+
+    The result has at most `n_points` points, evenly spaced over the points of the branch, both ends
+    included. Its coordinate is the parameter of the branch. Variables are NaN at points of unstable
+    gaits. With a `box`, the variables include `basin_share` and `basin_share_error` (see
+    `basin_share`). For models that can start within a step, the variables include
+    `smallest_disturbance` and `smallest_disturbance_error`, rad/s (see `smallest_disturbance`).
+
+    Args:
+        branch: a branch of gaits of one step, from `continue_branch`.
+        box: bounds of the starts, as in `basin_share`; without a box, no shares are computed.
+        model: the model of the branch, if it is not the paper's.
+        options: numerical options of the gait steps.
+        n_points: largest number of points.
+        n_starts: number of start states at each point.
+        max_steps: largest number of gait steps of a walk.
+
+    Returns:
+        A dataset with the dimension `point`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, or if the branch has another model.
+
+    Examples:
+        >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 200.0))
+        >>> vrw.measure_basins(branch, n_points=2).smallest_disturbance.values.round(3).tolist()
+        [0.126, 0.109]
+    """
+    checked_model = convert_model_argument(model)
+    checked_step_options = convert_step_options(options)
+    n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
+    box_bounds = None if box is None else parse_start_box(box)
+    point_indices = _select_branch_points(branch, checked_model, n_points)
+    can_start_within_gait_step = checked_model.capabilities.can_start_within_gait_step
+    variable_names = [
+        *(["basin_share", "basin_share_error"] if box_bounds else []),
+        *(
+            ["smallest_disturbance", "smallest_disturbance_error"]
+            if can_start_within_gait_step
+            else []
+        ),
+    ]
+
+    def measure_point(stable_gait: StableGait) -> list[float]:
+        values_at_point = []
+        if box_bounds:
+            share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
+            values_at_point += [share_result.share, share_result.share_error]
+        if can_start_within_gait_step:
+            disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
+            values_at_point += [disturbance_result.size, disturbance_result.size_error]
+        return values_at_point
+
+    point_values = [
+        measure_point(_load_branch_gait(branch, i, checked_model, checked_step_options))
+        if branch.stable[i]
+        else [np.nan] * len(variable_names)
+        for i in point_indices
+    ]
+    return _make_point_dataset(
+        branch,
+        point_indices,
+        point_values,
+        {variable_name: BASIN_VARIABLE_ATTRS[variable_name] for variable_name in variable_names},
+        f"Basins of the gaits along {branch.parameter}",
+    )
+
+
+@announce_wait("gaits and their response to slopes", "20 s")
+@with_default_jax_settings
+def measure_gait_sensitivity(
+    branch: Branch,
+    measures: str | Sequence[str],
+    *,
+    model: ModelLike | None = None,
+    options: CycleOptions | StepOptions | None = None,
+    n_points: int | None = None,
+) -> xr.Dataset:
+    """Return the gait sensitivity norms of measures along a branch.
+
+    The result has at most `n_points` points, evenly spaced over the points of the branch, both ends
+    included. Its coordinate is the parameter of the branch. The variable
+    `gait_sensitivity_<measure>` contains the norm of one measure, in the measure's unit per rad
+    (see `gait_sensitivity`). The norm is infinite at points of unstable gaits. Next to a fold two
+    gaits may be too close for `limit_cycle` to separate. The norm is then NaN.
+
+    Args:
+        branch: a branch of gaits of one step, from `continue_branch`.
+        measures: names of measures of a gait step, such as "period", "speed" or a margin.
+        model: the model of the branch, if it is not the paper's.
+        options: as in `limit_cycle`.
+        n_points: largest number of points; by default all points of the branch.
+
+    Returns:
+        A dataset with the dimension `point`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, or if the branch has another model.
+
+    Examples:
+        >>> branch = vrw.continue_branch(vrw.WheelParams(), "damping", (190.0, 200.0))
+        >>> norms = vrw.measure_gait_sensitivity(branch, "period", n_points=2)
+        >>> norms.gait_sensitivity_period.values.round(3).tolist()
+        [3.365, 3.509]
+    """
+    checked_model = convert_model_argument(model)
+    measure_names = check_names("measures", measures)
+    point_indices = _select_branch_points(branch, checked_model, n_points)
+    point_norms = []
+    for i in point_indices:
+        branch_gait = _load_branch_gait(branch, i, checked_model, StepOptions())
+        params, point_model = branch_gait.params, branch_gait.model
+        cycle_finder = resolve_finder(params, point_model, options)
+        parse_sensitivity_measures(cycle_finder, measure_names)
+        guess = branch_gait.section_states[0]
+        cycle: Any = limit_cycle(params, guess=guess, model=point_model, options=options)
+        is_same_gait = (
+            int(cycle.outcome) == Outcome.STEPPED
+            and branch_gait.is_on_gait(np.asarray(cycle.section_state)[None])[0]
+        )
+        point_norms.append(
+            compute_gait_sensitivity(cycle_finder, params, cycle, measure_names).norm
+            if is_same_gait
+            else [np.nan] * len(measure_names)
+        )
+    variable_attrs = {
+        f"gait_sensitivity_{measure_name}": (
+            f"{MEASURES[measure_name].unit} per rad",
+            f"gait sensitivity norm of {MEASURES[measure_name].long_name}",
+        )
+        for measure_name in measure_names
+    }
+    return _make_point_dataset(
+        branch,
+        point_indices,
+        point_norms,
+        variable_attrs,
+        f"Gait sensitivity norms along {branch.parameter}",
+    )
+
+
+def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | None) -> list[int]:
+    """Return the indices of at most `n_points` points of a branch, evenly spaced.
+
+    Both ends are included. If `n_points` is None, the result contains all points. Raise TypeError
+    or ValueError if an argument is invalid, if the branch has another model or no point.
+    """
+    check_type("branch", branch, Branch, "give the result of vrw.continue_branch")
+    branch_attrs = branch.dataset.attrs
+    if branch_attrs.get("model") != repr(model):
+        raise ValueError(
+            f"the branch is one of {branch_attrs.get('model', 'a map')}, but model is "
+            f"{model!r}: give the model of the branch."
+        )
+    n_branch_points = len(branch.values)
+    if not n_branch_points:
+        raise ValueError(
+            f"the branch has no gait: {branch.ending} Take a wheel for which vrw.limit_cycle finds "
+            "a gait."
+        )
+    if n_points is not None:
+        n_points = min(check_int("n_points", n_points), n_branch_points)
+    spaced_points = np.linspace(0, n_branch_points - 1, n_points or n_branch_points)
+    return np.unique(spaced_points.round().astype(int)).tolist()
+
+
+def _make_point_dataset(
+    branch: Branch,
+    point_indices: list[int],
+    point_values: list[Any],
+    variable_attrs: dict[str, tuple[str, str]],
+    title: str,
+) -> xr.Dataset:
+    """Return a dataset of variables at points of a branch, with the parameter as coordinate.
+
+    - `point_indices`: indices of the points of the branch;
+    - `point_values`: values of all variables at each point;
+    - `variable_attrs`: unit and meaning of each variable.
+    """
+    point_variables = {
+        variable_name: xr.Variable("point", values, {"units": unit, "long_name": meaning})
+        for (variable_name, (unit, meaning)), values in zip(
+            variable_attrs.items(), np.array(point_values, float).T, strict=True
+        )
+    }
+    branch_coordinates = {
+        branch.parameter: xr.Variable(
+            "point", branch.values[point_indices], make_measure_attributes(branch.parameter)
+        )
+    }
+    return xr.Dataset(point_variables, branch_coordinates, branch.dataset.attrs | {"title": title})
+
+
+def _load_branch_gait(
+    branch: Branch, point_index: int, model: AbstractWheel, options: StepOptions
+) -> StableGait:
+    """Return the gait of one step at point `point_index` of a branch, stable or not.
+
+    Raise ValueError if the gait does not repeat after one step.
+    """
+    branch_attrs, float_dtype = branch.dataset.attrs, branch.dataset.attrs["dtype"]
+    parameter_values = {
+        parameter_name: jnp.asarray(branch_attrs[f"parameter_{parameter_name}"], float_dtype)
+        for parameter_name in PARAMETER_NAMES
+        if f"parameter_{parameter_name}" in branch_attrs
+    }
+    params = WheelParams(**parameter_values, n_legs=branch_attrs["parameter_n_legs"])
+    point_model, params = model.with_parameter(
+        params, branch.parameter, jnp.asarray(branch.values[point_index], float_dtype)
+    )
+    section_state = np.asarray(branch.dataset.section_state.values[point_index])[None]
+    stable_gait = StableGait(params, point_model, options, section_state)
+    next_section_state = step_batch(
+        params, section_state, model=point_model, options=options
+    ).section_state
+    if not stable_gait.is_on_gait(next_section_state)[0]:
+        raise ValueError(
+            "a gait of the branch does not repeat after one step, but robustness along branches is "
+            "that of gaits of one step: continue a branch with period_n=1."
+        )
+    return stable_gait

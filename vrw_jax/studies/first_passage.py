@@ -1,0 +1,427 @@
+"""Mean number of gait steps until a wheel fails on uneven ground (first-passage time)."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float, Int
+
+from vrw_jax.base.checks import (
+    check_int,
+    check_positive,
+    has_traced_leaf,
+    require_untraced_arguments,
+)
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.printing import AbstractPrintable, LabelAndText
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.status_codes import StatusCode, describe_step_ending
+from vrw_jax.base.types import Scalar
+from vrw_jax.gaits.finder_selection import resolve_model
+from vrw_jax.gaits.gait_search import limit_cycle
+from vrw_jax.lanes.autodiff import make_zero_tangent
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.capabilities import PassageMethod
+from vrw_jax.models.stepping import (
+    ModelLike,
+    convert_model_argument,
+    convert_step_options,
+    require_single_wheel,
+)
+from vrw_jax.studies.passage_gradient import differentiate_log_mean_steps
+from vrw_jax.studies.rigid_passage import solve_rigid_passage
+from vrw_jax.studies.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+
+MAX_QUADRATURE_NODES = 3200
+"""Largest number n of quadrature nodes, chosen because an n by n matrix then takes 80 MB."""
+
+SAMPLED_STEP_TOLERANCE = 1e-5
+"""Relative and absolute tolerance of sampled gait steps without unilateral contact.
+
+The value is chosen because the error of a section state is then only a ten-thousandth of its
+standard deviation over random slopes. With unilateral contact and infinite friction, one step in a
+thousand would end with a spurious Painlevé paradox even at tolerances of 1e-6.
+"""
+
+SAMPLED_TRACING_REMEDY = "take jax.grad of a function that is not compiled"
+"""Remedy in the error message for a sampled computation inside `jit` or `vmap`."""
+
+
+class PassageStatus(StatusCode):
+    """Status of the computation of first-passage times: whether its error is small enough."""
+
+    CONVERGED = 0, "The error estimate is within the tolerance."
+    TOLERANCE_NOT_MET = 1, "The error estimate exceeds the tolerance: allow more nodes or steps."
+    NO_FAILURE = 2, "No walk failed, however uneven its slopes were made: the mean has no estimate."
+    UNKNOWN_ERROR = (
+        3,
+        "The error is unknown: sampled walks miss failures, or a few of them dominate the mean.",
+    )
+    START_NOT_FORGOTTEN = (
+        4,
+        "The effect of the start exceeds the tolerance: allow more walkers or a larger error.",
+    )
+
+
+class FirstPassage(AbstractPrintable):
+    """Mean numbers of gait steps until failure, with the eigenvalues of the survival operator.
+
+    A line joins two footholds. Means include the step onto the line on which the wheel fails.
+
+    - `mean_steps`: mean for starts from the quasi-stationary distribution, 1/(1 - kappa_1);
+    - `mean_steps_from_gait`: mean for a start on the gait, before a landing on a line of the mean
+      slope. If walks are sampled, its relative error is at most 1.5 times that of `mean_steps`;
+    - `failure_probability`: probability 1 - kappa_1 that a step from the quasi-stationary
+      distribution fails;
+    - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays. If
+      walks are sampled, its error is some hundredths. It is NaN if more walkers are needed for an
+      estimate;
+    - `error`: error estimate of `mean_steps`. If walks are sampled, it is half the width of a 99 %
+      confidence interval, plus the effect of the start. It is infinite if the sampled walks miss
+      failures, if a few walks dominate the mean, or if `kappa_2` is NaN;
+    - `states`: states of the quasi-stationary distribution. For quadrature, they are squared
+      angular rates at the instant at which the stance leg is vertical, 1/s^2, shape (n, 1). For
+      sampled walks, they are section states with the slope as last component;
+    - `weights`: weights of the states, with the sum 1;
+    - `status`: a `PassageStatus`;
+    - `end_names`, `end_fractions`: names of the outcomes that end walks, and the fraction of walks
+      that each outcome ends;
+    - `n_steps`: number of sampled gait steps; 0 for quadrature.
+
+    Examples:
+        >>> wheel = vrw.RigidWheel(stop_at_lift_off=False)
+        >>> params = vrw.WheelParams(slope=0.14, leg_mass=1e-9)
+        >>> passage = vrw.first_passage(params, 0.0436, model=wheel)
+        >>> print(f"{passage.mean_steps:.1f} steps, {passage.kappa_2:.3f}")
+        432.6 steps, 0.490
+    """
+
+    mean_steps: Scalar
+    mean_steps_from_gait: Scalar
+    failure_probability: Scalar
+    kappa_2: Scalar
+    error: Scalar
+    states: Float[Array, "n n_state"]
+    weights: Float[Array, " n"]
+    status: Int[Array, ""]
+    end_fractions: Float[Array, " n_ends"]
+    end_names: tuple[str, ...] = eqx.field(static=True)
+    n_steps: int = eqx.field(static=True, default=0)
+
+    @property
+    def kappa_1(self) -> Scalar:
+        """Return the leading eigenvalue of the survival operator: the probability that a step from
+        the quasi-stationary distribution succeeds.
+        """
+        return 1.0 - self.failure_probability
+
+    @property
+    def ending(self) -> str:
+        """Return a sentence on whether the error is within the tolerance."""
+        return describe_step_ending(self.status, PassageStatus)
+
+    def summary_rows(self) -> list[LabelAndText]:
+        """Return pairs of label and text for means, failure probability, outcomes and status."""
+        end_texts = [
+            f"{outcome_name} {100 * outcome_fraction:.3g} %"
+            for outcome_name, outcome_fraction in zip(
+                self.end_names, np.asarray(self.end_fractions), strict=True
+            )
+        ]
+        return [
+            ("mean steps", f"{float(self.mean_steps):,.6g} (error {float(self.error):.2g})"),
+            ("from the gait", f"{float(self.mean_steps_from_gait):,.6g}"),
+            ("failure probability of a step", f"{float(self.failure_probability):.6g}"),
+            ("ends", ", ".join(end_texts) or "none"),
+            ("sampled steps", f"{self.n_steps:,}" if self.n_steps else "none: quadrature"),
+            ("status", self.ending),
+        ]
+
+
+@announce_wait("gaits and random walks", "10 s")
+@with_default_jax_settings
+def first_passage(
+    params: WheelParams,
+    slope_sd: float | Scalar,
+    *,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    seed: int = 0,
+    n_nodes: int = 400,
+    n_walkers: int = 8192,
+    tol: float | None = None,
+    max_steps: int = 5_000_000,
+) -> FirstPassage:
+    """Return the mean number of gait steps until failure on random slopes (Byl and Tedrake 2009).
+
+    The slopes of the lines that join the footholds are independent and normal, with mean
+    `params.slope`. A walk ends at the first step whose outcome is not STEPPED. A landing on a slope
+    outside the domain of slopes also ends the walk. In the paper's model, a failure is a departure
+    from the sequence of phases, and need not be a fall. Walks of a `UnilateralWheel` continue after
+    such a departure.
+
+    For the rigid wheel, the kernel of its one-dimensional map has a closed form. Quadrature then
+    computes the mean, even if walks take billions of steps. The model must be
+    `RigidWheel(stop_at_lift_off=False)`, and `mean_steps` has first derivatives with respect to
+    `params` and `slope_sd`.
+
+    For other models, walks are sampled. Importance sampling makes failures frequent, so that the
+    number of sampled steps does not grow with the mean. The error is then half the width of a 99 %
+    confidence interval.
+
+    `jax.grad` of a sampled mean returns first derivatives with an error of a few percent. A walk
+    fails beyond a radius in the space of slopes, and this radius is a smooth function of the
+    parameters. The derivatives neglect terms of the relative size 1/`mean_steps`. They are computed
+    from concrete values, so `jit` and `vmap` do not accept sampled means. A `WheelObjective` passes
+    them to `tune`.
+
+    Args:
+        params: parameters of the wheel; the slope is the mean slope.
+        slope_sd: standard deviation of the slopes, rad.
+        model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
+        options: numerical options of sampled gait steps; by default rtol and atol are 1e-5, or with
+            unilateral contact those of `StepOptions()`.
+        seed: seed of the random slopes.
+        n_nodes: initial number of quadrature nodes, doubled until the relative error is at most
+            `tol`.
+        n_walkers: number of walks that are simulated at the same time, rounded up to 32 times a
+            power of two.
+        tol: relative error of `mean_steps`; by default 1e-8 for quadrature and 0.02 for sampled
+            walks.
+        max_steps: number of sampled gait steps after which no further walks begin.
+
+    Returns:
+        A `FirstPassage`: the mean number of steps, its error, and the outcomes that end walks.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, if the wheel has no gait, or if the slopes
+            are so uneven that no step succeeds.
+
+    Examples:
+        >>> passage = vrw.first_passage(vrw.WheelParams(), 0.02, tol=0.1)
+        >>> passage.end_names
+        ('TOUCHDOWN_BEFORE_STOPPER',)
+    """
+    require_single_wheel(params, "take one after the other")
+    if not has_traced_leaf(slope_sd):
+        slope_sd = check_positive("slope_sd", slope_sd)
+    seed, n_nodes = check_int("seed", seed, 0), check_int("n_nodes", n_nodes, 8)
+    n_walkers, max_steps = check_int("n_walkers", n_walkers), check_int("max_steps", max_steps)
+    tol = None if tol is None else check_positive("tol", tol)
+    resolved_model: Any = convert_model_argument(resolve_model(params, model))
+    if resolved_model.capabilities.passage_method == PassageMethod.QUADRATURE:
+        return _solve_passage_by_quadrature(
+            params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8
+        )
+    require_untraced_arguments(
+        "vrw.first_passage", "differentiate by the wheel only", resolved_model
+    )
+    if options is None:
+        options = (
+            StepOptions()
+            if resolved_model.reports_contacts
+            else StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
+        )
+    estimate_passage = functools.partial(
+        _estimate_passage_by_sampling,
+        model=resolved_model,
+        options=convert_step_options(options),
+        seed=seed,
+        n_walkers=n_walkers,
+        relative_tolerance=tol or 0.02,
+        max_steps=max_steps,
+    )
+    if not has_traced_leaf(params, slope_sd):
+        return estimate_passage(params, float(slope_sd))[0]
+    return _estimate_differentiable_passage(estimate_passage, params, slope_sd)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _estimate_differentiable_passage(
+    estimate_passage: Callable[..., tuple[FirstPassage, dict[str, float]]],
+    params: WheelParams,
+    slope_sd: Any,
+) -> FirstPassage:
+    """Return the `FirstPassage` that sampled walks estimate, with means that JAX can differentiate.
+
+    Raise TypeError if the parameters of the wheel are abstract, as inside `jit` and `vmap`.
+    """
+    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
+    return estimate_passage(params, float(slope_sd))[0]
+
+
+@functools.partial(_estimate_differentiable_passage.defjvp, symbolic_zeros=True)
+def _differentiate_passage(
+    estimate_passage: Callable[..., tuple[FirstPassage, dict[str, float]]],
+    primals: tuple[WheelParams, Any],
+    tangents: tuple[WheelParams, Any],
+) -> tuple[FirstPassage, FirstPassage]:
+    """Return the `FirstPassage` that sampled walks estimate, and its tangent."""
+    params, slope_sd = primals
+    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
+    params_tangent, slope_sd_tangent = tangents
+    tangent_by_name = {name: getattr(params_tangent, name) for name in PARAMETER_NAMES}
+    tangent_by_name = {
+        name: tangent
+        for name, tangent in (tangent_by_name | {"slope_sd": slope_sd_tangent}).items()
+        if not isinstance(tangent, SymbolicZero)
+    }
+    sampled_passage, derivative_by_name = estimate_passage(
+        params, float(slope_sd), differentiated_parameter_names=tuple(tangent_by_name)
+    )
+    log_mean_steps_tangent = sum(
+        derivative_by_name[name] * tangent for name, tangent in tangent_by_name.items()
+    )
+    passage_tangent = eqx.tree_at(
+        lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability),
+        make_zero_tangent(sampled_passage),
+        (
+            sampled_passage.mean_steps * log_mean_steps_tangent,
+            sampled_passage.mean_steps_from_gait * log_mean_steps_tangent,
+            -sampled_passage.failure_probability * log_mean_steps_tangent,
+        ),
+    )
+    return sampled_passage, passage_tangent
+
+
+def _solve_passage_by_quadrature(
+    params: WheelParams, slope_sd: Array, model: Any, n_nodes: int, relative_tolerance: float
+) -> FirstPassage:
+    """Return the `FirstPassage` of the rigid wheel, computed by quadrature.
+
+    The number of nodes is doubled until the error is within `relative_tolerance`. For traced
+    arguments, the number is not doubled. Raise ValueError if the model stops at lift-off or the
+    wheel has no gait.
+    """
+    if model.stop_at_lift_off:
+        raise ValueError(
+            "RigidWheel has stop_at_lift_off=True, but the kernel in closed form has no lift-off: "
+            "give vrw.RigidWheel(stop_at_lift_off=False)."
+        )
+    if (
+        not has_traced_leaf(params)
+        and not float(model.make_vertical_rate_map(params).compute_fixed_point(params.slope)) > 0
+    ):
+        raise ValueError(
+            f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "
+            "steeper one."
+        )
+    survival_analysis, *_ = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
+    while True:
+        coarse_mean_steps = 1.0 / survival_analysis.failure_probability
+        survival_analysis, mean_steps_from_gait, squared_rate_nodes = solve_rigid_passage(
+            params, slope_sd, model, n_nodes
+        )
+        mean_steps = 1.0 / survival_analysis.failure_probability
+        error = lax.stop_gradient(jnp.abs(mean_steps - coarse_mean_steps))
+        is_within_tolerance = error <= relative_tolerance * mean_steps
+        if (
+            has_traced_leaf(params, slope_sd)
+            or bool(is_within_tolerance)
+            or n_nodes >= MAX_QUADRATURE_NODES
+        ):
+            break
+        n_nodes *= 2
+    status = jnp.where(
+        is_within_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET
+    )
+    return FirstPassage(
+        mean_steps=mean_steps,
+        mean_steps_from_gait=mean_steps_from_gait,
+        failure_probability=survival_analysis.failure_probability,
+        kappa_2=survival_analysis.kappa_2,
+        error=error,
+        states=squared_rate_nodes[:, None],
+        weights=survival_analysis.quasi_stationary_weights,
+        status=status.astype(jnp.int32),
+        end_fractions=jnp.ones(1, mean_steps.dtype),
+        end_names=(Outcome.FELL_BACK.name,),
+    )
+
+
+def _estimate_passage_by_sampling(
+    params: WheelParams,
+    slope_sd: float,
+    model: Any,
+    options: StepOptions,
+    *,
+    seed: int,
+    n_walkers: int,
+    relative_tolerance: float,
+    max_steps: int,
+    differentiated_parameter_names: tuple[str, ...] = (),
+) -> tuple[FirstPassage, dict[str, float]]:
+    """Return the `FirstPassage` that sampled walks estimate, and derivatives of the logarithm of
+    `mean_steps`.
+
+    The derivatives are those with respect to the parameters `differentiated_parameter_names`, by
+    the names of the parameters. Raise ValueError if the wheel has no gait, or if hardly any step
+    succeeds.
+    """
+    limit_cycle_result: Any = limit_cycle(params, model=model)
+    if int(limit_cycle_result.outcome) != Outcome.STEPPED:
+        raise ValueError(
+            "this wheel has no gait from which a walk could begin: "
+            f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
+        )
+    walker_groups = WalkerGroups(
+        params,
+        np.asarray(limit_cycle_result.section_state),
+        slope_sd,
+        model,
+        options,
+        n_walkers,
+        np.random.default_rng(seed),
+    )
+    try:
+        sampled_passage = sample_passage(
+            walker_groups, float(limit_cycle_result.spectral_radius), relative_tolerance, max_steps
+        )
+    except ExtinctGroupError as error:
+        raise ValueError(
+            f"slope_sd is {slope_sd:g} rad, with which hardly any step of this wheel succeeds: "
+            "give a smaller one."
+        ) from error
+    derivative_by_name = {}
+    if differentiated_parameter_names:
+        derivative_by_name = differentiate_log_mean_steps(
+            walker_groups, sampled_passage.walk_density, differentiated_parameter_names
+        )
+    failure_probability = sampled_passage.failure_probability
+    mean_steps = 1.0 / failure_probability if failure_probability else np.inf
+    if not failure_probability:
+        passage_status = PassageStatus.NO_FAILURE
+    elif sampled_passage.start_effect > relative_tolerance:
+        passage_status = PassageStatus.START_NOT_FORGOTTEN
+    elif not np.isfinite(sampled_passage.relative_error):
+        passage_status = PassageStatus.UNKNOWN_ERROR
+    elif sampled_passage.relative_error > relative_tolerance:
+        passage_status = PassageStatus.TOLERANCE_NOT_MET
+    else:
+        passage_status = PassageStatus.CONVERGED
+    n_states = len(sampled_passage.quasi_stationary_states)
+    passage_numbers = {
+        "mean_steps": mean_steps,
+        "mean_steps_from_gait": sampled_passage.mean_steps_from_gait,
+        "failure_probability": failure_probability,
+        "kappa_2": sampled_passage.kappa_2,
+        "error": mean_steps * sampled_passage.relative_error,
+        "states": sampled_passage.quasi_stationary_states,
+        "weights": np.full(n_states, 1.0 / n_states),
+        "end_fractions": np.array(list(sampled_passage.fraction_by_outcome.values())),
+    }
+    first_passage_result = FirstPassage(
+        **jax.tree.map(lambda x: jnp.asarray(x, params.damping.dtype), passage_numbers),
+        status=jnp.asarray(int(passage_status), jnp.int32),
+        end_names=tuple(sampled_passage.fraction_by_outcome),
+        n_steps=sampled_passage.n_sampled_steps,
+    )
+    return first_passage_result, derivative_by_name

@@ -1,0 +1,308 @@
+"""Steady gaits of many wheels by collocation, computed by one compiled function for batches of one
+size.
+
+The samples are divided into batches of equal size, and the last batch is padded. The same compiled
+code evaluates every batch, so the result for a sample depends neither on its position nor on the
+other samples. Batches run in parallel with one compiled program: one thread per core, or one thread
+per GPU.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
+from threading import Lock
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax import lanes
+from vrw_jax.base import batch_sizes
+from vrw_jax.base.options import StepOptions
+from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.finder import confirm_outcome_by_step
+from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.lanes.batching import choose_batch_size
+from vrw_jax.lanes.saved_traces import compile_exported_function
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.measures import MARGIN_MEASURES
+from vrw_jax.studies.measure_catalog import (
+    DIFFERENTIABLE_MEASURES,
+    MeasureDerivative,
+    ValuesByVariable,
+    parse_derivative,
+)
+from vrw_jax.studies.scan_design import ParameterSamples
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, make_wheel_from_parameters
+
+GaitOutputs = tuple[Array, Array, dict[str, Array]]
+"""Outcome of the search for a gait, section state of the gait, and measures of the gait by name."""
+
+
+class EvaluationRequest(NamedTuple):
+    """Measures that a scan computes for each sample, with the base wheel, the model and the
+    options.
+    """
+
+    measure_names: tuple[str, ...]
+    base_wheel: WheelParams
+    wheel_model: Any
+    step_options: StepOptions
+    cycle_options: CycleOptions
+    # largest permitted error of each measure, in its unit; None for a scan without tolerance
+    error_tolerance: float | None
+    # standard deviation of random slopes, rad; None for a scan without measures of such walks
+    slope_standard_deviation: float | None = None
+
+    @property
+    def requested_derivatives(self) -> tuple[MeasureDerivative, ...]:
+        """Return the measures that are derivatives."""
+        return tuple(filter(None, map(parse_derivative, self.measure_names)))
+
+    def stack_parameter_rows(self, samples_by_parameter: ParameterSamples) -> np.ndarray:
+        """Return the model's parameters for each sample, shape (samples, parameters).
+
+        Parameters that are not swept are those of `base_wheel` and `wheel_model`.
+        """
+        n_samples = len(next(iter(samples_by_parameter.values())))
+        base_parameter_values = np.asarray(
+            self.wheel_model.collect_parameter_values(self.base_wheel)
+        )
+        parameter_rows = np.tile(base_parameter_values, (n_samples, 1))
+        for parameter_name, parameter_samples in samples_by_parameter.items():
+            parameter_index = self.wheel_model.parameter_names.index(parameter_name)
+            parameter_rows[:, parameter_index] = parameter_samples
+        return parameter_rows
+
+
+class CollocationScanEngine:
+    """Scan engine for the paper's model and a fixed set of measures, compiled on the first call.
+
+    The engine computes each limit cycle and the requested derivatives by collocation. It then
+    computes one event-driven gait step from the cycle, which gives the margins and checks the
+    cycle. The two functions are compiled in parallel.
+    """
+
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
+        """Initialize the engine for the measures and options of `evaluation_request`.
+
+        - `n_threads`: number of CPU threads, by default one per core.
+        """
+        measure_names, base_wheel, wheel_model, step_options, cycle_options, *_ = evaluation_request
+        self._n_threads = n_threads or lanes.count_available_cores()
+        self._evaluation_request = evaluation_request
+        requested_derivatives = evaluation_request.requested_derivatives
+        differentiation_parameters = list(
+            dict.fromkeys(derivative.parameter_name for derivative in requested_derivatives)
+        )
+        differentiated_parameter_indices = np.asarray(
+            list(map(PARAMETER_NAMES.index, differentiation_parameters)), int
+        )
+        n_legs = base_wheel.n_legs
+        gait_finder = make_finder(
+            wheel_model, n_legs, cycle_options=cycle_options, step_options=step_options
+        )
+
+        def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
+            """Return outcome, section state, measures and derivatives of the limit cycle for one
+            vector of parameters.
+            """
+
+            def find_measures_and_cycle(
+                differentiated_parameter_values: Array,
+            ) -> tuple[dict[str, Array], AbstractCycle]:
+                limit_cycle = gait_finder.find_cycle_from_values(
+                    parameter_values.at[differentiated_parameter_indices].set(
+                        differentiated_parameter_values
+                    )
+                )
+                return limit_cycle.measures(
+                    derivative.measure_name for derivative in requested_derivatives
+                ), limit_cycle
+
+            if requested_derivatives:
+                find_measures_and_cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)
+            measure_jacobian, limit_cycle = find_measures_and_cycle(
+                parameter_values[differentiated_parameter_indices]
+            )
+            cycle_measure_names = [
+                measure_name
+                for measure_name in measure_names
+                if measure_name in DIFFERENTIABLE_MEASURES
+            ]
+            return (
+                limit_cycle.outcome,
+                limit_cycle.section_state,
+                limit_cycle.measures([*cycle_measure_names, "spectral_radius"])
+                | {
+                    derivative.variable_name: measure_jacobian[derivative.measure_name][
+                        differentiation_parameters.index(derivative.parameter_name)
+                    ]
+                    for derivative in requested_derivatives
+                },
+            )
+
+        def evaluate_confirming_step(
+            parameter_values: Array, section_state: Array, step_options: StepOptions
+        ) -> GaitOutputs:
+            """Return outcome, end state and measures of one gait step from a limit cycle's section
+            state.
+            """
+            step_result = wheel_model.take_step(
+                make_wheel_from_parameters(parameter_values, n_legs), section_state, step_options
+            )
+            step_measures = {
+                measure_name: measure_value
+                for measure_name, measure_value in step_result.measures().items()
+                if measure_name in MARGIN_MEASURES
+                or (measure_name in measure_names and measure_name not in DIFFERENTIABLE_MEASURES)
+            }
+            return step_result.outcome, step_result.section_state, step_measures
+
+        self._evaluate_cycle_batch = jax.vmap(evaluate_cycle)
+        self._evaluate_step_batch: Callable = jax.vmap(
+            evaluate_confirming_step, in_axes=(0, 0, None)
+        )
+        self._batch_size = choose_batch_size(
+            batch_sizes.SCAN_BATCH_SIZE, batch_sizes.GPU_SCAN_BATCH_SIZE
+        )
+        self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
+        self._n_workers, self._compilation_lock = 0, Lock()
+
+    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
+        """Return the value of each variable for all samples, by the name of the variable.
+
+        - `samples_by_parameter`: value of each swept parameter for each sample.
+        """
+        parameter_rows = self._evaluation_request.stack_parameter_rows(samples_by_parameter)
+        with self._compilation_lock:
+            if not self._n_workers:
+                self._compile_programs()
+        parameter_batches = (
+            parameter_rows[first_sample_index : first_sample_index + self._batch_size]
+            for first_sample_index in range(0, len(parameter_rows), self._batch_size)
+        )
+        with ThreadPoolExecutor(self._n_workers) as scan_thread_pool:
+            results_by_batch = list(
+                scan_thread_pool.map(self._evaluate_sample_batch, parameter_batches)
+            )
+        return {
+            variable_name: variable_values[: len(parameter_rows)]
+            for variable_name, variable_values in concatenate_results(results_by_batch).items()
+        }
+
+    @with_default_jax_settings  # It runs in a thread of its own.
+    def _evaluate_sample_batch(self, parameter_rows: np.ndarray) -> ValuesByVariable:
+        """Return the value of each variable for a batch of samples, by the name of the variable.
+
+        A small batch is padded with copies of its first wheel.
+
+        - `parameter_rows`: parameters of the wheels, shape (samples, parameters).
+        """
+        padded_parameter_rows = np.concatenate(
+            [
+                parameter_rows,
+                np.repeat(parameter_rows[:1], self._batch_size - len(parameter_rows), 0),
+            ]
+        )
+        device_programs = self._free_programs.get()
+        try:
+            device_parameter_rows = jax.device_put(padded_parameter_rows, device_programs.device)
+            cycle_outcome, cycle_section_state, cycle_measures = device_programs.cycle_program(
+                device_parameter_rows
+            )
+            device_step_options = jax.device_put(
+                self._evaluation_request.step_options, device_programs.device
+            )
+            step_outcome, step_end_state, step_measures = device_programs.step_program(
+                device_parameter_rows, cycle_section_state, device_step_options
+            )
+            confirmed_outcome = confirm_outcome_by_step(
+                cycle_outcome, cycle_section_state, step_outcome, step_end_state
+            )
+        finally:
+            self._free_programs.put(device_programs)
+        return mask_failed_samples(confirmed_outcome, cycle_measures | step_measures)
+
+    def _compile_programs(self) -> None:
+        """Compile the functions for cycles and for gait steps in parallel, once for each device.
+
+        All cores of a CPU use the same programs.
+        """
+        local_devices = jax.local_devices()
+        parameter_dtype = np.dtype(self._evaluation_request.base_wheel.damping.dtype)
+        parameter_rows_shape = jax.ShapeDtypeStruct(
+            (self._batch_size, len(PARAMETER_NAMES)), parameter_dtype
+        )
+        section_states_shape = jax.ShapeDtypeStruct((self._batch_size, 3), parameter_dtype)
+        # Threads have separate settings.
+        compile_function = with_default_jax_settings(compile_exported_function)
+        step_options = self._evaluation_request.step_options
+        scan_program_specifications = (
+            (self._evaluate_cycle_batch, (parameter_rows_shape,)),
+            (
+                self._evaluate_step_batch,
+                (parameter_rows_shape, section_states_shape, step_options),
+            ),
+        )
+        with ThreadPoolExecutor(2) as scan_thread_pool:
+            futures_by_device = {
+                device: [
+                    scan_thread_pool.submit(compile_function, batch_function, arguments, device)
+                    for batch_function, arguments in scan_program_specifications
+                ]
+                for device in local_devices
+            }
+        for device, program_futures in futures_by_device.items():
+            device_programs = _CompiledDevicePrograms(
+                device, *(program_future.result() for program_future in program_futures)
+            )
+            n_device_programs = (
+                self._n_threads if device.platform == "cpu" and len(local_devices) == 1 else 1
+            )
+            for _ in range(n_device_programs):
+                self._free_programs.put(device_programs)
+            self._n_workers += n_device_programs
+
+
+class _CompiledDevicePrograms(NamedTuple):
+    """Compiled functions for cycles and for gait steps on one device."""
+
+    device: jax.Device
+    cycle_program: Callable
+    step_program: Callable
+
+
+def concatenate_results(
+    results_by_batch: Sequence[ValuesByVariable],
+) -> ValuesByVariable:
+    """Return the values of each variable for the samples of all batches, by the name of the
+    variable.
+    """
+    return {
+        variable_name: np.concatenate(
+            [results_of_batch[variable_name] for results_of_batch in results_by_batch]
+        )
+        for variable_name in results_by_batch[0]
+    }
+
+
+def mask_failed_samples(
+    outcome: np.ndarray, measures_by_name: Mapping[str, Any]
+) -> ValuesByVariable:
+    """Return outcomes and measures by name, where measures of samples without a gait are missing
+    values.
+
+    A missing value is NaN, or -1 for a measure that is an integer.
+    """
+    masked_measures = {
+        variable_name: np.array(variable_values)
+        for variable_name, variable_values in measures_by_name.items()
+    }
+    for variable_values in masked_measures.values():
+        missing_value = np.nan if np.issubdtype(variable_values.dtype, np.floating) else -1
+        variable_values[outcome != Outcome.STEPPED] = missing_value
+    return {"outcome": outcome.astype(np.int8)} | masked_measures

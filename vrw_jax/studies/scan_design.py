@@ -1,0 +1,469 @@
+"""Designs of scans: samples of the wheel's parameters, as a grid or as a list."""
+
+from __future__ import annotations
+
+import abc
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vrw_jax.base.checks import (
+    check_int,
+    check_range,
+    check_type,
+    format_value,
+    require_no_masked_entries,
+    require_untraced_arguments,
+)
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.printing import format_quantity
+from vrw_jax.models.measures import make_measure_attributes
+from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, check_parameter_name
+
+ParameterSamples = dict[str, np.ndarray]
+"""Swept parameters by name, with one value per sample."""
+
+SWEEPABLE_PARAMETERS = (*PARAMETER_NAMES, FRICTION_NAME)
+"""Names of the parameters that a design may sweep: those of the wheel, and the friction of the
+ground.
+"""
+
+ParameterValues = Sequence[float] | np.ndarray
+"""Values of a parameter, in its unit."""
+
+ParameterRange = tuple[float, float]
+"""Lower and upper bound of a parameter, in its unit."""
+
+ParameterRanges = Mapping[str, ParameterRange]
+"""Range of each parameter, by the parameter's name."""
+
+MAX_LISTED_SAMPLES = 10_000_000
+"""Largest number of values of one axis, or of samples in a list.
+
+The value is chosen because such a list fits into memory.
+"""
+
+SALTELLI_DESIGN_KIND = "saltelli"
+"""Kind of the designs from which Sobol' indices are computed."""
+
+
+class AbstractSampleDesign(abc.ABC):
+    """Samples of the wheel's parameters, arranged on one or more sample axes."""
+
+    design_kind: str
+    values_by_parameter: Mapping[str, np.ndarray]
+
+    def __repr__(self) -> str:
+        printed_columns = (
+            f"{parameter_name} {format_quantity(parameter_values, '')}"
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        )
+        return f"{self.design_kind} of {self.size:,}: {', '.join(printed_columns)}"
+
+    @property
+    def swept_parameters(self) -> tuple[str, ...]:
+        """Return the names of the swept parameters."""
+        return tuple(self.values_by_parameter)
+
+    @property
+    def size(self) -> int:
+        """Return the number of samples in the design."""
+        return math.prod(self.shape)
+
+    @property
+    @abc.abstractmethod
+    def dims(self) -> tuple[str, ...]:
+        """Return the names of the sample axes of the labeled result."""
+
+    @property
+    @abc.abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Return the lengths of the sample axes of the labeled result."""
+
+    @abc.abstractmethod
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
+        """Return the values of each swept parameter in a rectangular region of samples, by
+        parameter.
+
+        Each array of values is flattened, with the last axis varying fastest.
+
+        - `region_of_samples`: one slice for each axis of the design.
+        """
+
+    def make_result_coordinates(self) -> dict[str, xr.Variable]:
+        """Return the coordinates of the labeled result by their names."""
+        return {
+            parameter_name: xr.Variable(
+                (parameter_name,) if parameter_name in self.dims else self.dims,
+                parameter_values,
+                make_measure_attributes(parameter_name),
+            )
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        }
+
+    def describe_design(self) -> dict[str, object]:
+        """Return the settings that identify the design.
+
+        The settings are the kind of the design, the parameter names, the shape, and a SHA-256
+        digest of the kind, the names and all samples.
+        """
+        sample_digest = hashlib.sha256(
+            json.dumps([self.design_kind, *self.values_by_parameter]).encode()
+        )
+        for parameter_values in self.values_by_parameter.values():
+            sample_digest.update(np.ascontiguousarray(parameter_values, dtype="<f8").tobytes())
+        return {
+            "kind": self.design_kind,
+            "swept": list(self.swept_parameters),
+            "shape": list(self.shape),
+            "digest": sample_digest.hexdigest(),
+        }
+
+
+@dataclass(frozen=True, repr=False)
+class GridDesign(AbstractSampleDesign):
+    """Design that contains every combination of the parameters' values, with one axis per
+    parameter.
+    """
+
+    values_by_parameter: Mapping[str, np.ndarray]
+    design_kind: str = "grid"
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return self.swept_parameters
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(map(len, self.values_by_parameter.values()))
+
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
+        selected_axis_values = [
+            parameter_values[axis_slice]
+            for parameter_values, axis_slice in zip(
+                self.values_by_parameter.values(), region_of_samples, strict=True
+            )
+        ]
+        grid_columns = np.meshgrid(*selected_axis_values, indexing="ij")
+        return dict(zip(self.swept_parameters, map(np.ravel, grid_columns), strict=True))
+
+
+@dataclass(frozen=True, repr=False)
+class SampleListDesign(AbstractSampleDesign):
+    """Design that contains a list of samples, in which all parameters may vary together.
+
+    Its axis is `sample`.
+    """
+
+    values_by_parameter: Mapping[str, np.ndarray]
+    design_kind: str = "samples"
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return ("sample",)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(next(iter(self.values_by_parameter.values()))),)
+
+    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
+        return {
+            parameter_name: parameter_values[region_of_samples[0]]
+            for parameter_name, parameter_values in self.values_by_parameter.items()
+        }
+
+    def make_result_coordinates(self) -> dict[str, xr.Variable]:
+        sample_coordinate = xr.Variable(self.dims, np.arange(self.size))
+        return {"sample": sample_coordinate} | super().make_result_coordinates()
+
+
+def _merge_mapping_and_keywords(
+    function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
+) -> Mapping:
+    """Return the parameters of a design as one mapping, given as a mapping or as keywords.
+
+    Raise a TypeError if both `parameter_mapping` and `parameter_keywords` are given, and a
+    ValueError if a parameter is unknown or none is given.
+    """
+    if parameter_mapping is not None and parameter_keywords:
+        raise TypeError(
+            f"{function_name} has a mapping and the keywords {', '.join(parameter_keywords)}: "
+            "give either one mapping or keywords."
+        )
+    parameter_mapping = parameter_keywords if parameter_mapping is None else parameter_mapping
+    check_type("the design", parameter_mapping, Mapping, "write {'damping': (100.0, 200.0)}")
+    if not parameter_mapping:
+        raise ValueError(
+            "the design sweeps no parameter, but a scan needs at least one: "
+            f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
+        )
+    for parameter_name in parameter_mapping:
+        check_parameter_name(parameter_name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
+    return parameter_mapping
+
+
+def _parse_value_columns(
+    function_name: str, parameter_mapping: Mapping | None, parameter_keywords: Mapping
+) -> ParameterSamples:
+    """Return the values of each parameter as a vector of floats, by parameter.
+
+    Raise an error if that is impossible.
+    """
+    value_columns = {}
+    for parameter_name, parameter_values in _merge_mapping_and_keywords(
+        function_name, parameter_mapping, parameter_keywords
+    ).items():
+        require_untraced_arguments("a design", "use jax.vmap", parameter_values)
+        require_no_masked_entries(parameter_name, parameter_values)
+        try:
+            value_column = np.atleast_1d(np.asarray(parameter_values))
+        # Lists may differ in length, and the conversion of a foreign object may raise any error.
+        except Exception:
+            value_column = np.array([None])
+        if value_column.dtype.kind not in "fiu" and value_column.size:
+            raise TypeError(
+                f"{parameter_name} is {format_value(parameter_values)}, but it must be a list of "
+                "numbers: write [100.0]."
+            )
+        value_column = value_column.astype(float)
+        if value_column.ndim != 1:
+            raise ValueError(
+                f"{parameter_name} has shape {value_column.shape}, but it must be a list of "
+                "numbers: give one axis."
+            )
+        if not len(value_column):
+            raise ValueError(
+                f"{parameter_name} has no values, but a scan needs at least one: add some."
+            )
+        value_columns[parameter_name] = value_column
+    return value_columns
+
+
+def grid(
+    values: Mapping[str, ParameterValues] | None = None,
+    /,
+    **parameters: ParameterValues,
+) -> GridDesign:
+    """Return the design that contains every combination of parameter values.
+
+    Args:
+        values: values of each parameter, by the parameter's name, as any sequence of numbers.
+        **parameters: the same values as keywords, such as `grid(damping=..., slope=...)`, if no
+            mapping is given.
+
+    Returns:
+        A design whose axes are the parameters.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> vrw.grid(damping=[100.0, 150.0], slope=np.linspace(0.28, 0.32, 5)).shape
+        (2, 5)
+    """
+    values_by_swept_parameter = _parse_value_columns("grid", values, parameters)
+    for parameter_name, value_column in values_by_swept_parameter.items():
+        if len(np.unique(value_column)) != len(value_column):
+            raise ValueError(
+                f"{parameter_name} holds a value twice, but each value of a grid's axis names "
+                "one place: give every value once."
+            )
+    return GridDesign(values_by_swept_parameter)
+
+
+def samples(
+    values: Mapping[str, ParameterValues] | None = None,
+    /,
+    **parameters: ParameterValues,
+) -> SampleListDesign:
+    """Return the design that contains a list of samples, such as `samples({"damping": [100],
+    "slope": [0.29]})`.
+
+    A sample that is not finite, or outside the domain of a parameter, has the outcome BAD_INPUT.
+
+    Args:
+        values: values of each parameter, by the parameter's name, all of one length.
+        **parameters: the same values as keywords, if no mapping is given.
+
+    Returns:
+        A design over the axis `sample`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> vrw.samples({"damping": [100.0, 150.0], "slope": [0.29, 0.30]}).shape
+        (2,)
+    """
+    values_by_swept_parameter = _parse_value_columns("samples", values, parameters)
+    column_lengths = {
+        parameter_name: len(value_column)
+        for parameter_name, value_column in values_by_swept_parameter.items()
+    }
+    if len(set(column_lengths.values())) > 1:
+        raise ValueError(
+            f"the columns have lengths {column_lengths}, but a sample takes one value from each: "
+            "give columns of one length."
+        )
+    return SampleListDesign(values_by_swept_parameter)
+
+
+def sobol(
+    ranges: ParameterRanges | None = None,
+    n: int | None = None,
+    seed: int = 0,
+    **parameters: ParameterRange,
+) -> SampleListDesign:
+    """Return a design of `n` samples from a scrambled Sobol' sequence.
+
+    The samples cover the box between the bounds most evenly if `n` is a power of 2.
+
+    Args:
+        ranges: lower and upper bound of each parameter, by the parameter's name.
+        n: number of samples.
+        seed: seed of the scrambling.
+        **parameters: the same ranges as keywords, if no mapping is given.
+
+    Returns:
+        A design over the axis `sample`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> vrw.sobol({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
+        (8,)
+    """
+    from scipy.stats import qmc  # This import is slow.
+
+    ranges, n = _parse_sampling_box("sobol", ranges, parameters, n)
+    sobol_sequence = qmc.Sobol(len(ranges), rng=_make_random_generator(seed))
+    unit_cube_points = sobol_sequence.random_base2((n - 1).bit_length())[:n]
+    return _scale_unit_points_to_box(ranges, unit_cube_points, "sobol")
+
+
+def uniform(
+    ranges: ParameterRanges | None = None,
+    n: int | None = None,
+    seed: int = 0,
+    **parameters: ParameterRange,
+) -> SampleListDesign:
+    """Return a design of `n` independent samples, uniformly distributed between the bounds.
+
+    Args:
+        ranges: lower and upper bound of each parameter, by the parameter's name.
+        n: number of samples.
+        seed: seed of the random numbers.
+        **parameters: the same ranges as keywords, if no mapping is given.
+
+    Returns:
+        A design over the axis `sample`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
+        (8,)
+    """
+    ranges, n = _parse_sampling_box("uniform", ranges, parameters, n)
+    unit_cube_points = _make_random_generator(seed).random((n, len(ranges)))
+    return _scale_unit_points_to_box(ranges, unit_cube_points, "uniform")
+
+
+def saltelli(
+    ranges: ParameterRanges | None = None,
+    n: int | None = None,
+    seed: int = 0,
+    **parameters: ParameterRange,
+) -> SampleListDesign:
+    """Return the design that `sobol_indices` requires: `n` groups ("rows") of 2 + d samples for d
+    parameters.
+
+    A row contains two independent points of the box between the bounds, A and B. It also contains d
+    copies of A, in each of which one coordinate is that of B. Samples are ordered A, B, then by
+    parameter.
+
+    Args:
+        ranges: lower and upper bound of each parameter, by the parameter's name.
+        n: number of rows, a power of two.
+        seed: seed of the sequence.
+        **parameters: the same ranges as keywords, if no mapping is given.
+
+    Returns:
+        A design over the axis `sample`.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> vrw.saltelli({"damping": (100.0, 180.0), "slope": (0.27, 0.29)}, 8).shape
+        (32,)
+    """
+    from scipy.stats import qmc  # This import is slow.
+
+    ranges, n = _parse_sampling_box("saltelli", ranges, parameters, n)
+    if n & (n - 1):
+        raise ValueError(
+            f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
+            f"give n = {1 << n.bit_length()}, say."
+        )
+    sobol_sequence = qmc.Sobol(2 * len(ranges), rng=_make_random_generator(seed))
+    points_a, points_b = np.hsplit(sobol_sequence.random_base2(n.bit_length() - 1), 2)
+    points_with_swapped_coordinate = [
+        np.where(is_swapped, points_b, points_a) for is_swapped in np.eye(len(ranges), dtype=bool)
+    ]
+    unit_cube_points = np.concatenate([points_a, points_b, *points_with_swapped_coordinate])
+    return _scale_unit_points_to_box(ranges, unit_cube_points, SALTELLI_DESIGN_KIND)
+
+
+def _scale_unit_points_to_box(
+    ranges: ParameterRanges, unit_cube_points: np.ndarray, design_kind: str
+) -> SampleListDesign:
+    """Return the design whose samples are points of the unit cube, scaled to the box between the
+    bounds.
+
+    - `unit_cube_points`: points of the unit cube, shape (samples, parameters).
+    """
+    lower_bounds, upper_bounds = np.transpose(list(ranges.values()))
+    box_points = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
+    return SampleListDesign(
+        dict(zip(ranges, np.ascontiguousarray(box_points.T), strict=True)), design_kind
+    )
+
+
+def _make_random_generator(seed: int) -> np.random.Generator:
+    """Return a generator of random numbers. Raise an error if the seed is not an integer."""
+    return np.random.default_rng(check_int("seed", seed, 0))
+
+
+def _parse_sampling_box(
+    function_name: str,
+    ranges: ParameterRanges | None,
+    parameter_keywords: ParameterRanges,
+    n: int | None,
+) -> tuple[dict[str, ParameterRange], int]:
+    """Return the range of each parameter, by name, and the number of samples, all checked.
+
+    The number of samples has no default. The ranges are a mapping or keywords.
+    """
+    if n is None:
+        raise TypeError(
+            f"n is None, but {function_name} needs a number of samples: give n=1024, say."
+        )
+    ranges = _merge_mapping_and_keywords(function_name, ranges, parameter_keywords)
+    n = check_int("n", n)
+    if n > MAX_LISTED_SAMPLES:
+        raise ValueError(
+            f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or "
+            "a grid."
+        )
+    checked_ranges = {
+        parameter_name: check_range(f"the range of {parameter_name}", bound_pair)
+        for parameter_name, bound_pair in ranges.items()
+    }
+    return checked_ranges, n

@@ -1,0 +1,298 @@
+"""Execution of a scan: its chunks are computed, written and returned as one labeled dataset.
+
+A scan is divided into chunks of samples, which the same compiled function computes. If a store is
+given, each chunk is written as soon as it is computed. An interrupted scan continues with the
+missing chunks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vrw_jax.base.checks import check_callable, check_path
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait, report_progress
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.stepping import ModelLike
+from vrw_jax.studies.scan_design import AbstractSampleDesign
+from vrw_jax.studies.scan_planning import (
+    ChunkExecutor,
+    ChunkResult,
+    ScanPlan,
+    describe_computing_environment,
+    describe_settings_difference,
+    plan_scan,
+)
+from vrw_jax.studies.scan_store import (
+    PROVENANCE_ATTRIBUTE,
+    AbstractResultStore,
+    MemoryResultStore,
+    ZarrResultStore,
+    create_empty_store,
+    read_stored_manifest,
+)
+from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams
+
+ProgressCallback = Callable[["ScanProgress"], None]
+"""Function that is called with the progress of a scan after each chunk."""
+
+
+@dataclass(frozen=True)
+class ScanProgress:
+    """Progress of a scan, measured in samples."""
+
+    n_samples: int  # samples to compute in this run
+    n_done: int  # samples computed in this run
+    n_failed: int  # computed samples without a steady gait
+    n_reused: int  # samples that an earlier run computed
+
+
+@announce_wait("batches of gaits and gait steps", "15 s")
+@with_default_jax_settings
+def scan(
+    design: AbstractSampleDesign,
+    measures: Iterable[str] | None = None,
+    *,
+    base: WheelParams | None = None,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    store: str | Path | None = None,
+    chunk: int | None = None,
+    on_progress: ProgressCallback | None = None,
+    dask: str | None = None,
+    tol: float | None = None,
+    slope_sd: float | None = None,
+) -> xr.Dataset:
+    """Return outcome, margins and measures of the steady gait for every sample, as a labeled
+    dataset.
+
+    `measures` are names (see `vrw_jax.studies.measure_catalog`), including derivatives such as
+    'd dls_fraction / d damping'. The variables of the dataset have these names and this order. The
+    result for a sample depends neither on other samples nor on `chunk`.
+
+    If `store` is given, the result is written there chunk by chunk. An interrupted scan continues
+    where it stopped and ends with bitwise the same data. A finished scan is only opened, but its
+    damaged chunks are computed again, with a warning.
+
+    `model` may be a `UnilateralWheel`, whose gaits are computed by walks. `model` may also be
+    "auto", which selects the simplest valid model for each sample. Then the dataset also contains
+    `rung`, the code of the model, and `reason`, the code of the reason for the choice of the model.
+    With `UnilateralWheel` and "auto", `friction` may be a swept parameter.
+
+    Args:
+        design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
+        measures: names of the measures; by default DLS fraction, speed and similar measures.
+        base: wheel with the parameters that are not swept; by default that of Table 1 of the
+            paper.
+        model: model of the wheel; "auto" for the simplest valid model for each sample.
+        options: numerical options of the gait steps that check the gaits.
+        cycle_options: numerical options of the search for gaits.
+        store: local folder to which the result is written, not a URL; may begin with `~`.
+        chunk: number of samples that are written at a time; 4,096 by default.
+        on_progress: function that is called with the `ScanProgress` after each chunk.
+        dask: address of a dask cluster that computes the chunks, or "local" to start one.
+        tol: permitted error of each measure, in its unit, with respect to a `UnilateralWheel`. Each
+            sample is computed with the simplest model whose error bound is within `tol` (see
+            `vrw.measure_to_tolerance`). The dataset also contains `rung`, the code of that model,
+            and the errors of the measures, such as `speed_error`.
+        slope_sd: standard deviation of random slopes, rad. If it is given, "mean_steps",
+            "mean_steps_error" and "failure_probability" are additional measures (see
+            `vrw.first_passage`). A sample then takes about a second, and by default 16 samples are
+            written at a time.
+
+    Returns:
+        A dataset whose dimensions are the axes of the design.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, or if the store contains another scan or
+            is locked by another process; the message names the remedy.
+
+    Examples:
+        >>> gaits = vrw.scan(vrw.grid(damping=[150.0, 300.0]), ["speed"])
+        >>> gaits.speed.round(3).values.tolist(), gaits.outcome.values.tolist()
+        ([1.018, nan], [0, 14])
+    """
+    if store is not None:
+        store = check_path("store", store, "give the folder to keep the result in")
+    if on_progress is not None:
+        check_callable("on_progress", on_progress, "that takes the progress")
+    scan_plan = plan_scan(
+        design,
+        measures,
+        base=base,
+        model=model,
+        options=options,
+        cycle_options=cycle_options,
+        chunk=chunk,
+        tol=tol,
+        slope_sd=slope_sd,
+    )
+    with resolve_executor(dask) as chunk_executor:
+        return run_scan(scan_plan, store, on_progress=on_progress, chunk_executor=chunk_executor)
+
+
+def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[ChunkExecutor | None]:
+    """Return a context that provides an executor on a dask cluster, or None if `dask` is None.
+
+    With None, the chunks are computed in this process.
+    """
+    if dask is None:
+        return contextlib.nullcontext()
+    from vrw_jax.studies.scan_dask import connect_dask_workers
+
+    return connect_dask_workers(dask)
+
+
+@with_default_jax_settings
+def run_scan(
+    scan_plan: ScanPlan,
+    store: str | Path | AbstractResultStore | None,
+    *,
+    on_progress: ProgressCallback | None = None,
+    chunk_executor: ChunkExecutor | None = None,
+) -> xr.Dataset:
+    """Compute a scan plan, and return its results as a labeled dataset.
+
+    - `store`: store or folder to which the results are written; with None they stay in memory;
+    - `chunk_executor`: function that computes the chunks; by default this process computes them.
+    """
+    if isinstance(store, AbstractResultStore):
+        result_store = store
+    elif store is None:
+        result_store = MemoryResultStore(scan_plan.result_layout, scan_plan.store_attributes)
+    else:
+        result_store = open_or_create_store(scan_plan, Path(store))
+        if result_store.damage_description:
+            warnings.warn(f"{result_store.damage_description}: computed again.", stacklevel=3)
+    if result_store.damage_description or result_store.find_missing_chunks():
+        with result_store.open_for_writing():
+            _compute_and_write_chunks(scan_plan, result_store, on_progress, chunk_executor)
+    return result_store.load_dataset()
+
+
+def _compute_and_write_chunks(
+    scan_plan: ScanPlan,
+    result_store: AbstractResultStore,
+    on_progress: ProgressCallback | None,
+    chunk_executor: ChunkExecutor | None,
+) -> None:
+    """Compute the missing chunks, write each chunk to the store, and report the progress after each
+    chunk.
+    """
+    missing_chunks = result_store.find_missing_chunks()
+    chunk_shapes = {
+        chunk_index: scan_plan.result_layout.compute_chunk_sample_shape(chunk_index)
+        for chunk_index in missing_chunks
+    }
+    n_samples = sum(map(math.prod, chunk_shapes.values()))
+    scan_progress = ScanProgress(n_samples, 0, 0, scan_plan.design.size - n_samples)
+    n_chunks = scan_plan.result_layout.n_chunks
+    if on_progress is not None:
+        on_progress(scan_progress)
+    try:
+        if chunk_executor is None:
+            scan_engine = scan_plan.build_scan_engine()
+            computed_chunks: Iterable[ChunkResult] = (
+                (chunk_index, scan_engine(scan_plan.select_chunk_samples(chunk_index)))
+                for chunk_index in missing_chunks
+            )
+        else:
+            computed_chunks = chunk_executor(scan_plan, missing_chunks)
+        for chunk_index, flat_chunk_results in computed_chunks:
+            chunk_shape = chunk_shapes[chunk_index]
+            chunk_results = {
+                variable_name: variable_values.reshape(*chunk_shape, *variable_values.shape[1:])
+                for variable_name, variable_values in flat_chunk_results.items()
+            }
+            try:
+                result_store.write_chunk(chunk_index, chunk_results)
+            except OSError as disk_error:
+                if disk_error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                    raise
+                n_chunks_done = n_chunks - len(result_store.find_missing_chunks())
+                raise OSError(
+                    disk_error.errno,
+                    f"no space is left for {result_store.store_location}, where {n_chunks_done} "
+                    "chunks are complete: make room and run the same again, it goes on from there",
+                ) from disk_error
+            has_failed = flat_chunk_results["outcome"] != Outcome.STEPPED
+            scan_progress = replace(
+                scan_progress,
+                n_done=scan_progress.n_done + has_failed.size,
+                n_failed=scan_progress.n_failed + int(has_failed.sum()),
+            )
+            report_progress(f"{scan_progress.n_done:,} of {n_samples:,} samples")
+            if on_progress is not None:
+                on_progress(scan_progress)
+    except KeyboardInterrupt:
+        if isinstance(result_store, MemoryResultStore):
+            raise KeyboardInterrupt(
+                "stopped, and nothing is kept: give store=, a folder, to continue another time."
+            ) from None
+        n_chunks_done = n_chunks - len(result_store.find_missing_chunks())
+        raise KeyboardInterrupt(
+            f"stopped: {n_chunks_done} of {n_chunks} chunks are kept in "
+            f"{result_store.store_location}; run the same again, it goes on from there."
+        ) from None
+
+
+def open_or_create_store(scan_plan: ScanPlan, store_path: Path) -> ZarrResultStore:
+    """Return the store at `store_path`, which is created if it does not exist.
+
+    Raise a ValueError if the store contains another scan.
+    """
+    if read_stored_manifest(store_path) is None:
+        create_empty_store(store_path, scan_plan.result_layout, scan_plan.store_attributes)
+    zarr_store = find_matching_store(scan_plan, store_path)
+    assert zarr_store is not None
+    stored_manifest = read_stored_manifest(store_path) or {}
+    settings_difference_text = describe_settings_difference(
+        stored_manifest[PROVENANCE_ATTRIBUTE], describe_computing_environment()
+    )
+    if settings_difference_text and (n_missing_chunks := len(zarr_store.find_missing_chunks())):
+        damaged_chunks_text = (
+            f" ({len(zarr_store.damaged_chunks)} of them damaged)"
+            if zarr_store.damaged_chunks
+            else ""
+        )
+        raise ValueError(
+            f"{store_path} lacks {n_missing_chunks} of {scan_plan.result_layout.n_chunks} "
+            f"chunks{damaged_chunks_text} and was begun by other means, so that its last digits "
+            f"might not fit: {settings_difference_text}. Go on with what it was begun with, or "
+            "begin anew in another place."
+        )
+    return zarr_store
+
+
+def find_matching_store(
+    scan_plan: ScanPlan, store_path: Path, verifies_files: bool = True
+) -> ZarrResultStore | None:
+    """Return the store at `store_path`, or None if it does not exist.
+
+    Raise a ValueError if the store contains another scan.
+
+    - `verifies_files`: whether damaged chunks are searched for.
+    """
+    stored_manifest = read_stored_manifest(store_path)
+    if stored_manifest is None:
+        return None
+    settings_difference_text = describe_settings_difference(
+        stored_manifest[MANIFEST_ATTRIBUTE], scan_plan.scan_settings
+    )
+    if settings_difference_text:
+        raise ValueError(
+            f"{store_path} holds a scan made with other settings: {settings_difference_text}. "
+            "Give another place for this scan, or go back to those settings, or delete the store."
+        )
+    return ZarrResultStore(store_path, scan_plan.result_layout, verifies_files)

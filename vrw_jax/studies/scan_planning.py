@@ -1,0 +1,371 @@
+"""Plan of a scan before its computation: checked arguments, layout of the result, and the settings
+that identify the scan.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from vrw_jax import lanes
+from vrw_jax.base import batch_sizes
+from vrw_jax.base.checks import check_int, check_names, check_positive, check_type
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.lanes.disk_cache import compute_source_digest
+from vrw_jax.models.capabilities import ModelCapabilities
+from vrw_jax.models.measures import MARGIN_MEASURES, make_locked_leg_coordinate
+from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.registry import describe_accepted_models
+from vrw_jax.models.stepping import (
+    ModelLike,
+    convert_model_argument,
+    convert_step_options,
+    require_compliant_model,
+)
+from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.studies.measure_catalog import (
+    MeasureCatalog,
+    ValuesByVariable,
+    canonicalize_variable_name,
+    check_measure_names,
+    get_variable_attributes,
+    make_error_variable_name,
+    select_measure_catalog,
+)
+from vrw_jax.studies.scan_collocation import EvaluationRequest
+from vrw_jax.studies.scan_design import AbstractSampleDesign, ParameterSamples
+from vrw_jax.studies.scan_engines import SampleEvaluator, make_scan_engine
+from vrw_jax.studies.scan_store import (
+    PROVENANCE_ATTRIBUTE,
+    REQUESTED_MEASURES_ATTRIBUTE,
+    ResultLayout,
+    choose_chunk_shape,
+)
+from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE, JsonObject
+from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, WheelParams
+
+MAX_SCAN_SAMPLES = 1_000_000_000
+"""Largest number of samples in a scan.
+
+The value is chosen because so many samples take over a day and some hundred GB.
+"""
+
+
+N_PASSAGE_SAMPLES_PER_CHUNK = 16
+"""Number of samples that are written at a time if a scan measures walks over random slopes.
+
+The value is chosen because each sample takes a second or more.
+"""
+
+
+STORED_NAME_BY_CLASS = {"StepOptions": "Options"}
+"""Names of classes in stores, by their names in Python, where the two names differ."""
+
+STORED_NAMES_BY_FIELD_OF_CLASS = {
+    "StepOptions": {
+        "dt0": "first_step",
+        "max_event_iterations": "event_steps",
+        "max_margin_search_iterations": "monitor_steps",
+    },
+    "CycleOptions": {
+        "mesh_intervals": "steps",
+        "mesh_grading": "growth",
+        "max_newton_iterations": "iterations",
+        "first_newton_iterations": "first_iterations",
+        "homotopy_steps": "stages",
+        "batch_size": "block",
+    },
+    "UnilateralWheel": {"infinite_friction_rule": "infinite"},
+}
+"""Names of fields in stores, by class and by name in Python, where the two names differ."""
+
+STORED_NAME_BY_MODEL_FIELD = {
+    "model_name": "rung",
+    "reports_contacts": "tells_contacts",
+    "batch_kernel": "lanes",
+    "is_compliant": "legs_yield",
+}
+"""Names in stores of class variables of models, by their names in Python, where the two names
+differ.
+"""
+
+ChunkResult = tuple[int, ValuesByVariable]
+"""Index of a chunk, and the values of each variable in the chunk, by the name of the variable."""
+
+ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
+"""Function that computes the chunks with the given indices, and yields a `ChunkResult` for each
+chunk in any order.
+"""
+
+
+@dataclass(frozen=True)
+class ScanPlan:
+    """Checked arguments of a scan, and the layout of its result."""
+
+    design: AbstractSampleDesign
+    evaluation_request: EvaluationRequest
+    measure_catalog: MeasureCatalog
+    result_layout: ResultLayout
+    requested_measures: tuple[str, ...]  # names of the requested measures, as the caller gave them
+    config_file_text: str
+
+    @property
+    def scan_settings(self) -> JsonObject:
+        """Return the settings that identify the scan.
+
+        A scan continues a store only if the store contains the same settings.
+        """
+        request, base_wheel = self.evaluation_request, self.evaluation_request.base_wheel
+        scan_settings: JsonObject = {
+            "design": self.design.describe_design(),
+            "wheel": {
+                parameter_name: float(getattr(base_wheel, parameter_name))
+                for parameter_name in PARAMETER_NAMES
+                if parameter_name not in self.design.swept_parameters
+            }
+            | {"n_legs": base_wheel.n_legs},
+            "measures": list(request.measure_names),
+            "model": _convert_settings_to_json(request.wheel_model),
+            "options": _convert_settings_to_json(request.step_options),
+            "cycle_options": _convert_settings_to_json(request.cycle_options),
+            "dtype": str(base_wheel.damping.dtype),
+            "chunk": list(self.result_layout.chunk_shape),
+        }
+        if request.error_tolerance is not None:
+            scan_settings["tol"] = request.error_tolerance
+        if request.slope_standard_deviation is not None:
+            scan_settings["slope_sd"] = request.slope_standard_deviation
+        return scan_settings
+
+    @property
+    def store_attributes(self) -> JsonObject:
+        """Return the attributes that the labeled result and its store have."""
+        return {
+            "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
+            f"{', '.join(self.design.swept_parameters)}",
+            "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
+            MANIFEST_ATTRIBUTE: json.dumps(self.scan_settings),  # Other formats have no tables.
+            PROVENANCE_ATTRIBUTE: json.dumps(describe_computing_environment()),
+            REQUESTED_MEASURES_ATTRIBUTE: ", ".join(self.requested_measures),
+            "config": self.config_file_text,
+        }
+
+    def select_chunk_samples(self, chunk_index: int) -> ParameterSamples:
+        """Return the values of each swept parameter for the samples of a chunk, by parameter."""
+        return self.design.select_samples(self.result_layout.compute_chunk_region(chunk_index))
+
+    def build_scan_engine(self) -> SampleEvaluator:
+        """Return the engine that computes the samples of this plan."""
+        return make_scan_engine(self.evaluation_request)
+
+
+def plan_scan(
+    design: AbstractSampleDesign,
+    measures: Iterable[str] | None = None,
+    *,
+    base: WheelParams | None = None,
+    model: ModelLike | None = None,
+    options: StepOptions | None = None,
+    cycle_options: CycleOptions | None = None,
+    chunk: int | None = None,
+    config_text: str = "",
+    tol: float | None = None,
+    slope_sd: float | None = None,
+) -> ScanPlan:
+    """Return the checked plan of a scan, with the layout of its result. No gait is computed.
+
+    The arguments are those of `scan`. `config_text` is the text of the configuration file, if any.
+    """
+    if not isinstance(design, AbstractSampleDesign):
+        raise TypeError(
+            f"design is a {type(design).__name__}, but it must say which samples: write "
+            "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
+        )
+    base = WheelParams() if base is None else base
+    check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
+    base.require_single_wheel("give numbers, and what varies in the design")
+    options, model = convert_step_options(options), convert_model_argument(model)
+    options.check_tolerances(np.dtype(base.damping.dtype))
+    gait_finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
+    gait_finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
+    default_chunk_size = (
+        batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else N_PASSAGE_SAMPLES_PER_CHUNK
+    )
+    chunk = default_chunk_size if chunk is None else check_int("chunk", chunk)
+    if design.size > MAX_SCAN_SAMPLES:
+        raise ValueError(
+            f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at "
+            "most: give its axes fewer values, or draw samples with vrw.sobol."
+        )
+    require_compliant_model(model, "a scan is of gaits with", "scan")
+    if FRICTION_NAME in design.swept_parameters and FRICTION_NAME not in model.parameter_names:
+        raise ValueError(
+            "the design sweeps friction, which does not affect the paper's wheel: give "
+            f"model={describe_accepted_models('scan', FRICTION_NAME)}."
+        )
+    if tol is not None:
+        tol = check_positive("tol", tol)
+        model_fields: dict[str, Any] = type(model).__dataclass_fields__
+        fixed_fields = model.capabilities.fields_with_fixed_defaults
+        if fixed_fields is None or any(
+            getattr(model, field_name) != model_fields[field_name].default
+            for field_name in fixed_fields
+        ):
+            raise ValueError(
+                f"tol is given and model is {model!r}, but a tolerance refers to unilateral "
+                "contact with no settings other than friction and stoppers: give "
+                "model=vrw.UnilateralWheel(friction=...)."
+            )
+    if slope_sd is not None:
+        slope_sd = check_positive("slope_sd", slope_sd)
+        if tol is not None:
+            raise ValueError(
+                "tol and slope_sd are both given, but a scan to a tolerance has no measures of "
+                "walks over random slopes: drop one of them."
+            )
+    measure_catalog = select_measure_catalog(model, tol, slope_sd)
+    requested_measures = (
+        measure_catalog.default_measures if measures is None else check_names("measures", measures)
+    )
+    measure_names = check_measure_names(requested_measures, measure_catalog)
+    variable_names = []
+    for requested_measure in requested_measures:
+        variable_names.append(canonicalize_variable_name(requested_measure))
+        if tol is not None:
+            variable_names.append(make_error_variable_name(requested_measure))
+    variable_names += measure_catalog.always_included_variables
+    cycle_options = CycleOptions() if cycle_options is None else cycle_options
+    evaluation_request = EvaluationRequest(
+        measure_names, base, model, options, cycle_options, tol, slope_sd
+    )
+    result_layout = _make_result_layout(design, variable_names, base, chunk)
+    return ScanPlan(
+        design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
+    )
+
+
+def describe_computing_environment() -> JsonObject:
+    """Return a description of the environment in which this process computes.
+
+    It consists of the digest of the source code, the versions of the libraries and the device.
+    """
+    provenance_record = collect_provenance_attributes(
+        WheelParams(), ViscoelasticWheel(), StepOptions()
+    )
+    processor_features = lanes.describe_processor()[2].split(",")
+    instruction_sets = [
+        instruction_set
+        for instruction_set in VECTOR_INSTRUCTION_SETS
+        if f"+{instruction_set}" in processor_features
+    ]
+    processor_text = " ".join([platform.machine(), *instruction_sets])
+    return {
+        "code": compute_source_digest(),
+        "versions": provenance_record["versions"],
+        "device": f"{jax.default_backend()}: {provenance_record['device']}, {processor_text}",
+    }
+
+
+VECTOR_INSTRUCTION_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
+"""Processor instruction sets that decide which products and sums the compiler fuses, and thus the
+last digits of results.
+"""
+
+
+def describe_settings_difference(
+    stored_settings: object, current_settings: object, setting_name: str = ""
+) -> str:
+    """Return a sentence that states the first setting that differs, or "" if no setting differs.
+
+    - `setting_name`: name of the compared setting, "" for the table of all settings.
+    """
+    if isinstance(stored_settings, dict) and isinstance(current_settings, dict):
+        differences = (
+            describe_settings_difference(
+                stored_settings.get(nested_name),
+                current_settings.get(nested_name),
+                f"{setting_name}.{nested_name}".removeprefix("."),
+            )
+            for nested_name in stored_settings | current_settings
+        )
+        return next(filter(None, differences), "")
+    if stored_settings == current_settings:
+        return ""
+    if setting_name == "design.digest":
+        return "the values of the swept parameters differ"
+    if setting_name == "code":
+        return "the library's code differs"
+    return f"{setting_name} is {stored_settings!r} there and {current_settings!r} here"
+
+
+def _make_result_layout(
+    design: AbstractSampleDesign,
+    variable_names: Iterable[str],
+    base_wheel: WheelParams,
+    chunk_size: int,
+) -> ResultLayout:
+    """Return the layout of a scan's variables over the axes of a design.
+
+    - `chunk_size`: largest number of samples in a chunk.
+    """
+    locked_leg_coordinate = make_locked_leg_coordinate(base_wheel.n_legs)
+
+    def make_empty_variable(variable_name: str) -> xr.Variable:
+        """Return a variable without results: NaN for every sample, or -1 for an integer."""
+        missing_value = np.array(np.nan, base_wheel.damping.dtype)
+        if variable_name in INTEGER_VARIABLE_DTYPES:
+            missing_value = np.array(-1, INTEGER_VARIABLE_DTYPES[variable_name])
+        dimension_names, shape = design.dims, design.shape
+        if variable_name in MARGIN_MEASURES and MARGIN_MEASURES[variable_name].leg_dimension:
+            dimension_names, shape = (*dimension_names, "leg"), (*shape, locked_leg_coordinate.size)
+        return xr.Variable(
+            dimension_names,
+            np.broadcast_to(missing_value, shape),
+            get_variable_attributes(variable_name),
+        )
+
+    return ResultLayout(
+        sample_shape=design.shape,
+        chunk_shape=choose_chunk_shape(design.shape, chunk_size),
+        empty_variables={
+            variable_name: make_empty_variable(variable_name) for variable_name in variable_names
+        },
+        result_coordinates=design.make_result_coordinates() | {"leg": locked_leg_coordinate},
+    )
+
+
+INTEGER_VARIABLE_DTYPES = {
+    "outcome": "int8",
+    "rung": "int8",
+    "reason": "int8",
+    "solver_steps": "int32",
+}
+"""Types of the variables that are integers."""
+
+
+def _convert_settings_to_json(settings_object: object) -> JsonObject:
+    """Return the class name and the fields of `settings_object` as JSON values, by field name."""
+    class_name = type(settings_object).__name__
+    field_value_by_name: JsonObject = {"kind": STORED_NAME_BY_CLASS.get(class_name, class_name)}
+    stored_name_by_field = STORED_NAME_BY_MODEL_FIELD | STORED_NAMES_BY_FIELD_OF_CLASS.get(
+        class_name, {}
+    )
+    for field_name in type(settings_object).__dataclass_fields__:  # type: ignore[attr-defined]
+        field_value = getattr(settings_object, field_name)
+        if isinstance(field_value, StepOptions | ModelCapabilities):
+            continue  # Options are recorded separately, and capabilities are code.
+        if isinstance(field_value, tuple):
+            field_value = list(field_value)
+        elif field_value is not None and not isinstance(field_value, bool | int | str):
+            field_value = float(field_value)
+        field_value_by_name[stored_name_by_field.get(field_name, field_name)] = field_value
+    return field_value_by_name

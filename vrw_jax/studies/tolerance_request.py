@@ -1,0 +1,475 @@
+"""Compute measures to within a tolerance, from the simplest model whose error can be bounded.
+
+One walking step with unilateral contact starts at the gait of the lower model. The defect of this
+step, propagated to the measure by the lower model's derivatives, approximates the model error to
+second order. The estimate is a dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica
+10, 2001), in which the next model replaces the finer mesh. If the error is within the tolerance,
+the lower model's measure is returned. Otherwise Newton's method, starting at the end of that step,
+finds the gait with unilateral contact. If that gait is far from the lower model's gait, a walk to
+another gait is computed.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from vrw_jax.base.checks import (
+    check_bool,
+    check_choice,
+    check_names,
+    check_positive,
+    check_type,
+    require_known_name,
+    require_untraced_arguments,
+)
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.gaits.gait_search import GaitChoice, parse_gait_choice
+from vrw_jax.gaits.gait_walks import compute_walk_starts
+from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.studies.lower_fidelity import (
+    LowerFidelityGaits,
+    ModelIndex,
+    compute_static_leg_contraction,
+    find_paper_gaits,
+    find_rigid_gaits,
+    make_empty_gaits,
+    select_wheels,
+)
+from vrw_jax.studies.measure_result import MeasureResult, MeasureStatus
+from vrw_jax.studies.refinement import (
+    RefinedGaits,
+    estimate_measures_from_lower_gaits,
+    refine_gaits,
+)
+from vrw_jax.studies.settling import walk_until_settled
+from vrw_jax.studies.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
+from vrw_jax.studies.tolerance_contact import (
+    TIGHT_TOLERANCE,
+    VERY_TIGHT_TOLERANCE,
+    ContactWheelBatch,
+    replace_rows,
+)
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, convert_friction
+
+# Smallest tolerance of a measure for which walking steps are computed at `TIGHT_TOLERANCE`. Below
+# this value, they are computed at `VERY_TIGHT_TOLERANCE`.
+MIN_TOL_FOR_TIGHT_STEPS = 1e-7
+
+
+@announce_wait("gait steps of each model", "30 s")
+@with_default_jax_settings
+def measure_to_tolerance(
+    measures: str | Sequence[str],
+    params: WheelParams,
+    tol: float,
+    *,
+    friction: Any = 0.7,
+    relative: bool = False,
+    stoppers: str = "bilateral",
+    which: GaitChoice | None = None,
+) -> MeasureResult:
+    """Return measures of the wheel's gait with unilateral contact, each to within `tol`.
+
+    The reference model is `UnilateralWheel(friction, stoppers=stoppers)`. By default, the gait is
+    the one that Newton's method reaches from the gait of the paper's model. If that gait is too far
+    away, it is the gait that a walk from the paper's gait reaches. `MeasureResult.why` names the
+    method. Fields of `params` and `friction` may have one batch axis; the elements of a batch are
+    independent.
+
+    This function cannot be used inside `jax.jit`, because the values of the arguments determine
+    which models are computed.
+
+    Args:
+        measures: one name or several of speed, period, dls_fraction, step_length, duration_dls,
+            duration_single, duration_flight, theta_touchdown, dtheta_touchdown, dL1_touchdown.
+        params: the wheel, or a batch of wheels.
+        tol: allowed error, in the measure's unit or relative to the value.
+        friction: coefficient of Coulomb friction between feet and ground.
+        relative: whether `tol` is relative to the value itself.
+        stoppers: stoppers in the reference model, "bilateral" or "one-sided".
+        which: "slowest", "fastest" or an index, slowest first, among the gaits with unilateral
+            contact that walks from a stated set of starts reach. By default, the gait is the one
+            described above.
+
+    Returns:
+        A `MeasureResult`: the value for each wheel, its error, and the models that were used.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> wheel = vrw.WheelParams(damping=150.0)
+        >>> result = vrw.measure_to_tolerance("speed", wheel, 1e-3, friction=50.0)
+        >>> print(f"{result.value:.2f} m/s", result.error <= 1e-3)
+        1.02 m/s True
+    """
+    start_seconds = time.perf_counter()
+    require_untraced_arguments(
+        "vrw.measure_to_tolerance", "it on numbers, and give a batch as arrays", params, friction
+    )
+    measure_names = check_names("measures", measures)
+    for measure_name in measure_names:
+        require_known_name(measure_name, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+    if not measure_names:
+        raise ValueError("measures is empty, but at least one is needed: give 'speed', say.")
+    tol, relative = check_positive("tol", tol), check_bool("relative", relative)
+    check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
+    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(params, friction)
+    gait_rank = None if which is None else parse_gait_choice(which)
+    solver_tolerance = TIGHT_TOLERANCE if tol >= MIN_TOL_FOR_TIGHT_STEPS else VERY_TIGHT_TOLERANCE
+    step_options = StepOptions(rtol=solver_tolerance, atol=solver_tolerance)
+    step_options.check_tolerances(np.dtype(float))
+    wheel_batch = ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options)
+    measure_request = _MeasureRequest(measure_names, tol, relative, wheel_batch, params)
+    if gait_rank is None:
+        measure_request.try_rigid_model()
+        measure_request.try_paper_model()
+        measure_request.walk_to_gaits()
+    else:
+        measure_request.select_gait_by_rank(gait_rank)
+    result_arrays = jax.tree.map(
+        lambda x: x.reshape(batch_shape + x.shape[1:]), measure_request.result_arrays
+    )
+    return MeasureResult(
+        **result_arrays,
+        names=measure_names,
+        is_single=isinstance(measures, str),
+        seconds=time.perf_counter() - start_seconds,
+    )
+
+
+def broadcast_params_and_friction(
+    params: WheelParams, friction: Any
+) -> tuple[WheelParams, np.ndarray, tuple[int, ...]]:
+    """Return parameters and friction with one batch axis, and the batch shape of the arguments.
+
+    The batch shape is () for a single wheel. Raise a ValueError if the arguments have several batch
+    axes or different lengths.
+    """
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    friction = convert_friction(friction)
+    batch_argument_shapes = {
+        np.shape(wheel_argument_array)
+        for wheel_argument_array in (*jax.tree.leaves(params), friction)
+    }
+    batch_shape = max(batch_argument_shapes, key=len)
+    if len(batch_shape) > 1 or batch_argument_shapes - {(), batch_shape}:
+        shapes_text = ", ".join(map(str, sorted(batch_argument_shapes - {()})))
+        raise ValueError(
+            f"parameters and {FRICTION_NAME} have shapes {shapes_text}, but a batch has one "
+            "axis, the same for all: give one value for all, or one for each element."
+        )
+    n_wheels = batch_shape[0] if batch_shape else 1
+    broadcast_to_batch = lambda wheel_argument_array: np.broadcast_to(
+        np.asarray(wheel_argument_array, float), (n_wheels,)
+    )
+    return (
+        jax.tree.map(broadcast_to_batch, params),
+        broadcast_to_batch(friction),
+        batch_shape,
+    )
+
+
+# Ratio of the error bound to the error estimated from one walking step. It is chosen because the
+# bound holds if each Newton correction is at most 3/4 as long as the previous correction.
+REQUEST_SAFETY_FACTOR = 4.0
+# Number of starts of walks, slow starts first, for wheels for which the lower model has no gait. It
+# is chosen because walks from the first two starts reach a gait for 100 of 232 wheels. Walks from
+# further starts reach a gait for no other wheel.
+N_COLD_STARTS = 2
+# Largest accepted distance between the lower model's gait and the gait with unilateral contact, in
+# lengths of the first correction. It is chosen because the sum of corrections that are halved each
+# time is twice the first correction.
+MAX_GAIT_DISTANCE_RATIO = 2.0
+
+
+@dataclass
+class _MeasureRequest:
+    """State of the computation of measures for a batch of wheels, with the results so far."""
+
+    measure_names: tuple[str, ...]
+    tol: float
+    relative: bool
+    wheel_batch: ContactWheelBatch
+    params: WheelParams
+
+    def __post_init__(self) -> None:
+        n_wheels = self.wheel_batch.parameter_matrix.shape[1]
+        self.lower_gaits = make_empty_gaits(n_wheels)
+        make_measure_array = lambda fill_value: np.full(
+            (n_wheels, len(self.measure_names)), fill_value
+        )
+        self.result_arrays = {
+            "values": make_measure_array(np.nan),
+            "errors": make_measure_array(np.inf),
+            "model_errors": make_measure_array(np.nan),
+            "numerical_errors": make_measure_array(np.inf),
+            "models": np.full(n_wheels, ModelIndex.NONE),
+            "statuses": np.full(n_wheels, int(MeasureStatus.NO_GAIT)),
+            "n_steps": np.zeros(n_wheels, int),
+            "outcomes": np.full(n_wheels, int(Outcome.NO_CYCLE_FOUND)),
+            "n_gaits": np.zeros(n_wheels, int),
+            "states": self.wheel_batch.embed_paper_states(
+                np.arange(n_wheels), np.zeros((n_wheels, 3))
+            ),
+        }
+
+    def compute_error_goal(self, measure_values: np.ndarray) -> np.ndarray:
+        """Return the allowed absolute errors for measures with the values `measure_values`."""
+        return self.tol * (
+            np.abs(measure_values) if self.relative else np.ones_like(measure_values)
+        )
+
+    def find_unfinished_indices(self) -> np.ndarray:
+        """Return the indices of the wheels without a result."""
+        return np.flatnonzero(self.result_arrays["models"] == ModelIndex.NONE)
+
+    def try_rigid_model(self) -> None:
+        """Compute rigid gaits of wheels with stiff legs, and store measures to within `tol`."""
+        with np.errstate(all="ignore"):
+            wheel_indices = np.flatnonzero(
+                REQUEST_SAFETY_FACTOR * compute_static_leg_contraction(self.params) <= self.tol
+            )
+        if len(wheel_indices):
+            rigid_gaits = find_rigid_gaits(select_wheels(self.params, wheel_indices))
+            self._correct_lower_gaits(wheel_indices, rigid_gaits, are_rejected_gaits_refined=False)
+
+    def try_paper_model(self) -> None:
+        """Compute gaits of the paper's model, and store measures to within `tol`.
+
+        If the error of a gait is larger, the gait with unilateral contact near it is computed and
+        stored.
+        """
+        wheel_indices = self.find_unfinished_indices()
+        if len(wheel_indices):
+            paper_gaits = find_paper_gaits(
+                select_wheels(self.params, wheel_indices), self.wheel_batch.step_options
+            )
+            self._correct_lower_gaits(wheel_indices, paper_gaits, are_rejected_gaits_refined=True)
+
+    def walk_to_gaits(self) -> None:
+        """Compute walks of wheels without a result, and store the measures of the gaits reached."""
+        wheel_indices = self.find_unfinished_indices()
+        has_lower_gait = self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE
+        self._walk_and_record_gaits(
+            wheel_indices[has_lower_gait],
+            self.lower_gaits.section_states[wheel_indices[has_lower_gait]],
+            MeasureStatus.REACHED_FROM_LOWER_GAIT,
+        )
+        wheel_indices = wheel_indices[~has_lower_gait]
+        walk_starts = compute_walk_starts(select_wheels(self.params, wheel_indices))
+        for walk_start in walk_starts[:N_COLD_STARTS]:
+            is_gait_missing = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
+            self._walk_and_record_gaits(
+                wheel_indices[is_gait_missing],
+                walk_start[is_gait_missing],
+                MeasureStatus.REACHED_FROM_START,
+            )
+
+    def select_gait_by_rank(self, gait_rank: int) -> None:
+        """Store the measures of the gait with the index `gait_rank`, slowest first.
+
+        The gaits are those that walks from all starts reach.
+        """
+        wheel_indices = self.find_unfinished_indices()
+        walk_starts = compute_walk_starts(self.params)
+        wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
+            np.tile(wheel_indices, len(walk_starts)), np.concatenate(walk_starts)
+        )
+        selected_gait_indices = []
+        for wheel_index in wheel_indices:
+            distinct_gait_indices = refined_gaits.find_distinct_gaits(
+                np.flatnonzero(wheel_indices_of_gaits == wheel_index)
+            )
+            self.result_arrays["n_gaits"][wheel_index] = len(distinct_gait_indices)
+            if -len(distinct_gait_indices) <= gait_rank < len(distinct_gait_indices):
+                selected_gait_indices.append(distinct_gait_indices[gait_rank])
+        self._record_gaits(
+            wheel_indices_of_gaits,
+            refined_gaits,
+            np.array(selected_gait_indices, int),
+            MeasureStatus.SELECTED_BY_RANK,
+        )
+
+    def _correct_lower_gaits(
+        self,
+        wheel_indices: np.ndarray,
+        lower_gaits: LowerFidelityGaits,
+        are_rejected_gaits_refined: bool,
+    ) -> None:
+        """Compute one step with unilateral contact from each lower gait, and store measures.
+
+        The measures of a lower gait are stored if the estimated errors are within `tol`. If
+        `are_rejected_gaits_refined` is True, the other lower gaits are the initial guesses for
+        gaits with unilateral contact, whose measures are stored as well.
+        """
+        replace_rows(self.lower_gaits, wheel_indices, lower_gaits)
+        has_gait = np.isfinite(lower_gaits.step_quantities).all(1)
+        wheel_indices, lower_gaits = select_tree_rows((wheel_indices, lower_gaits), has_gait)
+        section_states, contact_step, measure_estimates = estimate_measures_from_lower_gaits(
+            self.wheel_batch, wheel_indices, lower_gaits, self.measure_names
+        )
+        lower_measure_values = evaluate_measures(self.measure_names, lower_gaits.step_quantities)
+        with np.errstate(all="ignore"):
+            total_measure_change = (
+                np.abs(
+                    evaluate_measures(self.measure_names, contact_step.step_quantities)
+                    - lower_measure_values
+                )
+                + measure_estimates.correction_effect_on_measures
+            )
+            model_error = lower_measure_values - measure_estimates.measure_values
+            section_state_sensitivity = np.abs(
+                measure_estimates.measure_jacobian @ lower_gaits.step_quantity_jacobian
+            )
+            lower_gait_error_effect = np.einsum(
+                "ijk,ik->ij", section_state_sensitivity, np.abs(lower_gaits.section_state_error)
+            )
+            numerical_error = (
+                lower_gait_error_effect
+                + measure_estimates.numerical_error_bound
+                + measure_estimates.missed_contact_error_bound
+            )
+            error_bound = (
+                np.abs(model_error)
+                + (REQUEST_SAFETY_FACTOR - 1.0) * total_measure_change
+                + numerical_error
+            )
+            is_estimate_accepted = measure_estimates.has_same_leg_codes & np.all(
+                error_bound <= self.compute_error_goal(lower_measure_values), axis=1
+            )
+        self.result_arrays["n_steps"][wheel_indices] += 1
+        lower_results = {
+            "models": lower_gaits.model_index,
+            "values": lower_measure_values,
+            "errors": error_bound,
+            "model_errors": model_error,
+            "numerical_errors": numerical_error,
+            "states": section_states,
+        }
+        self._record_results(
+            wheel_indices[is_estimate_accepted],
+            select_tree_rows(lower_results, is_estimate_accepted),
+            MeasureStatus.CHECKED_BY_ONE_STEP,
+        )
+        is_gait_refined = (
+            are_rejected_gaits_refined
+            & ~is_estimate_accepted
+            & measure_estimates.has_same_leg_codes
+        )
+        wheel_indices = wheel_indices[is_gait_refined]
+        refined_gaits = refine_gaits(
+            self.wheel_batch,
+            wheel_indices,
+            contact_step.section_states[is_gait_refined],
+            self.measure_names,
+            self.compute_error_goal,
+            is_every_gait_compared=False,
+        )
+        self.result_arrays["n_steps"][wheel_indices] += refined_gaits.n_steps
+        state_differences = refined_gaits.section_states - section_states[is_gait_refined]
+        gait_distance = np.linalg.norm(
+            state_differences[:, self.wheel_batch.list_paper_state_indices()], axis=1
+        )
+        max_gait_distance = MAX_GAIT_DISTANCE_RATIO * np.linalg.norm(
+            measure_estimates.newton_correction[is_gait_refined], axis=1
+        )
+        self._record_gaits(
+            wheel_indices,
+            refined_gaits,
+            refined_gaits.is_found & (gait_distance <= max_gait_distance),
+            MeasureStatus.CONTINUES_LOWER_GAIT,
+        )
+
+    def _walk_and_record_gaits(
+        self, wheel_indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
+    ) -> None:
+        """Compute walks from the paper's section states, and store measures of the gaits reached.
+
+        The section states have the shape (wheels, 3).
+        """
+        wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
+            wheel_indices, section_states
+        )
+        self._record_gaits(
+            wheel_indices_of_gaits,
+            refined_gaits,
+            refined_gaits.is_found & refined_gaits.is_attracting,
+            status,
+        )
+
+    def _walk_and_refine_gaits(
+        self, wheel_indices: np.ndarray, section_states: np.ndarray
+    ) -> tuple[np.ndarray, RefinedGaits]:
+        """Return the gaits at the ends of walks from the paper's section states, after refinement.
+
+        The result is (wheel index of each gait, gaits).
+        """
+        walk_ends = walk_until_settled(
+            self.wheel_batch,
+            wheel_indices,
+            self.wheel_batch.embed_paper_states(wheel_indices, section_states),
+        )
+        np.add.at(self.result_arrays["n_steps"], wheel_indices, walk_ends.n_steps)
+        # A step cannot begin if a wheel has turned more than once in flight.
+        self.result_arrays["outcomes"][wheel_indices] = np.where(
+            np.isin(walk_ends.walk_outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT)),
+            Outcome.NO_CYCLE_FOUND,
+            walk_ends.walk_outcomes,
+        )
+        wheel_indices_of_gaits = wheel_indices[walk_ends.has_settled]
+        refined_gaits = refine_gaits(
+            self.wheel_batch,
+            wheel_indices_of_gaits,
+            walk_ends.section_states[walk_ends.has_settled],
+            self.measure_names,
+            self.compute_error_goal,
+            is_every_gait_compared=True,
+        )
+        np.add.at(self.result_arrays["n_steps"], wheel_indices_of_gaits, refined_gaits.n_steps)
+        return wheel_indices_of_gaits, refined_gaits
+
+    def _record_gaits(
+        self,
+        wheel_indices_of_gaits: np.ndarray,
+        refined_gaits: RefinedGaits,
+        selected_gait_indices: np.ndarray,
+        status: MeasureStatus,
+    ) -> None:
+        """Store the measures of the selected gaits with unilateral contact.
+
+        - `wheel_indices_of_gaits`: index of the wheel of each gait;
+        - `selected_gait_indices`: indices or mask of the selected gaits.
+        """
+        wheel_indices = wheel_indices_of_gaits[selected_gait_indices]
+        refined_gaits = select_tree_rows(refined_gaits, selected_gait_indices)
+        lower_measure_values = evaluate_measures(
+            self.measure_names, self.lower_gaits.step_quantities[wheel_indices]
+        )
+        gait_results = {
+            "models": ModelIndex.UNILATERAL,
+            "values": refined_gaits.measure_values,
+            "errors": refined_gaits.measure_error_bounds,
+            "model_errors": lower_measure_values - refined_gaits.measure_values,
+            "numerical_errors": refined_gaits.measure_error_bounds,
+            "states": refined_gaits.section_states,
+        }
+        self._record_results(wheel_indices, gait_results, status)
+
+    def _record_results(
+        self, wheel_indices: np.ndarray, results: dict[str, Any], status: MeasureStatus
+    ) -> None:
+        """Store the results of the wheels with the indices `wheel_indices`.
+
+        The keys of `results` are those of `result_arrays`. `status` is the method of the results.
+        """
+        results = results | {"statuses": status, "outcomes": Outcome.STEPPED}
+        for result_name, new_result_values in results.items():
+            self.result_arrays[result_name][wheel_indices] = new_result_values

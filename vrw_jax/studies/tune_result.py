@@ -1,0 +1,172 @@
+"""Result of tuning: the gait, all evaluated gaits, and the active constraints."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.printing import format_heading_and_rows, format_html_table
+from vrw_jax.models.measures import MEASURES, get_measure
+from vrw_jax.studies.tune_exploration import ExplorationResult
+from vrw_jax.studies.tune_maximization import TuneStatus
+from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.params import WheelParams
+
+NO_ACTIVE_CONSTRAINT_TEXTS = {
+    TuneStatus.CONVERGED: "nothing: a maximum inside all bounds and constraints",
+    TuneStatus.BRANCH_ENDED: "the end of the branch, no constraint and no bound",
+    TuneStatus.MAX_EVALUATIONS_REACHED: "nothing so far: the maximization has not ended",
+    TuneStatus.NO_FEASIBLE_GAIT: "nothing: a constraint is broken here",
+    TuneStatus.STALLED: "nothing: the first-order condition is not met",
+}
+"""Texts that state why no constraint or bound is active, by the status of the maximization."""
+
+
+class ActiveConstraint(NamedTuple):
+    """Active constraint or bound at the optimum.
+
+    - `name`: name of the parameter, or of the constraint with its leg label if it has one;
+    - `limit`: bound on the parameter or on the constrained measure;
+    - `unit`: unit of the limit;
+    - `price`: gain of the objective per unit by which the limit is relaxed, which is the Lagrange
+      multiplier. It is NaN if `price_range` contains more than one number;
+    - `price_range`: smallest and largest price that satisfy the first-order condition. They differ
+      if more limits are active than parameters are free, for example. Both are NaN if the gait does
+      not satisfy the condition.
+    """
+
+    name: str
+    limit: float
+    unit: str
+    price: float
+    price_range: tuple[float, float]
+
+    def describe_price(self) -> str:
+        """Return the price, or its range, as text."""
+        low, high = self.price_range
+        if low == high:
+            return f"{self.price:.4g}"
+        if low != low:
+            return "undefined, because the first-order condition is not met"
+        return f"not unique: {low:.4g} to {high:.4g}"
+
+
+class WalkValidation(NamedTuple):
+    """Validation of the tuned wheel by a walk from a slightly displaced start.
+
+    - `n_steps`: number of completed steps;
+    - `outcome`: outcome of the last step;
+    - `distance`: distance from the limit cycle after the last step, rad, rad/s and m/s;
+    - `is_feasible`: whether every step satisfied every constraint on a margin, to within the sum of
+      1e-3 of its value and 1e-2 of its default margin.
+    """
+
+    n_steps: int
+    outcome: Outcome
+    distance: float
+    is_feasible: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneResult:
+    """Result of tuning: the gait, the path of the maximization, and the active constraints.
+
+    - `params`: the tuned wheel;
+    - `status`: reason why the maximization ended;
+    - `objective`, `value`, `start_value`: name of the objective, and its value at the tuned gait
+      and at the start;
+    - `active`: constraints and bounds that are active, each with its price;
+    - `validation`: validation by a walk of ten steps of the tuned wheel;
+    - `cycle`: the gait as a LimitCycle, or as a ReturnMapCycle with unilateral contact;
+    - `step`: step of the gait, as a StepResult or a UnilateralStep;
+    - `kkt_residual`: residual of the first-order condition, relative to the largest gradient of the
+      objective on the path;
+    - `kinks`: names of the objective and of active constraints that have a kink at the gait. A
+      margin has a kink where its minimum occurs at several instants, or on several legs, at once.
+      The multiplier of such a constraint is the sum over the instants;
+    - `violated_margins`: names of violated margins that are not constraints;
+    - `path`: every gait that was evaluated, in order;
+    - `n_evaluations`: number of evaluated gaits, each with one walking step;
+    - `n_backtracks`: number of trials without a gait on the branch, or with values that are not
+      finite;
+    - `seconds`: total time, s;
+    - `compile_seconds`: time of compilation, and of the exploration if there are many starts, s;
+    - `exploration`: results of many starts before the maximization.
+
+    Examples:
+        >>> bounds = {"damping": (100.0, 215.0)}
+        >>> result = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
+        >>> print(f"{result.params.damping:.1f} N s/m, {bool(result.cycle.found)}")
+        215.0 N s/m, True
+    """
+
+    params: WheelParams
+    status: TuneStatus
+    objective: str
+    value: float
+    start_value: float
+    cycle: Any
+    step: Any
+    active: tuple[ActiveConstraint, ...]
+    kkt_residual: float
+    violated_margins: tuple[str, ...]
+    validation: WalkValidation
+    path: xr.Dataset
+    n_evaluations: int
+    n_backtracks: int
+    seconds: float
+    compile_seconds: float
+    exploration: ExplorationResult | None = None
+    kinks: tuple[str, ...] = ()
+
+    @property
+    def converged(self) -> bool:
+        """Return whether the maximization ended at an optimum."""
+        return self.status == TuneStatus.CONVERGED
+
+    @property
+    def ending(self) -> str:
+        """Return a sentence with the reason why the maximization ended."""
+        return self.status.meaning
+
+    def describe(self) -> dict[str, str]:
+        """Return the printed texts that summarize the result, by label."""
+        free_parameter_names = self.path.attrs["free"].split()
+        parameter_texts = [
+            f"{parameter_name} "
+            f"{MEASURES[parameter_name].format_with_unit(getattr(self.params, parameter_name))}"
+            for parameter_name in free_parameter_names
+        ]
+        feasibility_text = (
+            "every constraint kept" if self.validation.is_feasible else "a constraint broken"
+        )
+        if not self.path.sizes["constraint"]:
+            feasibility_text = "no constraint to keep"
+        active_constraint_texts = [
+            f"{parameter_name} at {get_measure(parameter_name).format_with_unit(constraint_limit)}"
+            for parameter_name, constraint_limit, *_ in self.active
+        ]
+        kink_texts = {
+            "kink": f"{', '.join(self.kinks)}: the minimum occurs at several instants at once"
+        }
+        return {
+            "objective": f"{self.objective}: {self.start_value:.6g} at the start, {self.value:.6g}",
+            "wheel": ", ".join(parameter_texts),
+            "ending": f"{self.status.name}: {self.status.meaning}",
+            "held by": ", ".join(active_constraint_texts)
+            or NO_ACTIVE_CONSTRAINT_TEXTS[self.status],
+            **(kink_texts if self.kinks else {}),
+            "not asked for, and broken": ", ".join(self.violated_margins) or "none",
+            "walked": f"{self.validation.n_steps} steps, {self.validation.outcome.name}, "
+            f"{self.validation.distance:.1e} from the cycle at last; {feasibility_text}",
+            "cost": f"{self.n_evaluations} gaits, {self.n_backtracks} steps shortened, "
+            f"{self.seconds - self.compile_seconds:.2f} s and {self.compile_seconds:.1f} s to "
+            "compile",
+        }
+
+    def __repr__(self) -> str:
+        return format_heading_and_rows("TuneResult", self.describe().items())
+
+    def _repr_html_(self) -> str:
+        return format_html_table("Tuned gait", self.describe().items())
