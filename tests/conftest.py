@@ -12,7 +12,7 @@ import pytest
 from support import shape_checks
 
 ROOT = Path(__file__).parent.parent
-UNCHECKED_PACKAGE = os.environ.get("VRW_TEST_UNCHECKED", "simd")
+UNCHECKED_PACKAGE = os.environ.get("VRW_TEST_UNCHECKED", "lanes")
 """Writes code call by call, which takes eight times as long where each is checked; has no shapes in
 its signatures. `tests/simd/test_checked.py` runs it checked."""
 PACKAGE_POSITIONS = [

@@ -2,9 +2,9 @@
 
     python -m experiments.shared.count_files [CALL]
 
-A file counts if at least one of its functions runs. The packages that check, print, cache and
-compile do not count. Without CALL, each call runs in a process of its own without a cache on disk,
-because a trace from a cache runs no functions.
+A file counts if at least one of its functions runs; those of `lanes`, which compiles, are listed
+apart. Without CALL, each call runs in a process of its own without a cache on disk, because a trace
+from a cache runs no functions.
 """
 
 import os
@@ -22,10 +22,6 @@ from experiments.shared.command import make_parser
 
 LIBRARY_FOLDER = Path(vrw.__file__).parent
 """Folder of the package `vrw_jax`."""
-UNCOUNTED_PACKAGES = ("validation", "printing", "runtime", "simd")
-"""Packages of which no file is counted."""
-UNCOUNTED_FILES = ("numerics/cached_programs.py", "numerics/settings.py")
-"""Files that compile functions, or set JAX's settings, and are not counted."""
 
 
 def run_step() -> object:
@@ -63,10 +59,7 @@ def list_files(call: Callable[[], object]) -> list[str]:
         path = Path(frame.f_code.co_filename)
         is_function = event == "call" and frame.f_code.co_name != "<module>"
         if is_function and path.is_relative_to(LIBRARY_FOLDER) and path.name != "__init__.py":
-            relative_path = path.relative_to(LIBRARY_FOLDER)
-            is_uncounted_file = relative_path.as_posix() in UNCOUNTED_FILES
-            if relative_path.parts[0] not in UNCOUNTED_PACKAGES and not is_uncounted_file:
-                files[str(relative_path)] = None
+            files[path.relative_to(LIBRARY_FOLDER).as_posix()] = None
 
     sys.setprofile(record)
     call()
@@ -82,7 +75,9 @@ if __name__ == "__main__":
         if call_name == "gradient":
             run_limit_cycle()  # The gradient's count then holds only the files that it adds.
         files = list_files(CALLS[call_name])
-        print(f"{call_name}: {len(files)} files\n  " + "\n  ".join(files))
+        compiler_files = [file for file in files if file.startswith("lanes/")]
+        print(f"{call_name}: {len(files)} files, {len(compiler_files)} of lanes")
+        print("  " + "\n  ".join([*(f for f in files if f not in compiler_files), *compiler_files]))
     else:
         for name in CALLS:
             # Without `vrw.start_jax` there is no cache on disk.

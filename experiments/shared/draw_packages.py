@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Polygon
 
 from experiments.shared.command import make_parser
-from tests.support.package_graph import PACKAGE_LAYERS, ImportGraph
+from tests.support.package_graph import ImportGraph
 from vrw_jax.app.figure_style import DARK_GRAY_COLOR, PAGE_FIGURE_WIDTH_INCHES, figure_style, save
 
 ROOT = Path(__file__).parents[2]
@@ -116,18 +116,6 @@ def _legend(axes: Axes, import_graph: ImportGraph) -> None:
         "Circles: the number of imported names; line widths grow with it."
     )
     axes.text(right, -0.6, text, ha="right", va="top", fontsize=8.0, linespacing=1.35)
-    for layer in (row for row in PACKAGE_LAYERS if len(row) > 1):
-        rows = [
-            import_graph.packages.index(package)
-            for package in layer
-            if package in import_graph.packages
-        ]
-        x = rows[-1] + WIDTH + 0.2
-        top, bottom = rows[0] - HEIGHT / 2, rows[-1] + HEIGHT / 2
-        axes.plot([x - 0.1, x, x, x - 0.1], [top, top, bottom, bottom], color=DARK_GRAY_COLOR,
-                  linewidth=0.7)  # fmt: skip
-        axes.text(x + 0.15, (top + bottom) / 2, "do not import\neach other", va="center",
-                  fontsize=7.0, color=DARK_GRAY_COLOR)  # fmt: skip
 
 
 def main() -> None:

@@ -15,13 +15,13 @@ from pathlib import Path
 from textwrap import dedent
 from typing import NamedTuple
 
-PACKAGE_LAYERS = (
-    ("simd",), ("validation",), ("printing",), ("runtime",), ("numerics",), ("integrator",),
-    ("hybrid",), ("collocation",), ("wheel",), ("measures",), ("models",), ("contact",),
-    ("selection",), ("simulation",), ("batches",), ("continuation",), ("cycles",), ("tolerance",),
-    ("branches", "tuning"), ("robustness",), ("scans",), ("figures", "web"), ("paper",), ("cli",),
+PACKAGE_ORDER = (
+    "lanes", "base", "wheel", "flow", "models", "gaits", "branches", "studies", "app",
 )  # fmt: skip
-"""Packages in import order: a package may import those of earlier rows only."""
+"""Packages in import order: a package may import those before it only."""
+
+PUBLIC_MODULES = {"hybrid": "flow", "continuation": "branches", "plot": "app", "__main__": "app"}
+"""Modules beside the packages, with the last package that each exports names of."""
 
 
 class ImportEdge(NamedTuple):
@@ -53,25 +53,21 @@ class ImportGraph:
         return module in self.paths and self.paths[module].name == "__init__.py"
 
     def package_of(self, module: str) -> str:
-        """Return a module's first folder or file below the top package.
-
-        It is "" for the top package's `__init__` and `__main__`.
-        """
+        """Return a module's package; it is "" for the top package's `__init__`."""
         package = module.split(".")[1] if "." in module else ""
-        return "" if package == "__main__" else package
+        return PUBLIC_MODULES.get(package, package)
 
     @cached_property
     def packages(self) -> tuple[str, ...]:
-        """All packages in import order; those outside `PACKAGE_LAYERS` come last."""
-        known_packages = [package for row in PACKAGE_LAYERS for package in row]
+        """All packages in import order; those outside `PACKAGE_ORDER` come last."""
         existing_packages = {self.package_of(module) for module in self.paths} - {""}
         return (
-            *(package for package in known_packages if package in existing_packages),
-            *sorted(existing_packages - set(known_packages)),
+            *(package for package in PACKAGE_ORDER if package in existing_packages),
+            *sorted(existing_packages - set(PACKAGE_ORDER)),
         )
 
     def modules_of(self, package: str) -> list[str]:
-        """Return the modules of a package, including its `__init__`."""
+        """Return the modules of a package, including its `__init__` and public modules."""
         return [module for module in self.paths if self.package_of(module) == package]
 
     def count_lines(self, module: str) -> int:

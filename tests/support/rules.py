@@ -1,19 +1,35 @@
 """Rules for imports between modules: each returns the violations in an import graph as lines."""
 
 import ast
+import sys
 from collections.abc import Iterable, Iterator
 
-from support.package_graph import PACKAGE_LAYERS, ImportEdge, ImportGraph, find_loaded_module
+from support.package_graph import (
+    PACKAGE_ORDER,
+    PUBLIC_MODULES,
+    ImportEdge,
+    ImportGraph,
+    find_loaded_module,
+)
+
+SHARED_LIBRARIES = {"equinox", "jax", "jaxtyping", "numpy", "scipy", "xarray"}
+"""Libraries that every package may import."""
 
 ALLOWED_IMPORTERS = {
-    "diffrax": ("hybrid.phase_integration",), "llvmlite": ("simd",), "matplotlib": ("figures",),
-    "PIL": ("figures",), "rich": ("cli",), "typer": ("cli",), "zarr": ("scans.store",),
-    "anywidget": ("web",),
+    "PIL": "app", "anywidget": "app", "cycler": "app", "dask": "studies.scan_dask",
+    "diffrax": "flow.phase_integration", "distributed": "studies.scan_dask", "llvmlite": "lanes",
+    "matplotlib": "app", "optax": "studies", "rich": "app", "traitlets": "app", "typer": "app",
+    "zarr": "studies",
 }  # fmt: skip
-"""Modules or packages that may import a library; an `__init__` file may re-export it."""
+"""The one package or module that may import a library."""
 
-MODEL_PACKAGES = ("models", "contact", "selection")
+MODEL_PACKAGES = ("models",)
 """Packages that define models. Only these may test which model an object is."""
+
+WALKER_PACKAGES = ("wheel", "models")
+"""Packages of the wheel, which packages for any walker do not import in the end."""
+GENERAL_PACKAGES = ("flow", "gaits", "branches", "studies")
+"""Packages for any walker."""
 
 
 def find_import_cycles(import_graph: ImportGraph) -> list[str]:
@@ -42,75 +58,71 @@ def find_import_cycles(import_graph: ImportGraph) -> list[str]:
 
 def find_upward_imports(import_graph: ImportGraph) -> list[str]:
     """Return the imports against the import order, and the packages outside that order."""
-    layer_index = {package: index for index, row in enumerate(PACKAGE_LAYERS) for package in row}
+    position = {package: index for index, package in enumerate(PACKAGE_ORDER)}
     violations = [
-        f"{package} is missing in PACKAGE_LAYERS"
+        f"{package} is missing in PACKAGE_ORDER"
         for package in import_graph.packages
-        if package not in layer_index
+        if package not in position
     ]
+    last = len(position)
     for edge in import_graph.edges:
         source, target = import_graph.package_of(edge.source), import_graph.package_of(edge.target)
-        if edge.target not in import_graph.paths or not source or source == target:
-            continue
-        if layer_index.get(target, len(PACKAGE_LAYERS)) >= layer_index.get(
-            source, len(PACKAGE_LAYERS)
-        ):
+        is_inside = edge.target in import_graph.paths and source != target
+        if source and is_inside and position.get(target, last) >= position.get(source, last):
             violations.append(f"{_format_location(edge)} imports {edge.target}")
     return sorted(set(violations))
 
 
-def find_bypassed_init_files(import_graph: ImportGraph) -> list[str]:
-    """Return the imports from another package that bypass its `__init__`."""
-    return sorted(
-        {
-            f"{_format_location(edge)} imports {edge.imported_name.replace(':', '.')}"
-            for edge in import_graph.edges
-            if _bypasses_init_file(import_graph, edge)
-        }
-    )
+def find_indirect_imports(import_graph: ImportGraph) -> list[str]:
+    """Return the imports of names from a module that does not define the name.
 
-
-def _bypasses_init_file(import_graph: ImportGraph, edge: ImportEdge) -> bool:
-    top, package, first, *_ = [*edge.imported_name.replace(":", ".").split("."), "", ""]
-    init_module = f"{top}.{package}"
-    if (
-        top != import_graph.name
-        or package == import_graph.package_of(edge.source)
-        or not import_graph.is_init_module(init_module)
-    ):
-        return False
-    exported = (
-        first in import_graph.names[init_module]
-        or f"{init_module}.{first}" not in import_graph.paths
-    )
-    return edge.stated_module not in ("", top, init_module) or not exported
+    Attributes of a package or of a public module, as in `lanes.jit`, are allowed.
+    """
+    violations = []
+    for edge in import_graph.edges:
+        *modules_on_path, _ = import_graph.resolve_path(edge.imported_name)
+        is_package_attribute = not edge.stated_module and (
+            import_graph.is_init_module(modules_on_path[0])
+            or modules_on_path[0].removeprefix(f"{import_graph.name}.") in PUBLIC_MODULES
+        )
+        if len(modules_on_path) > 1 and not is_package_attribute:
+            violations.append(
+                f"{_format_location(edge)} imports {edge.imported_name} instead of "
+                f"{modules_on_path[-1]}"
+            )
+    return sorted(set(violations))
 
 
 def find_misplaced_external_imports(import_graph: ImportGraph) -> list[str]:
     """Return the imports of libraries outside `ALLOWED_IMPORTERS`, or by a computed name."""
     violations = []
     for edge in import_graph.edges:
-        places = [
-            f"{import_graph.name}.{place}"
-            for place in ALLOWED_IMPORTERS.get(edge.target.split(".")[0], ())
-        ]
-        is_init = import_graph.is_init_module(edge.source)
-        is_allowed = any(f"{edge.source}.".startswith(f"{place}.") for place in places)
-        if places and not is_init and not is_allowed:
-            violations.append(f"{_format_location(edge)} imports {edge.target.split('.')[0]}")
-        source_in_simd, target_in_simd = (
-            import_graph.package_of(module) == "simd" for module in (edge.source, edge.target)
-        )
-        if source_in_simd and not target_in_simd and edge.target in import_graph.paths:
-            violations.append(
-                f"{_format_location(edge)} imports {edge.target}: simd imports no other package"
-            )
+        library = edge.target.split(".")[0]
+        if library in {import_graph.name, *SHARED_LIBRARIES} | sys.stdlib_module_names:
+            continue
+        importer = f"{import_graph.name}.{ALLOWED_IMPORTERS.get(library, '')}"
+        if not f"{edge.source}.".startswith(f"{importer}."):
+            violations.append(f"{_format_location(edge)} imports {library}")
     for module, tree in import_graph.trees.items():
         if any(
             find_loaded_module(node, import_graph.names[module]) == "" for node in ast.walk(tree)
         ):
             violations.append(f"{module} imports a module by a computed name")
     return sorted(set(violations))
+
+
+def list_walker_imports(import_graph: ImportGraph) -> list[str]:
+    """Return each module of a general package with the modules of the wheel that it imports."""
+    imported_modules: dict[str, set[str]] = {}
+    shorten = lambda module: module.removeprefix(f"{import_graph.name}.")
+    for edge in import_graph.edges:
+        is_general = import_graph.package_of(edge.source) in GENERAL_PACKAGES
+        if is_general and import_graph.package_of(edge.target) in WALKER_PACKAGES:
+            imported_modules.setdefault(shorten(edge.source), set()).add(shorten(edge.target))
+    return [
+        f"{module}: {' '.join(sorted(targets))}"
+        for module, targets in sorted(imported_modules.items())
+    ]
 
 
 def find_model_type_tests(import_graph: ImportGraph) -> list[str]:
@@ -201,8 +213,8 @@ def find_unused_exports(
 ) -> list[str]:
     """Return the exports of `__init__` files that nothing imports, or that are private.
 
-    `outside_sources` use the package: tests and experiments. The top package's own `__init__` is
-    for users and is not checked.
+    `outside_sources` use the package: tests, experiments, the website and pages. The top package's
+    own `__init__` is for users and is not checked.
     """
     imported_names = {
         name for text in outside_sources for name in import_graph.find_imports_in(text)
@@ -230,7 +242,7 @@ def _format_location(edge: ImportEdge) -> str:
 IMPORT_RULES = (
     find_import_cycles,
     find_upward_imports,
-    find_bypassed_init_files,
+    find_indirect_imports,
     find_misplaced_external_imports,
     find_model_type_tests,
 )

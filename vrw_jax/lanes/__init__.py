@@ -7,13 +7,7 @@ from vrw_jax.lanes import code_cache, disk_cache, ffi_primitive, kernel, machine
 from vrw_jax.lanes.array_emitter import DEFAULT_REGISTER_LIMITS, RegisterLimits
 from vrw_jax.lanes.batching import apply_function_in_blocks, map_in_batches, select_tree_rows
 from vrw_jax.lanes.code_cache import targets_machine_code
-from vrw_jax.lanes.ffi_primitive import MACHINE_CODE_PRIMITIVE
-from vrw_jax.lanes.lane_function import (
-    CompiledBatchFunction,
-    LaneFunction,
-    compile_batch_function,
-    jit,
-)
+from vrw_jax.lanes.lane_function import compile_batch_function, jit
 from vrw_jax.lanes.lowering import mark_noinline
 from vrw_jax.lanes.machine import describe_processor
 from vrw_jax.lanes.program import (
@@ -23,5 +17,5 @@ from vrw_jax.lanes.program import (
     load_saved_machine_code,
 )
 from vrw_jax.lanes.rules import describe_supported_primitives
-from vrw_jax.lanes.saved_traces import compile_exported_function, evaluate_by_saved_trace
+from vrw_jax.lanes.saved_traces import compile_exported_function
 from vrw_jax.lanes.settings import with_default_jax_settings
