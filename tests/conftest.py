@@ -14,7 +14,7 @@ from support import shape_checks
 ROOT = Path(__file__).parent.parent
 UNCHECKED_PACKAGE = os.environ.get("VRW_TEST_UNCHECKED", "lanes")
 """Writes code call by call, which takes eight times as long where each is checked; has no shapes in
-its signatures. `tests/simd/test_checked.py` runs it checked."""
+its signatures. `tests/lanes/test_checked.py` runs it checked."""
 PACKAGE_POSITIONS = [
     f"vrw_jax.{place.name}"
     for place in (ROOT / "vrw_jax").iterdir()
