@@ -975,7 +975,7 @@ def register_wrong_calls() -> None:
     )  # fmt: skip
     add_wrong_call(
         "a masked gap",
-        lambda: flow.enumerate_lcp_solutions(np.eye(2), masked), "TypeError", "masked entries",
+        lambda: hybrid.enumerate_lcp_solutions(np.eye(2), masked), "TypeError", "masked entries",
     )  # fmt: skip
     add_wrong_call(
         "indices of what is no saltelli scan",
