@@ -146,7 +146,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Return the version, or the package of figures, which is imported on first use."""
+    """Return the version, or the module of figures, which is imported on first use."""
     if name == "__version__":
         return importlib.metadata.version("vrw-jax")
     if name == "plot":  # imports matplotlib only if figures are drawn

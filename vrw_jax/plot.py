@@ -1,4 +1,4 @@
-"""Figures of labeled results. Only this package imports matplotlib."""
+"""Figures of labeled results. Only the package `app` imports matplotlib."""
 
 from vrw_jax.app import figure_style as style
 from vrw_jax.app._branch_figures import basin_figure, branch_figure

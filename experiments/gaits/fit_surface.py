@@ -3,7 +3,7 @@
     python -m experiments.gaits.fit_surface
 
 The cubic predicts gaits to about one percent. The reference is the half of the gaits that the fit
-omits. The command writes `vrw_jax/cycles/surface.npz`, from which `limit_cycle` takes its start.
+omits. The command writes `vrw_jax/gaits/surface.npz`, from which `limit_cycle` takes its start.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Signatures of `simd` hold; other tests do not check signatures of this package."""
+"""Signatures of `lanes` hold; other tests do not check signatures of this package."""
 
 import os
 import subprocess

@@ -32,7 +32,7 @@ def forbid_reverse_mode(function_name: str, function_result: PyTree) -> PyTree:
     """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
     error.
 
-    `function_name` is the function in `hybrid` that computed the result.
+    `function_name` is the function in `flow` that computed the result.
     """
 
     def mark_leaf_as_forward_only(leaf: Any) -> Any:

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     Elementwise = Array
 else:
     Elementwise = Inexact[Array, "..."] | Inexact[np.ndarray, "..."] | float
-"""Quantity with any leading axes, because formulas in lower layers than `scans` act element by
+"""Quantity with any leading axes, because formulas in lower layers than `studies` act element by
 element.
 
 Complex numbers are also allowed, because complex-step derivatives need them.

@@ -1,7 +1,7 @@
 """Minima of margins during a phase of a batch, as accurate as the integration.
 
-The method is that of `hybrid/minima`, applied to all batch elements. During the integration, the
-solver step that contains the lowest minimum of each margin is stored. Afterwards, a secant
+The method is that of `flow/diffrax_minima`, applied to all batch elements. During the integration,
+the solver step that contains the lowest minimum of each margin is stored. Afterwards, a secant
 iteration for the root of the margin's time derivative locates each minimum, one margin after
 another.
 """

@@ -134,7 +134,7 @@ def confirm_outcome_by_step(
 class AbstractGaitFinder(eqx.Module):
     """Base class of gait finders, each for one model.
 
-    Packages above `cycles` use only this interface. `make_finder` selects the class.
+    Packages above `gaits` use only this interface. `make_finder` selects the class.
     """
 
     model: eqx.AbstractVar[AbstractWheel]

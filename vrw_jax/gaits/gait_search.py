@@ -1,10 +1,10 @@
 """Search for limit cycles, with finer meshes and walks as fallbacks.
 
 The search in `collocation_search` starts from predicted gaits for the paper's parameter ranges, on
-a mesh that suits these gaits. If it fails, batches of walks (`batches`) begin at starts that scale
-with the wheel. The end of a walk that settles is the start of another search. If the mesh is too
-coarse, it is refined. These fallbacks depend on concrete values. Under a caller's `jit` or `vmap`,
-only the search runs.
+a mesh that suits these gaits. If it fails, batches of walks (`models.step_batch`) begin at starts
+that scale with the wheel. The end of a walk that settles is the start of another search. If the
+mesh is too coarse, it is refined. These fallbacks depend on concrete values. Under a caller's `jit`
+or `vmap`, only the search runs.
 """
 
 import functools

@@ -110,8 +110,8 @@ class JaxprLowering:
             if primitive_name not in self.primitive_rules:
                 raise NotImplementedError(
                     f"{primitive_name} has no machine code: write it by primitives that "
-                    "`simd.describe_supported_primitives()` lists, or give it a rule in "
-                    "`simd/rules.PRIMITIVE_RULES`."
+                    "`lanes.describe_supported_primitives()` lists, or give it a rule in "
+                    "`lanes/rules.PRIMITIVE_RULES`."
                 )
             for variable in equation.outvars:
                 if LANE_AXIS_SENTINEL in variable.aval.shape[:-1]:

@@ -1,7 +1,7 @@
 """Gait steps of batches of wheels: one function with a choice of engines.
 
 On a CPU the engine "lanes" is machine code that computes a few lanes (elements of the batch) at a
-time (`simd`). On a GPU it is an XLA program for thousands of lanes, which runs again in smaller
+time (`lanes`). On a GPU it is an XLA program for thousands of lanes, which runs again in smaller
 batches for the unfinished lanes. Every lane runs the same code, and no data pass between lanes. The
 result for a batch element is therefore bitwise the same alone, in any batch and in any order.
 Wheels whose steps need similar work are neighbors in the batch.
