@@ -112,6 +112,13 @@ class ContactLaw(NamedTuple):
     rest_speed: Elementwise  # speed below which a contact is at rest after an impact, m/s
     restitution: Elementwise | None = None  # Newton's coefficient of the feet
     next_line_tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
+    # number of events beyond `BounceRestOptions.n_events_before_rest_speed_ramp`
+    n_late_events: Int[Array, "..."] | int = 0
+
+    @property
+    def stopper_rest_speed(self) -> Elementwise:
+        """Return the speed below which a leg stays on its stopper after an impact, m/s."""
+        return self.rest_speed * (1 + self.n_late_events)
 
 
 @dataclass(frozen=True)
@@ -297,8 +304,11 @@ def _apply_restitution(
             motion, inverse_inertia.leg_directions, contact_slots
         ).normal_to_slope
     )
-    # A foot whose rebound is slower than the rest speed is at rest.
-    rebound_speeds = jnp.where(rebound_speeds < -contact_law.rest_speed, rebound_speeds, 0.0)
+    # A foot whose rebound is slower than the rest speed is at rest. After many events, restitution
+    # ends sooner than small motions of legs: an inelastic landing pushes, but the impulse that
+    # keeps a leg on its stopper may pull on the feet.
+    min_rebound_speed = contact_law.rest_speed * (1 + contact_law.n_late_events**2)
+    rebound_speeds = jnp.where(rebound_speeds < -min_rebound_speed, rebound_speeds, 0.0)
     return free_motion._replace(
         foot_transverse_motion=free_motion.foot_transverse_motion
         - inverse_inertia.sin * rebound_speeds,
@@ -394,7 +404,8 @@ def _solve_velocity_level(
         is_open_stopper_untested=~is_slot_locked,
     )
     tolerances = ContactSignTolerances(
-        s.m * contact_law.rest_speed / MAX_VIOLATION, contact_law.rest_speed / MAX_VIOLATION
+        s.m * contact_law.rest_speed / MAX_VIOLATION,
+        contact_law.stopper_rest_speed / MAX_VIOLATION,
     )
 
     def solve_kinematic_level(
@@ -640,6 +651,9 @@ def _bring_slow_contacts_to_rest(
     the impact is brought to rest. Otherwise its bounces would be too small to resolve, and their
     number would be unlimited. The forces then determine the contacts in the subsequent motion.
 
+    The impulses that bring contacts to rest have no friction. They may pull, by about the mass that
+    stops times its speed, and the later support force makes up for the pull.
+
     - `contact_modes`: contact mode of each foot after the impact;
     - `is_at_stopper`, `was_at_stopper`: whether each leg is on its stopper after and before the
       impact.
@@ -658,11 +672,13 @@ def _bring_slow_contacts_to_rest(
         jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, modes_after_rest),
         ContactMode.OFF,
     )
-    is_leg_locked = is_at_stopper | (was_at_stopper & (jnp.abs(motion.dL) < contact_law.rest_speed))
+    is_leg_locked = is_at_stopper | (
+        was_at_stopper & (jnp.abs(motion.dL) < contact_law.stopper_rest_speed)
+    )
     has_contact_changed = jnp.any(
         (modes_after_rest != contact_modes) | (is_leg_locked != is_at_stopper), axis=0
     )
-    s, frozen_motion, friction = stop_gradients((contact_law.s, motion, contact_law.friction))
+    s, frozen_motion = stop_gradients((contact_law.s, motion))
 
     def find_reversed_slip(_: Array) -> Array:
         """Return whether the projection reverses the slip of each foot.
@@ -670,7 +686,7 @@ def _bring_slow_contacts_to_rest(
         A foot with reversed slip also comes to rest.
         """
         slip_speed_after, _ = compute_foot_velocities(
-            project_motion(s, frozen_motion, modes_after_rest, is_leg_locked, friction),
+            project_motion(s, frozen_motion, modes_after_rest, is_leg_locked),
             leg_directions,
         )
         return ((modes_after_rest == ContactMode.SLIP_DOWN) & (slip_speed_after < 0.0)) | (
@@ -684,9 +700,7 @@ def _bring_slow_contacts_to_rest(
     return (
         select_trees_by_condition(
             has_contact_changed,
-            project_motion(
-                contact_law.s, motion, modes_after_rest, is_leg_locked, contact_law.friction
-            ),
+            project_motion(contact_law.s, motion, modes_after_rest, is_leg_locked),
             motion,
         ),
         modes_after_rest,
@@ -723,7 +737,9 @@ def _merge_touching_contacts(
         )
         <= 2
     )
-    has_more_contacts = (bounce_height >= s.L0 - motion.L) & (motion.dL >= -contact_law.rest_speed)
+    has_more_contacts = (bounce_height >= s.L0 - motion.L) & (
+        motion.dL >= -contact_law.stopper_rest_speed
+    )
     is_leg_meeting_stopper = contact_event.is_leg_meeting_stopper | (
         has_more_contacts & ~contact_state.is_leg_locked & contact_event.is_impact
     )
@@ -808,7 +824,7 @@ def resolve_event(
     )
     if contact_law.restitution is not None:  # Only a part of the impulse may act.
         stays_at_stopper = stays_at_stopper & (
-            jnp.abs(velocity_solution.motion_after_impact.dL) < contact_law.rest_speed
+            jnp.abs(velocity_solution.motion_after_impact.dL) < contact_law.stopper_rest_speed
         )
     slow_contact_result = _bring_slow_contacts_to_rest(
         contact_law,
@@ -884,15 +900,13 @@ def project_motion(
     motion: WheelMotion,
     contact_modes: Int[Array, "n ..."],
     is_leg_locked: Bool[Array, "n ..."],
-    friction: Friction | float = 0.0,
 ) -> WheelMotion:
     """Return the motion projected onto the constraints of its contacts.
 
     After the projection, loaded feet are on the slope and sticking feet are at rest. Bilateral
-    impulses without friction project the velocities. A motion that satisfies the constraints is
-    returned unchanged within round-off.
-
-    - `friction`: friction coefficient for sliding feet in the projection.
+    impulses without friction project the velocities, which never increases the energy: friction on
+    a foot whose impulse pulls would. A motion that satisfies the constraints is returned unchanged
+    within round-off.
     """
     leg_directions = compute_leg_directions(s, motion.theta)
     L = jnp.where(
@@ -900,7 +914,7 @@ def project_motion(
     )
     motion = motion._replace(L=jnp.where(is_leg_locked, s.L0, L))
     contact_configuration = ContactConfiguration(
-        s, motion, *find_slot_contacts(friction, contact_modes, is_leg_locked)
+        s, motion, *find_slot_contacts(0.0, contact_modes, is_leg_locked)
     )
     is_sticking = contact_configuration.slot_modes == ContactMode.STICK
     is_first_held, is_second_held = contact_configuration.is_stopper_holding

@@ -104,9 +104,7 @@ def process_event(
     the projection, the foot would land again immediately.
     """
     first_ramp_event = max(N_EVENTS_BEFORE_REST_SPEED_RAMP, max_events // 4)
-    contact_law = contact_law._replace(
-        rest_speed=contact_law.rest_speed * (1 + jnp.maximum(n_events - first_ramp_event, 0))
-    )
+    contact_law = contact_law._replace(n_late_events=jnp.maximum(n_events - first_ramp_event, 0))
     motion = project_motion(
         contact_law.s, motion, contact_state.contact_modes, contact_state.is_leg_locked
     )

@@ -149,8 +149,8 @@ class UnilateralWheel(AbstractContactWheel):
     - `friction`: friction coefficient of the ground, `inf` for infinite friction (see
       `infinite_friction_rule`);
     - `max_events`: largest number of events in one step. A contact slower than the rest speed comes
-      to rest. The rest speed grows with each event after a quarter of this number, or after 100
-      events if that is more;
+      to rest. The rest speed of legs and of landing feet grows with each event after a quarter of
+      this number, or after 100 events if that is more;
     - `stoppers`: if "bilateral", a leg in the air that has reached its stopper stays there until
       its foot is loaded. If "one-sided", the leg leaves the stopper as soon as the stopper would
       have to pull;
