@@ -77,7 +77,7 @@ NAMED_COLOR_PATTERN = (
 )
 
 
-@pytest.mark.parametrize("folder", ["experiments", "vrw_jax/figures"])
+@pytest.mark.parametrize("folder", ["experiments", "vrw_jax/app"])
 def test_figures_use_only_colors_of_the_palette(folder: str):
     """Okabe and Ito's, greys, black and white; matplotlib's own red, green and blue are others."""
     for path in (ROOT / folder).rglob("*.py"):
@@ -171,7 +171,7 @@ def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations
 UNIT = r"(s|ms|µs|m|mm|N|J|%|rad|m/s|rad/s|N s/m|N·s/m)"
 
 
-@pytest.mark.parametrize("folder", ["experiments", "vrw_jax/figures"])
+@pytest.mark.parametrize("folder", ["experiments", "vrw_jax/app"])
 def test_labels_write_units_in_brackets(folder: str):
     """Not after a stroke or a comma."""
     wrong = re.compile(rf'["\n](?:[^"\[]*) / {UNIT}"|label="[^"\[]*, {UNIT}"|\[[^\]"]*N s')
