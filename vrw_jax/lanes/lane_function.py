@@ -81,6 +81,7 @@ class CompiledBatchFunction:
         """Return the results as part of the JAX program that calls this object."""
         if is_machine_code_available() and self._has_machine_code():
             leaves, structure = jax.tree.flatten(argument_trees)
+            leaves = [x if hasattr(x, "dtype") else jnp.asarray(x) for x in leaves]
             get_program = functools.partial(self._get_program, structure)
             with contextlib.suppress(_NoMachineCodeError):
                 return call_machine_code(get_program, leaves)
@@ -356,7 +357,8 @@ class LaneFunction:
     ) -> "_LaneFunctionVariant":
         variant = self._variants.get(key) if key else None
         if variant is None:
-            variant = _LaneFunctionVariant(self._xla_block_size, key, signature, n_numbers)
+            name = getattr(self._function, "__qualname__", "a function")
+            variant = _LaneFunctionVariant(name, self._xla_block_size, key, signature, n_numbers)
         if key:
             self._variants[key] = variant
             self._variants.move_to_end(key)
@@ -375,9 +377,9 @@ class _LaneFunctionVariant:
     rebuild_function: Callable
 
     def __init__(
-        self, xla_block_size: int, key: str | None, signature: tuple, n_numbers: int
+        self, name: str, xla_block_size: int, key: str | None, signature: tuple, n_numbers: int
     ) -> None:
-        self._xla_block_size, self._key = xla_block_size, key
+        self._name, self._xla_block_size, self._key = name, xla_block_size, key
         self._structure, self._static_leaves, self._is_array = signature
         self._n_numbers = n_numbers
         self._batch_functions: dict[Any, CompiledBatchFunction] = {}
@@ -440,7 +442,7 @@ class _LaneFunctionVariant:
     def _compile(self, function: Callable, differentiated_arguments: tuple) -> Callable:
         """Compile a function of the arrays of one lane, which `jax.vmap` maps to lanes."""
         key = self._key and make_key(self._key, "one lane", differentiated_arguments)
-        lane_function = _append_lane_axis(function, 0)
+        lane_function = _append_lane_axis(function, 0, self._name)
         return unbatch(CompiledBatchFunction(lane_function, self._xla_block_size, key=key))
 
     def _compile_for_batches(
@@ -464,7 +466,7 @@ class _LaneFunctionVariant:
 
         key = self._key and make_key(self._key, "batches", shared_shapes)
         return CompiledBatchFunction(
-            _append_lane_axis(evaluate_assembled, 1), self._xla_block_size, key=key
+            _append_lane_axis(evaluate_assembled, 1, self._name), self._xla_block_size, key=key
         )
 
 
@@ -494,8 +496,8 @@ def _convert_numbers(arrays: Sequence[Any]) -> list[Any]:
     return [jnp.asarray(x, dtype) if isinstance(x, float) else jnp.asarray(x) for x in arrays]
 
 
-def _append_lane_axis(function: Callable, n_shared: int) -> Callable:
-    """Return a function of lanes on the last axis from a function of one lane."""
+def _append_lane_axis(function: Callable, n_shared: int, name: str) -> Callable:
+    """Return a function of lanes on the last axis from a function of one lane, with a name."""
     with_lanes_for_machine_code = append_lane_axis(function, n_shared)
 
     def call_with_lanes(*arguments: Any) -> Any:
@@ -504,4 +506,5 @@ def _append_lane_axis(function: Callable, n_shared: int) -> Callable:
         in_axes = (*[None] * n_shared, *[-1] * (len(arguments) - n_shared))
         return jax.vmap(function, in_axes, -1)(*arguments)
 
+    call_with_lanes.__qualname__ = name  # Warnings name the user's function.
     return call_with_lanes
