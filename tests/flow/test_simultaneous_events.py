@@ -83,6 +83,41 @@ def test_a_start_on_a_falling_guard_has_the_event_time_s_derivatives(height, sol
         np.testing.assert_allclose(second, reference, atol=1e-11)
 
 
+def differentiate_four_times(function, at):
+    for _ in range(4):
+        function = lambda a, f=function: jax.jvp(f, (a,), (1.0,))[1]
+    return jax.jit(function)(at)
+
+
+TSIT5 = vrw.StepOptions("Tsit5", rtol=1e-12, atol=1e-12)
+
+
+def test_an_event_at_time_zero_has_right_fourth_derivatives():
+    """Two decaying coordinates with a guard each: the first event is at time log y0."""
+    guards = (Guard(lambda y: y[0] - 1.0), Guard(lambda y: y[1] - 1.0))
+    decay = Mode(lambda y: jnp.stack([-y[0], -2.0 * y[1] * y[0]]), guards)
+
+    def decayed(a):
+        start = jnp.stack([a, 1.5 * a**2])
+        solution = simulate_hybrid((decay,), start, events=1, options=TSIT5)
+        return jnp.append(solution.states_before[0], solution.times)
+
+    def decayed_in_closed_form(a):
+        return jnp.stack([jnp.ones(()), 1.5 * a**2 * jnp.exp(2.0 * (1.0 - a)), jnp.log(a)])
+
+    fourth = differentiate_four_times(decayed, 1.0)
+    reference = differentiate_four_times(decayed_in_closed_form, 1.0)
+    np.testing.assert_allclose(fourth, reference, atol=1e-10)  # round-off times 4!
+
+
+@pytest.mark.slow
+def test_an_event_that_the_first_guess_hits_has_right_fourth_derivatives():
+    fourth = differentiate_four_times(lambda a: thrown(jnp.stack([a, 0.0 * a]), TSIT5), 0.5)
+    closed_form = lambda a: thrown_in_closed_form(jnp.stack([a, 0.0 * a]))
+    reference = differentiate_four_times(closed_form, 0.5)
+    np.testing.assert_allclose(fourth, reference, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_starts_on_and_above_a_guard_have_right_derivatives_in_one_batch():
     starts = jnp.array([[0.0, -2.0], [0.3, -2.0], [0.0, -1.0], [1e-12, -2.0]])

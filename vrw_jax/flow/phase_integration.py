@@ -3,8 +3,8 @@
 The solvers and the step-size controller of diffrax are called for one solver step at a time. The
 state at an event therefore has the accuracy of the integrator and not of an interpolant. An
 accepted solver step that brackets an event is repeated. Newton's method corrects the length of the
-repeated step until the step ends at the event. Derivatives pass through these last steps, so first
-and second derivatives of the event's state and time are accurate as well.
+repeated step until the step ends at the event. Derivatives of the event's state and time follow
+from the implicit function theorem, so they are accurate to the order of the solver.
 """
 
 from __future__ import annotations
@@ -83,9 +83,8 @@ class EventSearchOptions:
     n_required_confirming_steps: int = 3
     """Number of solver steps to the located event that must confirm the event's time.
 
-    The value is chosen because of the derivatives of the event's time. The first step makes them
-    accurate to first order, the second to third order. The last step evaluates the state at the
-    event.
+    The value is chosen because Newton's method squares `max_confirming_time_correction` twice. The
+    last step evaluates the state at the event.
     """
     max_confirming_time_correction: float = 1e-4
     """Largest correction of the event's time by a Newton iteration that confirms this time.
@@ -183,6 +182,7 @@ class _PhaseState(NamedTuple):
 
     step_purpose: Int[Array, ""]  # a StepPurpose
     last_accepted_step_end: SolverStepEnd  # the last accepted solver step
+    last_step_start: SolverStepEnd  # end of the solver step before the last accepted one
     next_step_length: Scalar  # length of the next solver step, s
     controller_state: Any
     event_search: _EventSearch
@@ -338,18 +338,68 @@ def integrate_phase(
         functools.partial(_advance_phase_state, phase_context),
         _init_phase_state(phase_context, start_state, is_active),
     )
+    end_time, end_state = _attach_event_derivatives(phase_context, phase_state)
     margin_minima = jnp.minimum(
         phase_state.margin_minimum_refinement.lowest_margin_values,
         phase_state.last_accepted_step_end.guard_and_margin_values[guards_and_margins.n_guards :],
     )
     return PhaseEnd(
-        state=phase_state.last_accepted_step_end.state,
-        duration=phase_state.last_accepted_step_end.end_time,
+        state=end_state,
+        duration=end_time,
         end_guard_index=phase_state.triggered_guard_index,
         is_timed_out=phase_state.is_timed_out,
         has_integration_failed=phase_state.has_integration_failed,
         solver_steps=phase_state.n_tried_steps,
         margin_minima=margin_minima,
+    )
+
+
+def _attach_event_derivatives(
+    phase_context: _PhaseContext, phase_state: _PhaseState
+) -> tuple[Scalar, StateArray]:
+    """Return time and state at the end of a phase, with derivatives that the event's time affects.
+
+    The derivatives of Newton's iteration, which located the event, are right to third order only.
+    Time and state of the event also solve two equations: the guard is zero, and the last solver
+    step reaches the state. All derivatives follow from them by the implicit function theorem.
+    """
+    solver_stepper, guards_and_margins, _ = phase_context
+    step_start, step_end = phase_state.last_step_start, phase_state.last_accepted_step_end
+    guard_index = phase_state.triggered_guard_index
+    was_located = (guard_index >= 0) & (
+        phase_state.event_search.n_confirming_steps
+        >= EVENT_SEARCH_OPTIONS.n_required_confirming_steps
+    )
+
+    def evaluate_event_equations(event: tuple[Scalar, StateArray]) -> tuple[Scalar, StateArray]:
+        end_time, state = event
+        guard_value = guards_and_margins.evaluate_guards_and_margins(state)[guard_index]
+        reached_state, _, _ = solver_stepper.take_solver_step(
+            step_start.state, step_start.solver_state, end_time - step_start.end_time
+        )
+        return (
+            jnp.where(was_located, guard_value, step_end.end_time - end_time),
+            state - jnp.where(was_located, reached_state, step_end.state),
+        )
+
+    def solve_tangent_equations(linear_function: Callable, values: tuple) -> tuple:
+        guard_value, state_change = values
+        field = -linear_function((jnp.ones_like(guard_value), jnp.zeros_like(state_change)))[1]
+        guard_change = linear_function((jnp.zeros_like(guard_value), state_change))[0]
+        guard_rate = linear_function((jnp.ones_like(guard_value), field))[0]
+        is_guard_falling = guard_rate < 0.0
+        time_change = jnp.where(
+            is_guard_falling,
+            (guard_value - guard_change) / jnp.where(is_guard_falling, guard_rate, -1.0),
+            0.0,
+        )
+        return time_change, state_change + field * time_change
+
+    return lax.custom_root(
+        evaluate_event_equations,
+        (step_end.end_time, step_end.state),
+        lambda _, located_event: located_event,
+        solve_tangent_equations,
     )
 
 
@@ -383,11 +433,11 @@ def _init_phase_state(
     float_zero = lax.stop_gradient(zero_duration)
     solver_state, controller_state = solver_stepper.init_solver_and_controller(start_state, options)
     is_guard_crossing = jnp.zeros((guards_and_margins.n_guards,), bool) | initial_flag
+    start = SolverStepEnd(zero_duration, start_state, solver_state, initial_values, initial_values)
     return _PhaseState(
         step_purpose=jnp.where(is_active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
-        last_accepted_step_end=SolverStepEnd(
-            zero_duration, start_state, solver_state, initial_values, initial_values
-        ),
+        last_accepted_step_end=start,
+        last_step_start=start,
         next_step_length=zero_duration,  # The first step has length zero and evaluates the start.
         controller_state=jax.tree.map(lambda x: x + float_zero, controller_state),
         event_search=_EventSearch(
@@ -498,6 +548,7 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
         event_search.is_guard_crossing,
     )
     is_first_met_guard = is_start_event_searched & (jnp.arange(n_guards) == first_met_guard_index)
+    is_step_taken = step_assessment.is_accepted | is_at_event
     is_step_in_phase = (step_assessment.is_accepted & ~is_phase_start) | is_at_event
     interior_margin_minima = update_interior_margin_minima(
         guards_and_margins,
@@ -531,7 +582,10 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
     return _PhaseState(
         step_purpose=step_purpose,
         last_accepted_step_end=select_trees_by_condition(
-            step_assessment.is_accepted | is_at_event, tried_step_end, previous_step_end
+            is_step_taken, tried_step_end, previous_step_end
+        ),
+        last_step_start=select_trees_by_condition(
+            is_step_taken, previous_step_end, phase_state.last_step_start
         ),
         next_step_length=following_step_length,
         controller_state=step_assessment.controller_state,
