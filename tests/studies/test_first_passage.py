@@ -8,6 +8,7 @@ from scipy.special import ndtr
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
+from vrw_jax.studies.first_passage import PassageStatus
 from vrw_jax.studies.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.studies.sampled_passage import (
     PASSAGE_SAMPLING_OPTIONS,
@@ -116,6 +117,22 @@ def test_the_papers_wheel_lasts_as_long_as_an_independent_code_counts(slope_sd, 
     assert passage.end_names == ("TOUCHDOWN_BEFORE_STOPPER",)
     assert float(passage.weights.sum()) == pytest.approx(1.0)
     assert "FirstPassage" in repr(passage)
+
+
+def test_short_lives_meet_the_tolerance_from_any_seed():
+    """With these seeds, more walks from the same starts cannot reduce the error to 2 %."""
+    for seed in (1, 8):
+        passage = vrw.first_passage(vrw.WheelParams(), 0.01407, seed=seed)
+        assert passage.ending == "The error estimate is within the tolerance."
+        assert float(passage.error) < 0.02 * float(passage.mean_steps)
+        # A count of 1,500,000 steps with another seed.
+        assert abs(float(passage.mean_steps) - 15.60) < float(passage.error) + 0.13
+
+
+def test_every_failed_status_names_an_argument_to_change():
+    for status in PassageStatus:
+        names = ("tol", "max_steps", "n_nodes", "n_walkers")
+        assert status == PassageStatus.CONVERGED or any(name in status.meaning for name in names)
 
 
 def count_failure_share(params, slope_sd, n_walkers, n_steps, model=None):

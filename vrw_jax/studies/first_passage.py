@@ -59,15 +59,24 @@ class PassageStatus(StatusCode):
     """Status of the computation of first-passage times: whether its error is small enough."""
 
     CONVERGED = 0, "The error estimate is within the tolerance."
-    TOLERANCE_NOT_MET = 1, "The error estimate exceeds the tolerance: allow more nodes or steps."
-    NO_FAILURE = 2, "No walk failed, however uneven its slopes were made: the mean has no estimate."
+    TOLERANCE_NOT_MET = (
+        1,
+        "The error estimate exceeds the tolerance: give a larger tol, max_steps (sampled walks) or "
+        "n_nodes (quadrature).",
+    )
+    NO_FAILURE = (
+        2,
+        "No walk failed, however uneven its ground was made: the mean has no estimate. Give more "
+        "uneven ground, or a larger n_walkers.",
+    )
     UNKNOWN_ERROR = (
         3,
-        "The error is unknown: sampled walks miss failures, or a few of them dominate the mean.",
+        "The error is unknown, because sampled walks miss failures, or a few of them dominate the "
+        "mean: give a larger n_walkers.",
     )
     START_NOT_FORGOTTEN = (
         4,
-        "The effect of the start exceeds the tolerance: allow more walkers or a larger error.",
+        "The effect of the start exceeds the tolerance: give a larger n_walkers or tol.",
     )
 
 

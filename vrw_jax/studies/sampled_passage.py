@@ -309,6 +309,17 @@ class WalkerGroups:
             states_before_step, ~has_failed, slope_deviations[:, 0], self.stack_states_and_slopes()
         )
 
+    def advance_without_counting(self, n_steps: int = 1) -> collections.Counter:
+        """Advance all walkers by `n_steps` gait steps, and return their failures by outcome.
+
+        The failures are not added to `weight_by_outcome`.
+        """
+        weight_by_outcome, self.weight_by_outcome = self.weight_by_outcome, collections.Counter()
+        for _ in range(n_steps):
+            self.step_and_replace_failures()
+        n_failures, self.weight_by_outcome = self.weight_by_outcome, weight_by_outcome
+        return n_failures
+
 
 def sample_passage(
     walker_groups: WalkerGroups,
@@ -403,7 +414,9 @@ def sample_passage(
         if failure_density is not None:
             walk_density = failure_density
             failure_probability, relative_error, start_effect = estimate_probability(
-                _make_weight_sampler(walker_groups, walk_density), n_biased_ground_lines
+                _make_weight_sampler(walker_groups, walk_density),
+                n_biased_ground_lines,
+                advance_walkers=walker_groups.advance_without_counting,
             )
             if np.isfinite(relative_error) and _has_missed_failures(
                 walker_groups, failure_probability * (1.0 + relative_error)
@@ -450,6 +463,7 @@ def _estimate_failure_probability(
     relative_tolerance: float,
     max_steps: int,
     are_walkers_advanced: bool = False,
+    advance_walkers: Callable[[], object] = lambda: None,
 ) -> tuple[float, float, float]:
     """Return the failure probability of a gait step, the relative error of that probability, and
     the part of this error that is the effect of the start.
@@ -466,7 +480,10 @@ def _estimate_failure_probability(
     - `start_effect_decay`: factor per step by which the effect of the start decays, and number of
       steps before the walks;
     - `are_walkers_advanced`: whether each round advances the walkers by one step, so that later
-      rounds are affected less by the start.
+      rounds are affected less by the start;
+    - `advance_walkers`: function that advances the walkers. It is called before each round that
+      follows the first error tests, because rounds from the same starts cannot reduce the part of
+      the error that is due to the choice of these starts.
     """
     from scipy import stats  # This import is slow.
 
@@ -496,6 +513,8 @@ def _estimate_failure_probability(
             n_sampling_rounds < options.min_sampling_rounds or walker_groups.n_steps < max_steps
         ):
             report_progress(f"{walker_groups.n_walkers:,} walks of {walker_groups.n_steps:,} steps")
+            if n_error_tests >= len(first_fractions):
+                advance_walkers()
             walk_weights = failure_weight_sampler()
             weight_sum_by_group += walk_weights.reshape(walker_groups.n_groups, -1).mean(1)
             weight_moments += (
@@ -604,12 +623,8 @@ def _has_missed_failures(walker_groups: WalkerGroups, max_failure_probability: f
     from scipy import stats  # This import is slow.
 
     options = walker_groups.options
-    importance_weight_by_outcome = walker_groups.weight_by_outcome.copy()
-    walker_groups.weight_by_outcome.clear()
-    for _ in range(options.n_failure_check_steps):
-        walker_groups.step_and_replace_failures()
-    n_failures_by_outcome = walker_groups.weight_by_outcome
-    walker_groups.weight_by_outcome = importance_weight_by_outcome
+    importance_weight_by_outcome = walker_groups.weight_by_outcome
+    n_failures_by_outcome = walker_groups.advance_without_counting(options.n_failure_check_steps)
     max_failure_count = (
         max_failure_probability * options.n_failure_check_steps * walker_groups.n_walkers
     )
