@@ -13,7 +13,7 @@ from support.slow_variants import mark_slow
 import vrw_jax as vrw
 from vrw_jax.models.contact_mechanics import find_contact_slots, select_slot_friction
 from vrw_jax.models.contact_section import pack_section_state, unpack_section_state
-from vrw_jax.wheel import PARAMETER_NAMES
+from vrw_jax.wheel import PARAMETER_NAMES, GroundAhead
 
 START = (0.1, 1.6, -0.1)
 TIGHT = vrw.StepOptions.tight()
@@ -225,8 +225,8 @@ def test_a_landing_on_a_steeper_line_is_the_same_motion_in_another_frame():
     x = model.complete_section_state(vrw.WheelParams(), jnp.asarray(START))
     motion, stance = unpack_section_state(s, x)
     result, turned = (
-        pack_section_state(motion, stance),
-        pack_section_state(motion, stance, jnp.asarray(0.05)),
+        pack_section_state(s, motion, stance),
+        pack_section_state(s, motion, stance, GroundAhead(jnp.asarray(0.05))),
     )
     assert abs(float(result[0] - turned[0]) - 0.05) < 1e-15
     np.testing.assert_allclose(turned[4:], result[4:])

@@ -6,10 +6,14 @@ footholds: line k, of slope phi[k], leads from foothold k - 1 to foothold k. Fee
 footholds. Step k starts with the landing on foothold k. Its rear foot leaves when the ground stops
 pressing along the normal of line k. The step ends when the next foot meets line k + 1, which starts
 at foothold k.
+
+If heights are given, foothold k lies at the height h[k] above a line of the mean slope. Step k ends
+when the next foot is at the height h[k + 1], and the line between both feet follows.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -67,6 +71,42 @@ def walk(
     return steps
 
 
+def walk_over_heights(
+    params: Params, x: Sequence[float], mean_slope: float, heights: Sequence[float]
+) -> list[Step]:
+    """Steps until one fails, over footholds -1, 0, 1, ... at the heights above the mean line."""
+    wheel = Wheel({**params, "slope": 0.0})
+    theta, dtheta, dL1 = (float(value) for value in x)
+    length, out = params["locked_length"], normal(mean_slope)
+    reach = length * math.cos(theta - wheel.alpha) / math.cos(theta)
+    q = np.array([0.0, 0.0, theta, reach, length])
+    # Before the rotation by its slope, line 0 is horizontal.
+    distance = math.hypot(*(_landing_foot(wheel, q) - q[:2]))
+    slope = mean_slope - math.asin((heights[1] - heights[0]) / distance)
+    q[2] += slope
+    v, steps = np.array([0.0, 0.0, dtheta, dL1, 0.0]), []
+    for before, ahead in itertools.pairwise(heights[1:]):
+        rise = ahead - before
+        q, v, step = _step(wheel, q, v, slope, mean_slope, RTOL, ATOL, rise)
+        displacement = _landing_foot(wheel, q) - q[:2]
+        slope = -math.atan2(displacement[1], displacement[0])
+        theta_on_line = step.section_state[0] + mean_slope - slope
+        steps.append(
+            step._replace(section_state=np.array([theta_on_line, *step.section_state[1:]]))
+        )
+        if step.outcome != STEPPED:
+            break
+        assert abs(out @ displacement - rise) < 1e-12
+    return steps
+
+
+def _landing_foot(wheel: Wheel, q: Array) -> Array:
+    """Position of the foot of the leg that lands next, (x, z)."""
+    length, new = wheel.params["locked_length"], q[2] - wheel.alpha
+    hub = q[:2] + q[3] * np.array([math.sin(q[2]), math.cos(q[2])])
+    return hub - length * np.array([math.sin(new), math.cos(new)])
+
+
 def _exchanged(wheel: Wheel, q: Array, v: Array) -> tuple[Array, Array]:
     """Labels of the step that begins: the leg at theta - alpha, which has landed, becomes Leg 1."""
     length = wheel.params["locked_length"]
@@ -84,7 +124,14 @@ def _exchanged(wheel: Wheel, q: Array, v: Array) -> tuple[Array, Array]:
 
 
 def _step(
-    wheel: Wheel, q: Array, v: Array, slope: float, ahead: float, rtol: float, atol: float
+    wheel: Wheel,
+    q: Array,
+    v: Array,
+    slope: float,
+    ahead: float,
+    rtol: float,
+    atol: float,
+    rise: float = 0.0,
 ) -> tuple[Array, Array, Step]:
     params, out = wheel.params, normal(slope)
     length, above = params["locked_length"], normal(ahead)
@@ -99,9 +146,7 @@ def _step(
     post_impact, begins = np.array([q[2] - slope, v[2]]), wheel.energy(q, v)
 
     def touchdown(q: Array, v: Array) -> float:
-        new = q[2] - wheel.alpha
-        hub = q[:2] + q[3] * np.array([math.sin(q[2]), math.cos(q[2])])
-        return float(above @ (hub - length * np.array([math.sin(new), math.cos(new)]) - foothold))
+        return float(above @ (_landing_foot(wheel, q) - foothold)) - rise
 
     def pressed(foot: int, mode: str) -> Any:
         return lambda q, v: float(out @ wheel.acceleration(q, v, mode)[1][foot : foot + 2])

@@ -214,14 +214,12 @@ def _make_phase_runner(
                 )
                 stiff_dt0 = jnp.minimum(MAX_FIRST_STEP_RATIO * dt0, max_transient_dt)
                 dt0 = jnp.where(next_phase_inputs.has_phase_occurred, stiff_dt0, dt0)
-        float_leaves, nonarray_leaves = eqx.partition(
-            (phase.s, phase.tilt_sine_cosine), eqx.is_array
-        )
+        float_leaves, nonarray_leaves = eqx.partition((phase.s, phase.ground_ahead), eqx.is_array)
 
         def make_phase(float_leaves: Any, phase_constants: Vector) -> BatchPhase:
-            s, tilt_sine_cosine = eqx.combine(float_leaves, nonarray_leaves)
+            s, ground_ahead = eqx.combine(float_leaves, nonarray_leaves)
             phase_with_traced_inputs = dataclasses.replace(
-                phase, s=s, phase_constants=phase_constants, tilt_sine_cosine=tilt_sine_cosine
+                phase, s=s, phase_constants=phase_constants, ground_ahead=ground_ahead
             )
             return make_batch_phase(
                 phase_with_traced_inputs, records_margins, is_compiled_separately

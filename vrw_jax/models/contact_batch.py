@@ -14,15 +14,18 @@ from vrw_jax.models.walk_batch import (
     StepwiseParameter,
     WalkBatch,
     complete_slopes_over_steps,
+    compute_rises_over_steps,
+    make_height_terms,
 )
 from vrw_jax.wheel.params import PARAMETER_NAMES
 
 CONTACT_PARAMETER_NAMES = (*PARAMETER_NAMES, "friction")
-UNEVEN_GROUND_PARAMETER_NAMES = ("previous_friction", "tilt")
+SLOPES_PARAMETER_NAMES = ("previous_friction", "tilt")
+HEIGHTS_PARAMETER_NAMES = ("previous_friction", "rise", "next_rise")
 """Names of the additional parameters of a gait step on uneven ground.
 
 The parameters are the friction of the feet that landed earlier, and the increase of the slope from
-this line of the ground to the next one, rad.
+this line of the ground to the next one, rad, or two rises (see `models.select_stance_line`), m.
 """
 CONTACT_SLOPE_INDEX = CONTACT_PARAMETER_NAMES.index("slope")
 CONTACT_FRICTION_INDEX = CONTACT_PARAMETER_NAMES.index("friction")
@@ -39,13 +42,16 @@ def step_batch_with_contact(
     requested_engine: str,
     n_legs: int,
     derivative_names: Sequence[str],
+    element_heights: np.ndarray | None,
 ) -> StepBatchResult:
     """Return the result of `step_batch` for a model with unilateral contact.
 
     Without derivatives on flat ground, one call of the kernel computes all gait steps.
     """
     element_friction = np.asarray(model.friction, section_states.dtype)
-    is_ground_uneven = any(np.ndim(x) == 2 for x in (*values_by_parameter, element_friction))
+    is_ground_uneven = element_heights is not None or any(
+        np.ndim(x) == 2 for x in (*values_by_parameter, element_friction)
+    )
     if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
@@ -57,7 +63,11 @@ def step_batch_with_contact(
             "for all elements: call vrw.step_batch for each restitution."
         )
     stepwise_ground = _StepwiseGround.repeat_over_steps(
-        values_by_parameter[CONTACT_SLOPE_INDEX], element_friction, len(section_states), n_steps
+        values_by_parameter[CONTACT_SLOPE_INDEX],
+        element_friction,
+        len(section_states),
+        n_steps,
+        element_heights,
     )
     first_step_values = [*values_by_parameter, stepwise_ground.friction_by_step[0]]
     first_step_values[CONTACT_SLOPE_INDEX] = stepwise_ground.slopes_by_step[0]
@@ -84,7 +94,10 @@ def step_batch_with_contact(
     parameter_names = CONTACT_PARAMETER_NAMES
     stepwise_parameters: dict[str, StepwiseParameter] = {}
     if is_ground_uneven:
-        parameter_names = (*CONTACT_PARAMETER_NAMES, *UNEVEN_GROUND_PARAMETER_NAMES)
+        ground_names = (
+            SLOPES_PARAMETER_NAMES if element_heights is None else HEIGHTS_PARAMETER_NAMES
+        )
+        parameter_names = (*CONTACT_PARAMETER_NAMES, *ground_names)
         stepwise_parameters = stepwise_ground.make_stepwise_parameters()
     active_walks = WalkBatch(
         section_states.T.copy(), derivative_names, parameter_names, stepwise_parameters
@@ -125,24 +138,29 @@ def step_batch_with_contact(
 
 
 class _StepwiseGround(NamedTuple):
-    """Slope and friction of the ground in each gait step of each element."""
+    """Slope or rises, and friction of the ground in each gait step of each element."""
 
     slopes_by_step: np.ndarray  # (n_steps + 1, elements), rad
     friction_by_step: np.ndarray  # (n_steps, elements)
     n_stepwise_slopes: int | None  # per element; None if slopes do not vary over steps
     n_stepwise_frictions: int | None
+    element_heights: np.ndarray | None  # see `step_batch`, m
 
     @classmethod
     def repeat_over_steps(
-        cls, element_slopes: np.ndarray, element_friction: np.ndarray, n_elements: int, n_steps: int
+        cls,
+        element_slopes: np.ndarray,
+        element_friction: np.ndarray,
+        n_elements: int,
+        n_steps: int,
+        element_heights: np.ndarray | None,
     ) -> "_StepwiseGround":
         """Return slope and friction for all gait steps, repeated over steps and over the batch
         where the argument has no such axis.
         """
-        stepwise_value_counts = (
+        n_stepwise_slopes, n_stepwise_frictions = (
             x.shape[1] if x.ndim == 2 else None for x in (element_slopes, element_friction)
         )
-
         repeat_parameter_over_steps = lambda x, n_repetitions: (
             x if x.ndim == 2 else np.broadcast_to(x, (n_repetitions, n_elements)).T
         )
@@ -152,25 +170,31 @@ class _StepwiseGround(NamedTuple):
         return cls(
             slopes_by_step,
             repeat_parameter_over_steps(element_friction, n_steps).T[:n_steps],
-            *stepwise_value_counts,
+            n_stepwise_slopes,
+            n_stepwise_frictions,
+            element_heights,
         )
 
     def make_parameters_of_step(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
         """Return the parameters of gait step `k`, shape (parameters, elements).
 
-        The last two parameters are `UNEVEN_GROUND_PARAMETER_NAMES`.
+        The last parameters are `SLOPES_PARAMETER_NAMES` or `HEIGHTS_PARAMETER_NAMES`.
         """
         parameter_matrix = parameter_matrix[: len(CONTACT_PARAMETER_NAMES)].copy()
         parameter_matrix[CONTACT_SLOPE_INDEX] = self.slopes_by_step[k]
         parameter_matrix[CONTACT_FRICTION_INDEX] = self.friction_by_step[k]
+        previous_friction = self.friction_by_step[max(k - 1, 0)]
+        if self.element_heights is not None:
+            rises = compute_rises_over_steps(self.element_heights, len(self.friction_by_step))
+            return np.vstack([parameter_matrix, previous_friction, *rises[k : k + 2]])
         tilt = self.slopes_by_step[k + 1] - self.slopes_by_step[k]
-        return np.vstack([parameter_matrix, self.friction_by_step[max(k - 1, 0)], tilt])
+        return np.vstack([parameter_matrix, previous_friction, tilt])
 
     def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
         """Return a mapping from parameter names to the terms by which the parameters enter the
         chain rule.
 
-        The mapping contains "friction" and, if the slope varies over gait steps, "slope".
+        The mapping contains "friction" and, if they vary over gait steps, "slope" or "heights".
         """
         previous_friction_input_index = len(CONTACT_PARAMETER_NAMES)
         last_slope_index = (self.n_stepwise_slopes or 1) - 1
@@ -183,6 +207,13 @@ class _StepwiseGround(NamedTuple):
                 (1, max(min(k, last_friction_index) - 1, 0), 1.0),
             ),
         )
+        if self.element_heights is not None:
+            stepwise_heights = make_height_terms(
+                (previous_friction_input_index + 1, previous_friction_input_index + 2),
+                self.element_heights.shape[1],
+                len(self.friction_by_step),
+            )
+            return {"heights": stepwise_heights, "friction": stepwise_friction}
         if self.n_stepwise_slopes is None:
             return {"friction": stepwise_friction}
         stepwise_slope = StepwiseParameter(

@@ -56,6 +56,7 @@ from vrw_jax.models.contact_modes import (
 )
 from vrw_jax.models.contact_state import ContactState, GuardLayout
 from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.params import Symbols
 
 
@@ -111,7 +112,7 @@ class ContactLaw(NamedTuple):
     counts_all_solutions: bool  # whether all admissible solutions are counted
     rest_speed: Elementwise  # speed below which a contact is at rest after an impact, m/s
     restitution: Elementwise | None = None  # Newton's coefficient of the feet
-    next_line_tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
+    ground_ahead: GroundAhead | None = None  # None on flat ground
     # number of events beyond `BounceRestOptions.n_events_before_rest_speed_ramp`
     n_late_events: Int[Array, "..."] | int = 0
 
@@ -722,7 +723,7 @@ def _merge_touching_contacts(
     """
     s, leg_directions = contact_law.s, compute_leg_directions(contact_law.s, motion.theta)
     bounce_height = contact_law.rest_speed**2 / (2.0 * s.g)
-    foot_heights = compute_foot_heights(motion, leg_directions, contact_law.next_line_tilt)
+    foot_heights = compute_foot_heights(motion, leg_directions, contact_law.ground_ahead)
     is_touching = (foot_heights <= bounce_height) & (
         compute_foot_velocities(motion, leg_directions).normal_to_slope <= contact_law.rest_speed
     )

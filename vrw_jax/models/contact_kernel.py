@@ -58,6 +58,7 @@ from vrw_jax.models.contact_record import (
     record_force_extremum,
 )
 from vrw_jax.models.contact_section import (
+    compute_section_foot_distance,
     pack_section_state,
     replace_invalid_start,
     unpack_section_state,
@@ -72,6 +73,8 @@ from vrw_jax.models.contact_state import (
     make_contact_mode_dynamics,
     update_force_rate_signs,
 )
+from vrw_jax.models.step_inputs import find_stance_slope
+from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
@@ -81,13 +84,16 @@ from vrw_jax.wheel.params import (
     stack_parameters,
 )
 
+SLOPE_INDEX = PARAMETER_NAMES.index("slope")
 N_PARAMETERS = len(PARAMETER_NAMES)
 """Number of wheel parameters, the first input columns. The friction coefficient follows."""
-N_UNEVEN_GROUND_COLUMNS = 2
-"""Number of further input columns on uneven ground.
+N_HEIGHT_COLUMNS = 3
+"""Number of further input columns if the heights of the footholds are given.
 
-They are the friction coefficient of the feet that landed earlier, and the angle by which the next
-straight line is steeper, rad. If restitution is an input, its column is last.
+They are the friction coefficient of the feet that landed earlier, and the two rises of
+`models.select_stance_line`, m. If slopes are given, two further columns are this friction
+coefficient and the angle by which the next straight line is steeper, rad. If restitution is an
+input, its column is last.
 """
 STATUS_UNFINISHED = -1
 """Value that replaces the outcome code as long as a walk is unfinished."""
@@ -171,9 +177,7 @@ class BatchWalkSettings(NamedTuple):
     is_detailed: bool  # whether a `UnilateralStep` is requested
     step_options: StepOptions
     tableau: ButcherTableau | None  # tableau of the batch kernel; None if diffrax integrates
-    has_uneven_ground: bool = (
-        False  # whether the input has `N_UNEVEN_GROUND_COLUMNS`; one step only
-    )
+    n_ground_columns: int = 0  # see `N_HEIGHT_COLUMNS`; on uneven ground, walks have one step
     has_restitution: bool = False  # whether the last input column is restitution
     engine_name: str = "lanes"  # name of the engine in the results
     # whether the extrema of normal forces are located; only if details are requested
@@ -190,7 +194,7 @@ class BatchWalkSettings(NamedTuple):
             self.has_one_sided_stoppers,
             contact_state,
             self.is_detailed,
-            self.extract_next_line_tilt(input_columns),
+            self.extract_ground_ahead(input_columns),
         )
 
     def unpack_input_columns(self, input_columns: Array) -> tuple[Symbols, Friction]:
@@ -201,19 +205,36 @@ class BatchWalkSettings(NamedTuple):
         """
         s = compute_symbols(self.n_legs, *input_columns[:N_PARAMETERS])
         friction = apply_friction_rule(input_columns[N_PARAMETERS], self.uses_paper_rule)
-        if not self.has_uneven_ground:
+        if not self.n_ground_columns:
             return s, friction
         previous_friction = apply_friction_rule(
             input_columns[N_PARAMETERS + 1], self.uses_paper_rule
         )
         return s, (friction, previous_friction)
 
-    def extract_next_line_tilt(self, input_columns: Array) -> Array | None:
-        """Return the angle by which the next straight line of the ground is steeper, rad.
-
-        The result is None on flat ground.
+    def extract_ground_ahead(self, input_columns: Array) -> GroundAhead | None:
+        """Return the ground ahead for columns that `resolve_heights` returned, or None on flat
+        ground.
         """
-        return input_columns[N_PARAMETERS + 2] if self.has_uneven_ground else None
+        first, end = N_PARAMETERS + 2, N_PARAMETERS + 1 + self.n_ground_columns
+        return GroundAhead(*input_columns[first:end]) if self.n_ground_columns else None
+
+    def resolve_heights(self, input_columns: Array, section_state: Array) -> Array:
+        """Return the input columns with the slope under both feet, and with the tilt and the rise
+        of `GroundAhead` instead of two rises.
+
+        Columns without heights are unchanged.
+        """
+        if self.n_ground_columns != N_HEIGHT_COLUMNS:
+            return input_columns
+        columns = list(input_columns)
+        mean_slope, rise = columns[SLOPE_INDEX], columns[N_PARAMETERS + 2]
+        foot_distance = compute_section_foot_distance(
+            self.unpack_input_columns(input_columns)[0], section_state
+        )
+        columns[SLOPE_INDEX] = find_stance_slope(mean_slope, rise, foot_distance)
+        columns[N_PARAMETERS + 2] = mean_slope - columns[SLOPE_INDEX]
+        return jnp.stack(columns)
 
     def begin_walk(self, input_columns: Array, section_state: Array) -> LaneState:
         """Return the state of all batch elements at the first landing, before the impact."""
@@ -322,7 +343,7 @@ class BatchWalkSettings(NamedTuple):
         # A landing of the foremost foot opens the next step. Then every event is processed.
         begins_step = has_landed & ~has_ended
         motion_at_step_start, contact_state_at_step_start = unpack_section_state(
-            s, pack_section_state(motion, contact_state)
+            s, pack_section_state(s, motion, contact_state)
         )
         contact_state_at_step_start = contact_state_at_step_start._replace(
             force_rate_signs=contact_state.force_rate_signs
@@ -347,7 +368,7 @@ class BatchWalkSettings(NamedTuple):
             self.is_detailed,
             compute_rest_speed(s, self.step_options),
             input_columns[-1] if self.has_restitution else None,
-            self.extract_next_line_tilt(input_columns),
+            self.extract_ground_ahead(input_columns),
         )
         event_result, contact_event, event_outcome = process_event(
             contact_law,
@@ -440,7 +461,10 @@ class BatchWalkSettings(NamedTuple):
         motion = unpack_motion(lane_state.contact_interval_state.contact_interval_point)
         contact_state = lane_state.contact_interval_state.contact_state
         section_state = pack_section_state(
-            motion, contact_state, self.extract_next_line_tilt(input_columns)
+            self.unpack_input_columns(input_columns)[0],
+            motion,
+            contact_state,
+            self.extract_ground_ahead(input_columns),
         )
         zero_unless_stepped = lambda value: jnp.where(
             lane_state.walk_outcome == Outcome.STEPPED, value, 0.0
@@ -459,14 +483,16 @@ class BatchWalkSettings(NamedTuple):
             make_wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
             input_columns[N_PARAMETERS],
             section_state,
-            self.extract_next_line_tilt(input_columns),
+            self.extract_ground_ahead(input_columns),
         )
         column_rows = [*stack_parameters(params), friction]
-        if self.has_uneven_ground:
-            previous_friction, next_line_tilt = input_columns[N_PARAMETERS + 1 : N_PARAMETERS + 3]
+        if self.n_ground_columns:
+            previous_friction, *ground_values = input_columns[
+                N_PARAMETERS + 1 : N_PARAMETERS + 1 + self.n_ground_columns
+            ]
             column_rows += [
                 jnp.where(is_valid, previous_friction, 1.0),
-                jnp.where(is_valid, next_line_tilt, 0.0),
+                *(jnp.where(is_valid, value, 0.0) for value in ground_values),
             ]
         if self.has_restitution:
             column_rows.append(input_columns[-1])
@@ -526,6 +552,7 @@ def run_walks(
     walk_settings: BatchWalkSettings, input_columns: Array, section_state: Array
 ) -> BatchWalkResult:
     """Return the results of all walks after `n_steps` landings of the foremost foot."""
+    input_columns = walk_settings.resolve_heights(input_columns, section_state)
     input_columns, lane_state = init_lane_states(walk_settings, input_columns, section_state)
     run_iteration = lambda lane_state: process_and_integrate(
         walk_settings, input_columns, lane_state

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Shaped
 
 from vrw_jax.base.trigonometry import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Scalar
+from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.params import Symbols
 
 LegArray = Float[Array, "n_legs ..."]
@@ -373,21 +374,23 @@ def compute_free_velocity(
 
 
 def compute_foot_heights(
-    motion: WheelMotion, leg_directions: LegDirections, next_line_tilt: Elementwise | None = None
+    motion: WheelMotion, leg_directions: LegDirections, ground_ahead: GroundAhead | None = None
 ) -> LegArray:
     """Return the height of every foot above the slope, m.
 
-    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad. This
-      line begins under the foot of Leg 1, and the height of the foremost foot is measured from it.
+    - `ground_ahead`: uneven ground. The height of the foremost foot is measured from the place
+      where it lands.
     """
     foot_heights = motion.z - motion.L * leg_directions.cos
-    if next_line_tilt is None:
+    if ground_ahead is None:
         return foot_heights
     downhill_positions = compute_foot_positions(motion, leg_directions)
     foremost_distance = downhill_positions[-1] - downhill_positions[0]
-    foremost_foot_height = foot_heights[-1] * jnp.cos(next_line_tilt) + foremost_distance * jnp.sin(
-        next_line_tilt
-    )
+    foremost_foot_height = foot_heights[-1] * jnp.cos(
+        ground_ahead.tilt
+    ) + foremost_distance * jnp.sin(ground_ahead.tilt)
+    if ground_ahead.rise is not None:
+        foremost_foot_height = foremost_foot_height - ground_ahead.rise
     return jnp.concatenate([foot_heights[:-1], foremost_foot_height[None]])
 
 

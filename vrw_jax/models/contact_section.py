@@ -10,6 +10,7 @@ from vrw_jax.base.types import Elementwise
 from vrw_jax.models.contact_mechanics import (
     WheelMotion,
     compute_foot_heights,
+    compute_foot_positions,
     compute_leg_directions,
 )
 from vrw_jax.models.contact_state import ContactState
@@ -21,7 +22,8 @@ from vrw_jax.models.step_inputs import (
 )
 from vrw_jax.wheel.foot_contact import ContactMode
 from vrw_jax.wheel.geometry import compute_length_at_touchdown
-from vrw_jax.wheel.params import Symbols, WheelParams
+from vrw_jax.wheel.ground import GroundAhead, compute_line_slope
+from vrw_jax.wheel.params import MAX_SI_VALUE, Symbols, WheelParams
 from vrw_jax.wheel.units import WheelUnits
 
 FullState = Float[Array, "n_full ..."]
@@ -87,7 +89,7 @@ def replace_invalid_start(
     params: WheelParams,
     friction: Elementwise,
     section_state: FullState,
-    next_line_tilt: Elementwise | None,
+    ground_ahead: GroundAhead | None,
 ) -> tuple[Bool[Array, "..."], WheelParams, Elementwise, FullState]:
     """Return which starts of a step are valid, and the input with invalid starts replaced.
 
@@ -95,8 +97,8 @@ def replace_invalid_start(
     friction coefficient of 1. The result is (is_valid, parameters, friction, section state).
 
     - `friction`: friction coefficient of the ground, invalid if negative;
-    - `next_line_tilt`: angle by which the next straight line of uneven ground is steeper, rad. On
-      uneven ground, feet may be below the extension of the line with the last foothold.
+    - `ground_ahead`: uneven ground, on which feet may be below the extension of the line with the
+      last foothold.
     """
     valid_state = embed_section_state(
         WheelParams(n_legs=params.n_legs).symbols(),
@@ -104,8 +106,10 @@ def replace_invalid_start(
     )
     valid_column = valid_state.reshape(-1, *(1,) * (section_state.ndim - 1))
     is_valid = is_valid_start_state(params, section_state) & (friction >= 0.0)
-    if next_line_tilt is not None:
-        is_valid = is_valid & is_slope_in_domain(params.slope + next_line_tilt)
+    if ground_ahead is not None:
+        is_valid = is_valid & is_slope_in_domain(params.slope + ground_ahead.tilt)
+        if ground_ahead.rise is not None:
+            is_valid = is_valid & (jnp.abs(ground_ahead.rise) < MAX_SI_VALUE)
     else:
         # No foot may be below the ground, and no leg longer than its stopper allows. Loaded feet
         # must be on the ground.
@@ -163,19 +167,23 @@ def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMot
 
 
 def pack_section_state(
-    motion: WheelMotion, contact_state: ContactState, next_line_tilt: Elementwise | None = None
+    s: Symbols,
+    motion: WheelMotion,
+    contact_state: ContactState,
+    ground_ahead: GroundAhead | None = None,
 ) -> FullState:
     """Return the section state for a motion just before the next landing.
 
     On uneven ground, the section state is in the frame of the line on which the foot lands.
 
-    - `next_line_tilt`: angle by which that line is steeper, rad; None on flat ground.
+    - `ground_ahead`: uneven ground; None on flat ground.
     """
     contact_codes = contact_state.contact_modes + LOCKED_CODE_OFFSET * contact_state.is_leg_locked
     theta, vx, vz = motion.theta, motion.vx, motion.vz
-    if next_line_tilt is not None:
-        sin, cos = jnp.sin(next_line_tilt), jnp.cos(next_line_tilt)
-        theta, vx, vz = theta - next_line_tilt, vx * cos - vz * sin, vz * cos + vx * sin
+    if ground_ahead is not None:
+        tilt = _compute_next_line_tilt(s, motion, ground_ahead)
+        sin, cos = jnp.sin(tilt), jnp.cos(tilt)
+        theta, vx, vz = theta - tilt, vx * cos - vz * sin, vz * cos + vx * sin
     return jnp.concatenate(
         [
             jnp.stack([theta, motion.dtheta, vx, vz]),
@@ -183,4 +191,35 @@ def pack_section_state(
             motion.dL,
             contact_codes.astype(motion.L.dtype),
         ]
+    )
+
+
+def compute_section_foot_distance(s: Symbols, section_state: FullState) -> Elementwise:
+    """Return the distance between the landing foot and the foot of Leg 1 along the slope, m."""
+    motion, _ = unpack_section_state(s, section_state)
+    return -compute_foot_positions(motion, compute_leg_directions(s, motion.theta))[1]
+
+
+def _compute_next_line_tilt(
+    s: Symbols, motion: WheelMotion, ground_ahead: GroundAhead
+) -> Elementwise:
+    """Return the angle by which the line on which the foremost foot lands is steeper, rad.
+
+    If heights are given and Leg 1 is in the air, the rise is that of the line from below its foot
+    to the landing foot, as in `compute_section_foot_distance`.
+    """
+    if ground_ahead.rise is None:
+        return ground_ahead.tilt
+    leg_directions = compute_leg_directions(s, motion.theta)
+    positions, heights = (
+        function(motion, leg_directions)
+        for function in (compute_foot_positions, compute_foot_heights)
+    )
+    dx, dz = positions[-1] - positions[0], heights[-1] - heights[0]
+    sin, cos = jnp.sin(ground_ahead.tilt), jnp.cos(ground_ahead.tilt)
+    foot_rise, distance = dz * cos + dx * sin, jnp.sqrt(dx * dx + dz * dz)
+    # With Leg 1 on the ground, its foot is `rise` below the landing foot, and both terms agree.
+    return 0.5 * (
+        compute_line_slope(ground_ahead.tilt, foot_rise, distance)
+        + compute_line_slope(ground_ahead.tilt, 2.0 * ground_ahead.rise - foot_rise, distance)
     )

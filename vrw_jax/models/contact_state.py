@@ -41,6 +41,7 @@ from vrw_jax.models.contact_mechanics import (
 )
 from vrw_jax.models.contact_modes import replace_infinite_friction
 from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.params import Symbols
 from vrw_jax.wheel.rest import are_coordinates_at_rest, are_rates_negligible
 from vrw_jax.wheel.units import compute_wheel_units
@@ -109,7 +110,7 @@ class ContactModeDynamics(NamedTuple):
     has_one_sided_stoppers: bool  # whether legs in the air may leave their stoppers
     contact_state: ContactState
     has_accumulators: bool  # whether a batch integrates the accumulators
-    tilt: Elementwise | None = None  # angle by which the next line is steeper, rad
+    ground_ahead: GroundAhead | None = None  # None on flat ground
 
     @property
     def measures_force_peaks(self) -> bool:
@@ -140,7 +141,7 @@ def make_contact_mode_dynamics(
     has_one_sided_stoppers: bool,
     contact_state: ContactState,
     has_accumulators: bool = False,
-    tilt: Elementwise | None = None,
+    ground_ahead: GroundAhead | None = None,
 ) -> ContactModeDynamics:
     """Return the dynamics of the wheel in the contact state `contact_state`.
 
@@ -148,7 +149,7 @@ def make_contact_mode_dynamics(
       all other feet;
     - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers;
     - `has_accumulators`: whether losses and slip are integrated together with the motion;
-    - `tilt`: angle by which the next straight line of uneven ground is steeper, rad.
+    - `ground_ahead`: uneven ground on which the next foot lands.
     """
     return ContactModeDynamics(
         s,
@@ -156,7 +157,7 @@ def make_contact_mode_dynamics(
         has_one_sided_stoppers,
         contact_state,
         has_accumulators,
-        tilt,
+        ground_ahead,
     )
 
 
@@ -464,7 +465,7 @@ def evaluate_guards(
         replace_if_not_evaluated(
             is_airborne,
             compute_foot_heights(
-                motion, compute_leg_directions(s, motion.theta), contact_mode_dynamics.tilt
+                motion, compute_leg_directions(s, motion.theta), contact_mode_dynamics.ground_ahead
             ),
         ),
         replace_if_not_evaluated(is_leg_free, s.L0 - motion.L),

@@ -86,7 +86,7 @@ class ContactStepConfig(NamedTuple):
     ) -> tuple[BatchWalkSettings, Array, Array]:
         """Return the settings of walks of one step, and input columns and section states."""
         wheel, params, x, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
-        uneven_ground_columns = () if wheel.uneven is None else wheel.uneven
+        uneven_ground_columns = jax.tree.leaves(wheel.uneven)
         restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
         input_columns = jnp.stack(
             [*stack_parameters(params), wheel.friction, *uneven_ground_columns, *restitution]
@@ -102,7 +102,7 @@ class ContactStepConfig(NamedTuple):
             self.is_detailed,
             options,
             tableau,
-            wheel.uneven is not None,
+            len(uneven_ground_columns),
             wheel.restitution is not None,
             self.engine_name,
             self.measures_force_peaks,
@@ -271,14 +271,16 @@ def build_contact_step_sampler(
     of each interval. The function has no derivatives.
     """
 
-    init_lane_state = lambda *leaves: init_lane_states(*step_config.unpack_argument_leaves(leaves))[
-        1
-    ]
+    def unpack_resolved_leaves(leaves: tuple[Array, ...]) -> tuple:
+        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
+        return walk_settings, walk_settings.resolve_heights(input_columns, x), x
+
+    init_lane_state = lambda *leaves: init_lane_states(*unpack_resolved_leaves(leaves))[1]
 
     def advance_to_event(
         leaves: tuple[Array, ...], lane_state: Any
     ) -> tuple[Any, ContactIntervalLog]:
-        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
+        walk_settings, input_columns, x = unpack_resolved_leaves(leaves)
         state_after_event, lane_state = process_and_integrate(
             walk_settings,
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
@@ -304,7 +306,7 @@ def build_contact_step_sampler(
     def sample_logged_interval(
         leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
     ) -> Any:
-        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
+        walk_settings, input_columns, x = unpack_resolved_leaves(leaves)
         start_states, contact_modes, is_leg_locked, durations = contact_interval_log
         contact_mode_dynamics = walk_settings.make_lane_contact_dynamics(
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
@@ -327,7 +329,7 @@ def build_contact_step_sampler(
         )
 
     def sample_whole_step(*leaves: Array) -> tuple:
-        walk_settings, input_columns, _ = step_config.unpack_argument_leaves(leaves)
+        walk_settings, input_columns, _ = unpack_resolved_leaves(leaves)
         max_events = walk_settings.max_events
         initial_state = begin_compiled_walk(*leaves)
         log_template = jax.eval_shape(advance_compiled_walk, leaves, initial_state)[1]

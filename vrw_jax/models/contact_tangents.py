@@ -32,6 +32,7 @@ from vrw_jax.models.contact_integrator import (
     iterate_until_stopped,
 )
 from vrw_jax.models.contact_kernel import (
+    N_HEIGHT_COLUMNS,
     STATUS_UNFINISHED,
     BatchWalkResult,
     BatchWalkSettings,
@@ -155,6 +156,13 @@ def walk_with_tangents(
 
     The first axis of the resulting tangents also contains the tangents.
     """
+    input_columns, push_to_columns = jax.linearize(
+        walk_settings.resolve_heights, input_columns, section_state
+    )
+    if walk_settings.n_ground_columns == N_HEIGHT_COLUMNS:
+        input_column_tangents = jnp.stack(
+            list(map(push_to_columns, input_column_tangents, section_state_tangents))
+        )
     count_rows = lambda array_tree: len(_pack_tree_into_rows(array_tree))
 
     def begin_walk(

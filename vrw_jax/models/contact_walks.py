@@ -47,7 +47,7 @@ def walk_batch(
     array contains the wheels.
 
     - `input_columns`: wheel parameters and friction, shape (10, wheels). On uneven ground, the walk
-      has one step, and two more columns follow: see `N_UNEVEN_GROUND_COLUMNS`;
+      has one step, and more columns follow: see `N_HEIGHT_COLUMNS`;
     - `section_states`: full section states, shape (wheels, 4 + 3 n).
     """
     static_walk_settings = _make_static_walk_settings(
@@ -300,7 +300,7 @@ def _make_static_walk_settings(
         has_tangents,
         eqx.filter(options, eqx.is_array, inverse=True),
         None,
-        n_columns > N_PARAMETERS + 1,
+        n_columns - N_PARAMETERS - 1,
         model.restitution is not None,
     )
 

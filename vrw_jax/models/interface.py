@@ -13,8 +13,9 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
 from vrw_jax.models.capabilities import ModelCapabilities
-from vrw_jax.models.step_inputs import SectionState, complete_ground_line_slopes
+from vrw_jax.models.step_inputs import SectionState, complete_ground_line_slopes, compute_rises
 from vrw_jax.models.step_results import AdvanceResult
+from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,
@@ -24,8 +25,8 @@ from vrw_jax.wheel.params import (
 from vrw_jax.wheel.units import WheelUnits
 
 StepGroundValues = tuple[Array, ...]
-"""Arrays that describe the ground under one step or under all steps: slopes and, for some models,
-friction coefficients. `with_step_ground` takes the arrays of one step.
+"""Arrays that describe the ground under one step or under all steps: slopes, rises and, for some
+models, friction coefficients. `with_step_ground` takes the arrays of one step.
 """
 
 
@@ -205,12 +206,21 @@ class AbstractWheel(eqx.Module):
     def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return a section state from which a walk can start."""
 
-    def split_ground_by_step(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
-        """Return the ground of each step if slope or friction are arrays with one entry per step.
+    def split_ground_by_step(
+        self, params: WheelParams, n_steps: int, heights: Array | None = None
+    ) -> StepGroundValues | None:
+        """Return the ground of each step if heights are given, or if slope or friction are arrays
+        with one entry per step.
 
         Return None otherwise, and for models that do not support uneven ground.
         """
-        if jnp.ndim(params.slope) == 0 or not self.capabilities.supports_uneven_ground:
+        if not self.capabilities.supports_uneven_ground:
+            return None
+        if heights is not None:
+            rises = compute_rises(heights, n_steps)
+            mean_slopes = jnp.full(n_steps, params.slope)
+            return (jnp.stack([mean_slopes, rises[:-1], rises[1:]], axis=-1),)
+        if jnp.ndim(params.slope) == 0:
             return None
         line_slopes = complete_ground_line_slopes(params.slope, n_steps)
         return (jnp.stack([line_slopes[:-1], line_slopes[1:]], axis=-1),)
@@ -220,10 +230,15 @@ class AbstractWheel(eqx.Module):
     ) -> tuple["AbstractWheel", WheelParams]:
         """Return the model and the wheel on the ground of one walking step.
 
-        `step_ground` contains the slope under both feet in double support and the slope of the next
-        line of the ground, see `separate_next_slope`.
+        `step_ground` contains values of the slope that `select_stance_line` separates.
         """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
+
+    def compute_foot_distance(self, params: WheelParams, x: Array) -> Elementwise:
+        """Return the distance between the landing foot and the foot of Leg 1 in the section state
+        `x`, along the line that joins them, m.
+        """
+        return compute_foot_distance(params.symbols(), x[0])
 
     def count_section_entries(self, params: WheelParams) -> int:
         """Return the number of entries of a section state."""

@@ -22,7 +22,7 @@ from vrw_jax.models.step_inputs import (
     PAPER_START_STATE,
     SectionStateEntries,
     replace_invalid_inputs,
-    select_stance_line_and_tilt,
+    select_stance_line,
 )
 from vrw_jax.models.step_results import (
     AdvanceResult,
@@ -35,6 +35,7 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.ground import GroundAhead, compute_foot_distance_for_length
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import MAX_SI_VALUE, Symbols, WheelParams
 from vrw_jax.wheel.phases import (
@@ -84,7 +85,7 @@ class PhaseSequenceResult(NamedTuple):
     phase_end_results: tuple[PhaseResult, ...]
     has_phase_occurred: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
-    next_line_tilt: Elementwise | None = None  # angle of the next line, rad; None on flat ground
+    ground_ahead: GroundAhead | None = None  # None on flat ground
 
 
 def run_step_phases(
@@ -98,19 +99,22 @@ def run_step_phases(
     """Integrate all phases of one walking step from the section state `x`, and return the results.
 
     `x` contains one array per entry. The motion is in the frame of the line of the ground under
-    both feet in double support. On uneven ground (see `separate_next_slope`), the touchdown and the
-    section state at the end refer to the next line of the ground.
+    both feet in double support. On uneven ground (see `select_stance_line`), the section state at
+    the end refers to the next line of the ground.
 
     - `phase_runner`: engine that integrates a phase;
     - `landing_function`: function that computes the landing at the beginning of the step.
     """
-    params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
+    params, is_valid_step, ground_ahead = select_stance_line(params, x)
     params, x = replace_invalid_inputs(is_valid_step, params, x, PAPER_START_STATE)
     s = params.symbols()
     landing_result = landing_function(s, *x)
-    tilt_sine_cosine = () if next_line_tilt is None else compute_sine_cosine(next_line_tilt)
+    ground_values: Vector = ()
+    if ground_ahead is not None:
+        rise = () if ground_ahead.rise is None else (ground_ahead.rise,)
+        ground_values = (*compute_sine_cosine(ground_ahead.tilt), *rise)
     step_phases = make_paper_phases(
-        s, landing_result.foot_distance, stop_at_lift_off, tilt_sine_cosine
+        s, landing_result.foot_distance, stop_at_lift_off, ground_values
     )
     # A landing that releases the rear foot continues in SLS-I.
     is_double_support_active = is_valid_step & landing_result.is_rear_foot_planted
@@ -123,7 +127,7 @@ def run_step_phases(
         is_double_support_active,
         options,
     )
-    return PhaseSequenceResult(s, landing_result, step_phases, *remaining_phases, next_line_tilt)
+    return PhaseSequenceResult(s, landing_result, step_phases, *remaining_phases, ground_ahead)
 
 
 def _run_remaining_phases(
@@ -250,8 +254,13 @@ def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> Adv
     """
     phase_end_results = phase_sequence.phase_end_results
     touchdown_angle, touchdown_rates = phase_end_results[2].q[0], phase_end_results[2].v
-    if phase_sequence.next_line_tilt is not None:
-        touchdown_angle = touchdown_angle - phase_sequence.next_line_tilt
+    if phase_sequence.ground_ahead is not None:
+        foot_distance = compute_foot_distance_for_length(
+            phase_sequence.s, phase_end_results[2].q[1]
+        )
+        touchdown_angle = touchdown_angle - phase_sequence.ground_ahead.compute_next_line_tilt(
+            foot_distance
+        )
     section_state = touchdown_angle, *touchdown_rates
     return _collect_advance_result(section_state, phase_end_results, phase_sequence.outcome, engine)
 

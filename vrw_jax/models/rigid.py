@@ -17,11 +17,11 @@ from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.step_inputs import (
+    AnySectionState,
     SectionState,
     SectionStateEntries,
     replace_invalid_inputs,
-    select_stance_line_and_tilt,
-    separate_next_slope,
+    select_stance_line,
 )
 from vrw_jax.models.step_results import (
     AdvanceResult,
@@ -34,6 +34,7 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.wheel import dynamics, geometry, transitions
 from vrw_jax.wheel.geometry import Motion, compute_rear_foot_height
+from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, Symbols, WheelParams, require_known_friction
 
@@ -139,6 +140,10 @@ class RigidWheel(AbstractWheel):
             / foot_inertia
         )
 
+    def compute_foot_distance(self, params: WheelParams, x: AnySectionState) -> Elementwise:
+        half_angle = jnp.full_like(x[0], 0.5 * params.leg_angle)
+        return compute_foot_distance(params.symbols(), half_angle)
+
     def make_vertical_rate_map(self, params: WheelParams) -> "VerticalRateMap":
         """Return the map of the squared angular rate from one vertical passage to the next.
 
@@ -160,8 +165,13 @@ class RigidWheel(AbstractWheel):
         """Return the results of a step, computed elementwise for one wheel or for a batch."""
         half_angle = jnp.asarray(0.5 * params.leg_angle, x[1].dtype)
         x = (half_angle + 0.0 * x[0], x[1], 0.0 * x[2])
-        params, is_valid_step, next_line_tilt = select_stance_line_and_tilt(params, x)
-        end_angle = half_angle if next_line_tilt is None else half_angle + next_line_tilt
+        params, is_valid_step, ground_ahead = select_stance_line(params, x)
+        end_angle = half_angle
+        if ground_ahead is not None:
+            foot_distance = compute_foot_distance(params.symbols(), half_angle)
+            if ground_ahead.rise is not None:
+                is_valid_step = is_valid_step & (jnp.abs(ground_ahead.rise) < foot_distance)
+            end_angle = half_angle + ground_ahead.compute_next_line_tilt(foot_distance)
         params, x = replace_invalid_inputs(is_valid_step, params, x, (half_angle, 1.0, 0.0))
         s = params.symbols()
         rate_before, rate_after = x[1], self._compute_landing_rate_ratio(s) * x[1]
@@ -329,11 +339,13 @@ class RigidWheel(AbstractWheel):
     ) -> Trajectory:
         """Return the motion during a step at equidistant angles, not at equidistant times."""
         step_result = self.take_step(params, x, options)
-        params, next_slope = separate_next_slope(params)
         half_angle = 0.5 * params.leg_angle
+        params, _, ground_ahead = select_stance_line(params, jnp.asarray(x).at[0].set(half_angle))
         end_angle = jnp.asarray(half_angle)
-        if next_slope is not None:
-            end_angle = half_angle + next_slope - params.slope
+        if ground_ahead is not None:
+            end_angle = half_angle + ground_ahead.compute_next_line_tilt(
+                compute_foot_distance(params.symbols(), end_angle)
+            )
         rolling_motion = RollingMotion(
             params.symbols(), params.slope, step_result.post_impact[1], -half_angle, end_angle
         )

@@ -45,6 +45,7 @@ from vrw_jax.models.batch_stiffness import (
 from vrw_jax.models.contact_batch import CONTACT_STEP_INPUT_NAMES, step_batch_with_contact
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.stepping import (
+    convert_heights,
     convert_model_argument,
     convert_section_state,
     convert_step_options,
@@ -56,6 +57,8 @@ from vrw_jax.models.walk_batch import (
     StepwiseParameter,
     WalkBatch,
     complete_slopes_over_steps,
+    compute_rises_over_steps,
+    make_height_terms,
     select_lanes,
 )
 from vrw_jax.wheel.outcomes import Outcome
@@ -75,10 +78,11 @@ PAPER_STEP_INPUT_NAMES = (START_INPUT_NAME, *PARAMETER_NAMES)
 SLOPE_INPUT_INDEX = PARAMETER_NAMES.index("slope")
 """Index of the slope among the inputs of a gait step.
 
-The inputs are the parameters, the section state and the slope of the ground after the next landing.
+The inputs are the parameters, the section state and, on uneven ground, the slope of the ground
+after the next landing or two rises (see `models.select_stance_line`).
 """
-NEXT_SLOPE_INPUT_INDEX = len(PARAMETER_NAMES) + 3
-"""Index, among the inputs of a gait step, of the slope of the ground after the next landing."""
+GROUND_INPUT_INDEX = len(PARAMETER_NAMES) + 3
+"""Index, among the inputs of a gait step, of the first value of uneven ground."""
 
 
 @announce_wait("batches of gait steps", "10 s")
@@ -92,6 +96,7 @@ def step_batch(
     options: StepOptions | None = None,
     engine: BatchEngineName = "auto",
     derivatives: Sequence[str] = (),
+    heights: Array | np.ndarray | None = None,
 ) -> StepBatchResult:
     """Return the result of up to `n_steps` gait steps of many wheels, with derivatives if
     requested.
@@ -115,7 +120,8 @@ def step_batch(
 
     On uneven ground the slope has the shape (elements, n_steps) or (elements, n_steps + 1), with
     one value per gait step as in `walk`. With unilateral contact, friction may have these shapes
-    too. Derivatives with respect to such an array have the axis over gait steps last.
+    too. Heights of footholds, as in `walk`, may be given instead of such slopes. Derivatives with
+    respect to such an array have the axis over gait steps last.
 
     Args:
         params: parameters of the wheels. Each field is a scalar or has the shape (elements,); the
@@ -127,7 +133,9 @@ def step_batch(
         options: numerical options of the gait steps.
         engine: "auto", "lanes" or "diffrax".
         derivatives: inputs with respect to which derivatives are computed: "section_state" and
-            names of parameters; with unilateral contact "friction" too.
+            names of parameters; with unilateral contact "friction" too, and "heights" if given.
+        heights: heights of the footholds above the mean line, shape (elements, n_steps + 1) or
+            (elements, n_steps + 2), m.
 
     Returns:
         A `StepBatchResult` for the last gait step of each element.
@@ -142,7 +150,7 @@ def step_batch(
         ((3, 3), [10, 10, 10], 'lanes')
     """
     require_untraced_arguments(
-        "vrw.step_batch", "map vrw.return_map over the lanes", params, states
+        "vrw.step_batch", "map vrw.return_map over the lanes", params, states, heights
     )
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
@@ -154,9 +162,23 @@ def step_batch(
     values_by_parameter = _check_parameter_shapes(
         params, checked_section_states, checked_model, options, n_steps
     )
-    checked_section_states = checked_section_states.astype(values_by_parameter[0].dtype, copy=False)
+    dtype = values_by_parameter[0].dtype
+    checked_section_states = checked_section_states.astype(dtype, copy=False)
+    element_heights = convert_heights(
+        heights, checked_model, values_by_parameter[SLOPE_INPUT_INDEX].ndim == 2, check_numpy_reals
+    )
+    if element_heights is not None:
+        n_elements = len(checked_section_states)
+        if element_heights.shape not in ((n_elements, n_steps + 1), (n_elements, n_steps + 2)):
+            raise ValueError(
+                f"heights have shape {element_heights.shape}, but there are {n_elements} states "
+                f"and {n_steps} steps: give {n_steps + 1} heights of footholds for each state, or "
+                f"{n_steps + 2} with that before the walk."
+            )
+        element_heights = element_heights.astype(dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
     known_input_names = CONTACT_STEP_INPUT_NAMES if has_contact_kernel else PAPER_STEP_INPUT_NAMES
+    known_input_names += ("heights",) * (element_heights is not None)
     for derivative_name in derivatives:
         if derivative_name not in known_input_names:
             raise ValueError(
@@ -174,6 +196,7 @@ def step_batch(
         engine,
         params.n_legs,
         derivatives,
+        element_heights,
     )
 
 
@@ -236,17 +259,24 @@ def _step_batch_without_contact(
     requested_engine: str,
     n_legs: int,
     derivative_names: Sequence[str],
+    element_heights: np.ndarray | None,
 ) -> StepBatchResult:
     n_wheels = len(section_states)
     element_slopes = values_by_parameter[SLOPE_INPUT_INDEX]
     ground_slopes: Any = [element_slopes]
+    rises = None
     stepwise_parameters = {}
     is_ground_uneven = element_slopes.ndim == 2
+    if element_heights is not None:
+        rises = compute_rises_over_steps(element_heights, n_steps)
+        stepwise_parameters["heights"] = make_height_terms(
+            (GROUND_INPUT_INDEX, GROUND_INPUT_INDEX + 1), element_heights.shape[1], n_steps
+        )
     if is_ground_uneven:
         ground_slopes = complete_slopes_over_steps(element_slopes, n_steps)
         n_slopes = element_slopes.shape[1]
         stepwise_parameters["slope"] = StepwiseParameter(
-            (SLOPE_INPUT_INDEX, NEXT_SLOPE_INPUT_INDEX),
+            (SLOPE_INPUT_INDEX, GROUND_INPUT_INDEX),
             n_slopes,
             lambda k: ((0, k, 1.0), (1, min(k + 1, n_slopes - 1), 1.0)),
         )
@@ -257,6 +287,8 @@ def _step_batch_without_contact(
     )
     if is_ground_uneven:
         ground_slopes = ground_slopes.take(wheel_order, -1)
+    if rises is not None:
+        rises = rises.take(wheel_order, -1)
     walk_batch = WalkBatch(
         section_states.T.take(wheel_order, -1),
         derivative_names,
@@ -292,10 +324,13 @@ def _step_batch_without_contact(
             if not len(lane_indices):
                 continue
             lanes = select_lanes(lane_indices, walk_batch)
-            next_slopes = (ground_slopes[k + 1][lanes],) if is_ground_uneven else ()
-            step_outputs = selected_engine.take_lane_steps(
-                parameter_matrix[:, lanes], walk_batch.section_state[:, lanes], *next_slopes
-            )
+            lane_inputs = parameter_matrix[:, lanes], walk_batch.section_state[:, lanes]
+            ground_inputs: tuple[np.ndarray, ...] = ()
+            if is_ground_uneven:
+                ground_inputs = (ground_slopes[k + 1][lanes],)
+            elif rises is not None:
+                ground_inputs = rises[k][lanes], rises[k + 1][lanes]
+            step_outputs = selected_engine.take_lane_steps(*lane_inputs, *ground_inputs)
             if solver_index == SolverIndex.STABLE_SOLVER:
                 # A phase may last longer than `select_cheapest_solver` assumes. The implicit
                 # solver, which is next, then repeats the step.
@@ -341,7 +376,7 @@ class _BatchEngine(NamedTuple):
     engine_name: str
     take_lane_steps: Callable[..., tuple[np.ndarray, ...]]
     """Function that computes one gait step. Its arguments are parameters, section states and, on
-    uneven ground, the slopes after the next landing.
+    uneven ground, the inputs from `GROUND_INPUT_INDEX`.
 
     The function returns section states, durations, outcomes, numbers of solver steps and, if
     derivatives are requested, Jacobians.
@@ -384,16 +419,16 @@ def _step_lanes_by_kernel(
     input_indices: tuple[int, ...],
     parameter_matrix: np.ndarray,
     section_states: np.ndarray,
-    *next_slopes: np.ndarray,
+    *ground_inputs: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Return the results of one gait step for all lanes, computed by machine code or XLA.
 
     The results are those of `_BatchEngine.take_lane_steps`.
     """
-    compiled_step = _compile_lane_step(stop_at_lift_off, n_legs, input_indices, len(next_slopes))
+    compiled_step = _compile_lane_step(stop_at_lift_off, n_legs, input_indices, len(ground_inputs))
     kernel_results = compiled_step.run(
         jax.tree.map(lambda x: np.asarray(x, parameter_matrix.dtype), options),
-        (*parameter_matrix, *section_states, *next_slopes),
+        (*parameter_matrix, *section_states, *ground_inputs),
     )
     _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
     return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
@@ -401,7 +436,7 @@ def _step_lanes_by_kernel(
 
 @functools.cache
 def _compile_lane_step(
-    stop_at_lift_off: bool, n_legs: int, input_indices: tuple[int, ...], n_next_slopes: int
+    stop_at_lift_off: bool, n_legs: int, input_indices: tuple[int, ...], n_ground_inputs: int
 ) -> CompiledBatchFunction:
     """Return a compiled gait step of lanes, a function of options and inputs."""
     n_parameters = len(PARAMETER_NAMES)
@@ -415,9 +450,9 @@ def _compile_lane_step(
 
         def compute_step_outputs(*lane_step_inputs: Array) -> tuple:
             params = make_wheel_from_parameters(
-                lane_step_inputs[:n_parameters], n_legs, *lane_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
+                lane_step_inputs[:n_parameters], n_legs, *lane_step_inputs[GROUND_INPUT_INDEX:]
             )
-            x = lane_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
+            x = lane_step_inputs[n_parameters:GROUND_INPUT_INDEX]
             step_result, is_unfinished = advance_gait_step(
                 params, x, options, tableau, stop_at_lift_off, straggler_count
             )
@@ -428,7 +463,9 @@ def _compile_lane_step(
             step_outputs, step_diagnostics = compute_step_outputs(*lane_step_inputs)
             return (*step_diagnostics, step_outputs)
         # With respect to all inputs, two columns follow from the units.
-        differentiates_all_inputs = len(input_indices) == len(lane_step_inputs)
+        differentiates_all_inputs = (
+            len(input_indices) == len(lane_step_inputs) <= GROUND_INPUT_INDEX + 1
+        )
         compute_jacobian_of_columns = (
             complete_jacobian_columns if differentiates_all_inputs else compute_jacobian_columns
         )
@@ -437,7 +474,7 @@ def _compile_lane_step(
         )
         return (*step_diagnostics, step_outputs, step_jacobian)
 
-    n_kernel_inputs = N_STEP_INPUTS + n_next_slopes
+    n_kernel_inputs = N_STEP_INPUTS + n_ground_inputs
     return compile_batch_function(
         step_lanes,
         batch_sizes.XLA_LANE_BATCH_SIZE,
@@ -453,7 +490,7 @@ def _step_lanes_by_diffrax(
     input_indices: tuple[int, ...],
     parameter_matrix: np.ndarray,
     section_states: np.ndarray,
-    *next_slopes: np.ndarray,
+    *ground_inputs: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Return the results of one gait step for all lanes, computed by `model.advance` under
     `jax.vmap`.
@@ -465,7 +502,7 @@ def _step_lanes_by_diffrax(
     )
     derivative_step_options = convert_options_dtype(options.with_derivative_tolerances())
     options = convert_options_dtype(options)
-    step_input_matrix = np.vstack([parameter_matrix, section_states, *next_slopes]).T
+    step_input_matrix = np.vstack([parameter_matrix, section_states, *ground_inputs]).T
 
     def step_all_elements(
         step_input_matrix: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]
@@ -536,11 +573,12 @@ def _step_elements_by_vmap(
     def step_one_element(step_inputs: Array) -> tuple[Array, ...]:
         def step_with_varied_inputs(varied_inputs: Array) -> tuple[Array, tuple[Array, ...]]:
             updated_step_inputs = step_inputs.at[np.array(input_indices, int)].set(varied_inputs)
-            next_slope = updated_step_inputs[NEXT_SLOPE_INPUT_INDEX:]
             params = make_wheel_from_parameters(
-                updated_step_inputs[:n_parameters], n_legs, *next_slope
+                updated_step_inputs[:n_parameters],
+                n_legs,
+                *updated_step_inputs[GROUND_INPUT_INDEX:],
             )
-            x = updated_step_inputs[n_parameters:NEXT_SLOPE_INPUT_INDEX]
+            x = updated_step_inputs[n_parameters:GROUND_INPUT_INDEX]
             step_result = model.advance(params, x, options)
             return jnp.concatenate([step_result.section_state, step_result.durations]), (
                 step_result.section_state,

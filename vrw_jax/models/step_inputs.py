@@ -1,7 +1,4 @@
-"""Inputs of a step: section states and the slopes of uneven ground, with the checks of both.
-
-Uneven ground consists of straight lines between the footholds.
-"""
+"""Inputs of a step: section states and uneven ground, with the checks of both."""
 
 import functools
 import operator
@@ -13,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vrw_jax.base.types import Elementwise
+from vrw_jax.wheel.ground import GroundAhead, compute_foot_distance, compute_line_slope
 from vrw_jax.wheel.params import MAX_SI_VALUE, PARAMETER_DOMAINS, WheelParams
 
 SectionState = Float[Array, "3"]
@@ -83,6 +81,20 @@ def complete_ground_line_slopes(slope: Array, n_steps: int) -> Array:
     return slope if len(slope) > n_steps else jnp.append(slope, slope[-1:])
 
 
+def compute_rises(heights: Array, n_steps: int) -> Array:
+    """Return the height of each of the n + 1 footholds of a walk minus that of the foothold before.
+
+    If `heights` has n + 1 entries, the foothold before the walk lies on the mean line.
+    """
+    if jnp.shape(heights) not in ((n_steps + 1,), (n_steps + 2,)):
+        raise ValueError(
+            f"heights has shape {jnp.shape(heights)}, but a walk of {n_steps} steps of one wheel "
+            f"takes {n_steps + 1} heights of footholds, or {n_steps + 2} with the foothold before "
+            "the walk: map over batches of wheels with jax.vmap."
+        )
+    return jnp.diff(heights, prepend=0.0)[-(n_steps + 1) :]
+
+
 def require_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: int) -> None:
     """Raise a `ValueError` unless an array has n or n + 1 entries for n steps."""
     if jnp.shape(stepwise_values) not in ((n_steps,), (n_steps + 1,)):
@@ -95,36 +107,52 @@ def require_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: 
         )
 
 
-def separate_next_slope(params: WheelParams) -> tuple[WheelParams, Elementwise | None]:
-    """Return the wheel on the line of the ground under both feet, and the slope of the next line.
-
-    The slope is in rad. The line joins the footholds of the two feet in double support. On uneven
-    ground, `params.slope` has both slopes on a leading axis that no other parameter has. On flat
-    ground, `params.slope` has no such axis and the second result is None.
-    """
-    if jnp.ndim(params.slope) == jnp.ndim(params.damping):
-        return params, None
-    slope, next_slope = params.slope[0], params.slope[1]
-    return eqx.tree_at(lambda wheel: wheel.slope, params, slope), next_slope
-
-
 def is_slope_in_domain(slope: Elementwise) -> Array:
     """Return whether a slope (rad) lies in the allowed domain. NaN gives False."""
     return jnp.asarray(PARAMETER_DOMAINS["slope"].contains_parameter_value(slope))
 
 
-def select_stance_line_and_tilt(
+def select_stance_line(
     params: WheelParams, x: SectionStateEntries
-) -> tuple[WheelParams, Array, Elementwise | None]:
-    """Return the wheel on the present line of the ground, the validity of the step, and the tilt.
+) -> tuple[WheelParams, Array, GroundAhead | None]:
+    """Return the wheel on the line under both feet, the validity of the step, and the ground ahead.
 
-    The present line is the one under both feet in double support. A step may start only if
-    parameters, start and slopes are valid. The tilt is the angle by which the next line is steeper
-    than the present line, rad. On flat ground the tilt is None.
+    A step may start only if parameters, start and ground are valid. On flat ground, the slope has
+    as many axes as the other parameters, and the ground ahead is None. On uneven ground, the slope
+    has a leading axis: the slopes of this line and of the next one, or the mean slope and two
+    rises. These are the heights of the foothold on which the step begins, and of the next one, each
+    minus the height of the foothold before.
     """
-    params, next_slope = separate_next_slope(params)
-    is_valid_step = is_valid_start_state(params, x)
-    if next_slope is None:
-        return params, is_valid_step, None
-    is_valid_step = is_valid_step & is_slope_in_domain(next_slope)
-    return params, is_valid_step, jnp.where(is_valid_step, next_slope - params.slope, 0.0)
+    if jnp.ndim(params.slope) == jnp.ndim(params.damping):
+        return params, is_valid_start_state(params, x), None
+    first_slope, *other_values = params.slope
+    replace_slope = lambda slope: eqx.tree_at(lambda wheel: wheel.slope, params, slope)
+    if len(other_values) == 1:
+        params, next_slope = replace_slope(first_slope), other_values[0]
+        is_valid_step = is_valid_start_state(params, x) & is_slope_in_domain(next_slope)
+        tilt = jnp.where(is_valid_step, next_slope - params.slope, 0.0)
+        return params, is_valid_step, GroundAhead(tilt)
+    rise, next_rise = other_values
+    theta = jnp.where(jnp.abs(x[0]) < 0.5 * jnp.pi, x[0], 0.0)
+    foot_distance = compute_foot_distance(replace_slope(first_slope).symbols(), theta)
+    params = replace_slope(find_stance_slope(first_slope, rise, foot_distance))
+    is_valid_step = is_valid_start_state(params, x) & (jnp.abs(next_rise) < MAX_SI_VALUE)
+    mask_invalid = lambda value: jnp.where(is_valid_step, value, 0.0)
+    ground_ahead = GroundAhead(mask_invalid(first_slope - params.slope), mask_invalid(next_rise))
+    return params, is_valid_step, ground_ahead
+
+
+def find_stance_slope(
+    mean_slope: Elementwise, rise: Elementwise, foot_distance: Elementwise
+) -> Elementwise:
+    """Return the slope of the line under both feet, rad, or an invalid slope if the rise exceeds
+    the distance of the feet.
+    """
+    is_rise_possible = jnp.abs(rise) < foot_distance
+    possible_rise = jnp.where(is_rise_possible, rise, 0.0)
+    slope = compute_line_slope(mean_slope, possible_rise, foot_distance)
+    return jnp.where(is_rise_possible, slope, IMPOSSIBLE_SLOPE)
+
+
+IMPOSSIBLE_SLOPE = jnp.pi
+"""Slope outside the domain of slopes, so that a step on it is BAD_INPUT, rad."""

@@ -423,6 +423,7 @@ def walk(
     model: ModelLike | None = None,
     options: StepOptions | None = None,
     engine: EngineName = "auto",
+    heights: Array | np.ndarray | Sequence[float] | None = None,
 ) -> Walk:
     """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
     step.
@@ -436,6 +437,13 @@ def walk(
     unilateral contact, the friction of the model may also be an array with one coefficient per
     step. The coefficient of each foot is that of the step in which it landed.
 
+    If `heights` are given, `params.slope` is the slope of a mean line, and foothold k lies at the
+    height `heights[k]` above this line. Step k begins on foothold k and ends when the next foot is
+    at the height of foothold k + 1. The foothold before the walk lies on the mean line, unless n +
+    2 heights are given, of which the first is that of this foothold. The slope of the line between
+    two footholds follows from their heights and from the distance of the feet at touchdown. A
+    sliding foot keeps its height.
+
     Args:
         params: the wheel.
         x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
@@ -444,6 +452,8 @@ def walk(
             simplest valid model.
         options: numerical options of the steps.
         engine: engine that computes the steps; see `StepOptions`.
+        heights: heights of the footholds above the mean line, normal to it, shape (n_steps + 1,) or
+            (n_steps + 2,), m.
 
     Returns:
         A `Walk` whose fields have a leading axis over the steps.
@@ -458,7 +468,7 @@ def walk(
     """
     n_steps = check_int("n_steps", n_steps)
     params, section_state, checked_model, options, stepwise_ground = convert_walk_arguments(
-        params, x, n_steps, model, options, engine
+        params, x, n_steps, model, options, engine, heights
     )
     return _simulate_walk_by_scan(
         checked_model, params, section_state, options, n_steps, stepwise_ground
@@ -484,6 +494,7 @@ def convert_walk_arguments(
     model: ModelLike | None,
     options: StepOptions | None,
     engine: EngineName,
+    heights: object | None = None,
     **start_checks: Any,
 ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions, StepGroundValues | None]:
     """Return wheel, section state, model and options of a walk, and the ground of each step.
@@ -491,14 +502,14 @@ def convert_walk_arguments(
     They are converted to one floating-point type. The wheel and the model are those on the ground
     of the first step. On flat ground, the ground of the steps is None.
 
+    - `heights`: heights of the footholds above the mean line, see `walk`;
     - `start_checks`: further arguments of `convert_step_arguments`.
     """
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
-    stepwise_ground = (
-        checked_model.split_ground_by_step(params, n_steps)
-        if isinstance(params, WheelParams)
-        else None
-    )
+    stepwise_ground = None
+    if isinstance(params, WheelParams):
+        checked_heights = convert_heights(heights, checked_model, jnp.ndim(params.slope) > 0)
+        stepwise_ground = checked_model.split_ground_by_step(params, n_steps, checked_heights)
     if stepwise_ground is not None:
         checked_model, _ = checked_model.with_step_ground(
             params, tuple(ground_by_step[0] for ground_by_step in stepwise_ground)
@@ -513,6 +524,32 @@ def convert_walk_arguments(
             ground_by_step.astype(section_state.dtype) for ground_by_step in stepwise_ground
         )
     return params, section_state, checked_model, options, stepwise_ground
+
+
+def convert_heights(
+    heights: object | None,
+    model: AbstractWheel,
+    is_slope_stepwise: bool,
+    height_converter: Callable = check_reals,
+) -> Any:
+    """Return the heights of footholds as an array, or None if there are none.
+
+    Raise a `TypeError` or a `ValueError` if the heights are no real numbers, if the slope is an
+    array over steps, or if the model walks on even ground only.
+    """
+    if heights is None:
+        return None
+    if is_slope_stepwise:
+        raise ValueError(
+            "heights are given and slope is an array over steps, but heights are measured from a "
+            "line of one slope: give one slope, or no heights."
+        )
+    if not model.capabilities.supports_uneven_ground:
+        raise ValueError(
+            f"heights are given, but a {type(model).__name__} walks on even ground only: take "
+            "vrw.UnilateralWheel()."
+        )
+    return height_converter("heights", heights, "give one height for each foothold, in m")
 
 
 def start_walk_toward_gait(

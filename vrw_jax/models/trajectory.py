@@ -7,7 +7,7 @@ landing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -32,11 +32,16 @@ from vrw_jax.models.contact_state import PackedState, unpack_state
 from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.models.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
 from vrw_jax.models.provenance import collect_provenance_attributes
-from vrw_jax.models.step_inputs import complete_ground_line_slopes, separate_next_slope
+from vrw_jax.models.step_inputs import (
+    complete_ground_line_slopes,
+    compute_rises,
+    select_stance_line,
+)
 from vrw_jax.models.stepping import ModelLike, SectionStateLike, convert_walk_arguments
 from vrw_jax.models.unilateral_wheel import UnilateralTrajectory
 from vrw_jax.wheel.dynamics import compute_damping_power
 from vrw_jax.wheel.geometry import Motion, rotate_to_landing_leg, rotate_to_rear_leg
+from vrw_jax.wheel.ground import compute_line_slope
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
@@ -52,13 +57,15 @@ def simulate(
     options: StepOptions | None = None,
     engine: EngineName = "auto",
     n_samples: int = 100,
+    heights: Array | np.ndarray | Sequence[float] | None = None,
 ) -> xr.Dataset:
     """Simulate a walk from the section state `x` and return it as a labeled trajectory over time.
 
     If `x` is None, the walk begins at the default start of the model, near the gait of Table 1 of
     the paper. Uneven ground is specified as in `vrw.walk`. Positions are then in the frame of the
-    first line of the ground. Angles and forces of a step are in the frame of the line under both
-    feet in double support. The attribute `line_slopes` contains the slopes of all lines.
+    first line of the ground, or of the mean line if heights are given. Angles and forces of a step
+    are in the frame of the line under both feet in double support. The attribute `slopes` contains
+    the slopes of all lines.
 
     Each phase has `n_samples` equidistant times, including both ends. A time at which a quantity
     jumps is therefore listed twice, with the values before and after the jump. A failed step ends
@@ -74,6 +81,7 @@ def simulate(
         options: numerical options of the steps.
         engine: engine that computes the steps; see `StepOptions`.
         n_samples: number of times per phase, including both ends, at least 2.
+        heights: heights of the footholds above the mean line, as in `vrw.walk`, m.
 
     Returns:
         A dataset over `time` with coordinates, rates, foot positions, forces and energies, and
@@ -87,7 +95,7 @@ def simulate(
         >>> walk.lambda_2.attrs["units"], walk.attrs["outcome"]
         ('N', 'STEPPED')
     """
-    require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x)
+    require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x, heights)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
     given_params = params
     params, x, model, options, stepwise_ground = convert_walk_arguments(
@@ -97,14 +105,30 @@ def simulate(
         model,
         options,
         engine,
+        heights,
         batch_remedy_text="simulate one at a time",
         allows_default_start=True,
     )
     s = jax.tree.map(float, params).symbols()
-    line_slopes = given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
-    ground_lines = GroundLines(
-        np.asarray(complete_ground_line_slopes(line_slopes, n_steps), float), float(s.Mt * s.g)
-    )
+    if heights is None:
+        line_slopes = (
+            given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
+        )
+        slopes = np.asarray(complete_ground_line_slopes(line_slopes, n_steps), float)
+        ground = TrajectoryGround(
+            lambda k, _: float(slopes[k]), float(slopes[0]), 0.0, np.ptp(slopes) > 0.0
+        )
+    else:
+        first_height = float(heights[-n_steps - 1])
+        rises = np.asarray(compute_rises(jnp.asarray(heights), n_steps), float)
+        ground = TrajectoryGround(
+            lambda k, x: float(
+                compute_line_slope(params.slope, rises[k], model.compute_foot_distance(params, x))
+            ),
+            float(params.slope),
+            first_height,
+            True,
+        )
     models_and_wheels = [(model, params)] * n_steps
     if stepwise_ground is not None:
         models_and_wheels = [
@@ -115,8 +139,8 @@ def simulate(
         specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
     )
     trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
-    sampled_columns, n_stepped, walk_outcome = sample_walk_steps(
-        trajectory_spec, x, n_steps, ground_lines
+    sampled_columns, walked_slopes, n_stepped, walk_outcome = sample_walk_steps(
+        trajectory_spec, x, n_steps, ground, float(s.Mt * s.g)
     )
     dataset_variables = make_labeled_variables(
         {
@@ -139,11 +163,14 @@ def simulate(
     provenance_attributes = trajectory_spec.dataset_attributes | collect_provenance_attributes(
         params, model, options
     )
-    if stepwise_ground is not None:
+    if heights is not None:
         provenance_attributes |= {
-            "frame": UNEVEN_GROUND_FRAME_TEXT,
-            "slopes": ground_lines.slopes.tolist(),
+            "frame": HEIGHTS_FRAME_TEXT,
+            "slopes": walked_slopes,
+            "heights": np.asarray(heights, float).tolist(),
         }
+    elif stepwise_ground is not None:
+        provenance_attributes |= {"frame": SLOPES_FRAME_TEXT, "slopes": slopes.tolist()}
         del provenance_attributes["parameter_slope"]
     dataset = xr.Dataset(
         dataset_variables,
@@ -179,55 +206,61 @@ class TrajectorySpecification(NamedTuple):
 
 
 HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
-"""Energies that depend on the height of the reference point, which is the first foothold of the
-walk.
-"""
+"""Energies that depend on the height of the reference point, which is the origin of positions."""
 
 
-UNEVEN_GROUND_FRAME_TEXT = (
-    "positions: x downhill along line 0, z normal to it, first foot at the origin; angles and "
-    "forces: along and normal to the line under both feet of the step's double support"
+ANGLES_FRAME_TEXT = (
+    "angles and forces: along and normal to the line under both feet of the step's double support"
 )
-"""Text for the attribute `frame` of a trajectory on uneven ground."""
+SLOPES_FRAME_TEXT = (
+    "positions: x downhill along line 0, z normal to it, first foot at the origin; "
+    + ANGLES_FRAME_TEXT
+)
+HEIGHTS_FRAME_TEXT = (
+    "positions: x downhill along the mean line, z above it, first foot at x = 0; "
+    + ANGLES_FRAME_TEXT
+)
+"""Text for the attribute `frame` of a trajectory on ground with given heights."""
 
 
-class GroundLines(NamedTuple):
-    """Slopes of all lines of the ground, and the weight of the wheel."""
+class TrajectoryGround(NamedTuple):
+    """Ground of a trajectory, and the frame of its positions."""
 
-    slopes: np.ndarray  # rad
-    wheel_weight: float  # N
+    # of the line under both feet, from the index of the step and its section state, rad
+    find_line_slope: Callable[[int, Array], float]
+    frame_slope: float  # rad
+    first_height: float  # normal component of the first foothold, m
+    is_uneven: bool
 
-    def rotate_to_line_0(self, k: int, x: Any, z: Any) -> tuple[Any, Any]:
-        """Return the components of a vector in the frame of line 0 of the ground.
-
-        - `k`: index of the line of the ground in whose frame x and z are components of the vector.
-        """
-        angle_from_line_0 = self.slopes[k] - self.slopes[0]
-        sine_of_angle, cosine_of_angle = np.sin(angle_from_line_0), np.cos(angle_from_line_0)
+    def rotate_to_frame(self, line_slope: float, x: Any, z: Any) -> tuple[Any, Any]:
+        """Return the components of a vector, given those along and normal to a line."""
+        angle_from_frame = line_slope - self.frame_slope
+        sine_of_angle, cosine_of_angle = np.sin(angle_from_frame), np.cos(angle_from_frame)
         return x * cosine_of_angle + z * sine_of_angle, z * cosine_of_angle - x * sine_of_angle
-
-    def compute_potential_energy(self, x: float, z: float) -> float:
-        """Return the potential energy of the wheel's weight at (x, z) in the frame of line 0, J."""
-        height = z * np.cos(self.slopes[0]) - x * np.sin(self.slopes[0])
-        return self.wheel_weight * height
 
 
 def sample_walk_steps(
-    trajectory_spec: TrajectorySpecification, x: Array, n_steps: int, ground_lines: GroundLines
-) -> tuple[dict[str, np.ndarray], int, Outcome]:
+    trajectory_spec: TrajectorySpecification,
+    x: Array,
+    n_steps: int,
+    ground: TrajectoryGround,
+    wheel_weight: float,
+) -> tuple[dict[str, np.ndarray], list[float], int, Outcome]:
     """Return samples of the walk from the section state x. The walk ends at the first failed step.
 
-    Return also the number of completed steps and the outcome of the last step. The samples have the
-    shape (time, ...); they are empty if no interval occurred.
+    Return also the slopes of the lines under the feet (rad), the number of completed steps and the
+    outcome of the last step. The samples have the shape (time, ...); they are empty if no interval
+    occurred.
 
     The samples of a step are in the frame of the line of the ground under both feet in double
-    support. Positions (m) and energies (J) are converted to the frame of line 0. Its origin is the
-    first foothold.
+    support. Positions (m) and energies (J) are converted to the frame of the ground.
+
+    - `wheel_weight`: weight of the wheel, N.
     """
     columns_by_step = []
     walk_outcome, k, step_start_time = Outcome.STEPPED, 0, 0.0
-    foothold_x, foothold_z = 0.0, 0.0
-    is_ground_uneven = np.ptp(ground_lines.slopes) > 0.0
+    foothold_x, foothold_z = 0.0, ground.first_height
+    line_slopes = [ground.find_line_slope(0, x)]
     while walk_outcome == Outcome.STEPPED and k < n_steps:
         sampled_step = trajectory_spec.step_sampler(x, k)
         has_occurred = sampled_step.durations > 0.0
@@ -242,32 +275,36 @@ def sample_walk_steps(
         landing_foot_z = columns.pop("landing_foot_z")
         for name in trajectory_spec.slope_position_names:
             normal_name = f"{name[:-1]}z"
-            position_x, position_z = ground_lines.rotate_to_line_0(
-                k, columns[name], columns[normal_name]
+            position_x, position_z = ground.rotate_to_frame(
+                line_slopes[k], columns[name], columns[normal_name]
             )
             columns[name], columns[normal_name] = position_x + foothold_x, position_z + foothold_z
         for name in columns.keys() & HEIGHT_DEPENDENT_ENERGIES:
-            columns[name] = columns[name] + ground_lines.compute_potential_energy(
-                foothold_x, foothold_z
+            foothold_height = foothold_z * np.cos(ground.frame_slope) - foothold_x * np.sin(
+                ground.frame_slope
             )
+            columns[name] = columns[name] + wheel_weight * foothold_height
         columns["time"] = columns["time"] + step_start_time
         columns["step"] = np.full(len(columns["time"]), k)
         columns_by_step.append(columns)
         walk_outcome = sampled_step.outcome
         if walk_outcome == Outcome.STEPPED:
             # On even ground, the height of a foot that lands is a numerical error.
-            displacement_x, displacement_z = ground_lines.rotate_to_line_0(
-                k, float(landing_foot_x[-1]), float(landing_foot_z[-1]) * is_ground_uneven
+            displacement_x, displacement_z = ground.rotate_to_frame(
+                line_slopes[k],
+                float(landing_foot_x[-1]),
+                float(landing_foot_z[-1]) * ground.is_uneven,
             )
             foothold_x, foothold_z = foothold_x + displacement_x, foothold_z + displacement_z
             k += 1
             step_start_time += float(sampled_step.durations.sum())
             x = sampled_step.next_section_state
+            line_slopes.append(ground.find_line_slope(k, x))
     walk_columns = {
         name: np.concatenate([columns[name] for columns in columns_by_step])
         for name in columns_by_step[0]
     }
-    return walk_columns, k, walk_outcome
+    return walk_columns, line_slopes, k, walk_outcome
 
 
 _sample_step = eqx.filter_jit(lambda model, *arguments: model.sample_step(*arguments))
@@ -285,7 +322,7 @@ def specify_phase_trajectory(
     def sample_phase_step(x: Array, k: int) -> SampledStep:
         step_model, step_params = models_and_wheels[k]
         trajectory = _sample_step(step_model, step_params, x, options, n_samples)
-        s = jax.tree.map(float, separate_next_slope(step_params)[0]).symbols()
+        s = jax.tree.map(float, select_stance_line(step_params, x)[0]).symbols()
         phase_durations = np.asarray(trajectory.durations)
         state, energies, foot_forces = (
             np.moveaxis(np.asarray(samples), -1, 0)

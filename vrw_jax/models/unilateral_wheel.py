@@ -21,6 +21,7 @@ from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.contact_section import (
     FullState,
     compute_full_section_size,
+    compute_section_foot_distance,
     compute_section_units,
     embed_section_state,
 )
@@ -34,6 +35,7 @@ from vrw_jax.models.interface import AbstractWheel, StepGroundValues
 from vrw_jax.models.step_inputs import (
     PAPER_START_STATE,
     complete_ground_line_slopes,
+    compute_rises,
     require_stepwise_shape,
 )
 from vrw_jax.models.step_results import AdvanceResult
@@ -67,10 +69,11 @@ class UnilateralTrajectory(eqx.Module):
 
 
 class UnevenGround(NamedTuple):
-    """Uneven ground of one step: friction under earlier feet, and tilt of the next line."""
+    """Uneven ground of one step: friction under earlier feet, and the ground ahead."""
 
     friction: Scalar  # friction coefficient of the feet that landed earlier
-    tilt: Scalar  # angle by which the next line is steeper, rad
+    # angle by which the next line is steeper, rad, or two rises (`models.select_stance_line`), m
+    ground_values: tuple[Scalar, ...]
 
 
 def _convert_restitution(restitution_coefficient: Any) -> Array | None:
@@ -132,6 +135,9 @@ class AbstractContactWheel(AbstractWheel):
     def collect_section_units(self, wheel_units: WheelUnits, n_legs: int) -> list[Elementwise]:
         return compute_section_units(wheel_units, n_legs)
 
+    def compute_foot_distance(self, params: WheelParams, x: Array) -> Elementwise:
+        return compute_section_foot_distance(params.symbols(), x)
+
     def complete_section_state(self, params: WheelParams, x: Array) -> FullState:
         """Return the full section state for `x`, shape (4 + 3 n,).
 
@@ -161,7 +167,7 @@ class UnilateralWheel(AbstractContactWheel):
       friction. "paper" is the rule (A1) to (A4) of the paper, extended to cases that the rule does
       not cover;
     - `uneven`: differences between footholds on uneven ground. `vrw.walk` sets this field from the
-      slopes and friction coefficients of the steps.
+      slopes or heights and the friction coefficients of the steps.
 
     Examples:
         >>> wheel = vrw.UnilateralWheel(friction=0.7)
@@ -225,14 +231,17 @@ class UnilateralWheel(AbstractContactWheel):
         """Return whether infinite friction means the rule (A1)-(A4) of the paper."""
         return self.infinite_friction_rule == FRICTION_PAPER_RULE
 
-    def split_ground_by_step(self, params: WheelParams, n_steps: int) -> StepGroundValues | None:
+    def split_ground_by_step(
+        self, params: WheelParams, n_steps: int, heights: Array | None = None
+    ) -> StepGroundValues | None:
         """Return the ground under each step, or None on flat ground with one friction coefficient.
 
         The result is (slope in rad, friction coefficient, friction coefficient of the feet that
-        landed earlier, tilt of the next line in rad), each of shape (n_steps,).
+        landed earlier, tilt of the next line in rad), each of shape (n_steps,). If heights are
+        given, the slope is the mean slope, and the two rises in m replace the tilt.
         """
         slope, friction = params.slope, self.friction
-        if slope.ndim == friction.ndim == 0:
+        if slope.ndim == friction.ndim == 0 and heights is None:
             return None
         is_flat_ground = slope.ndim == 0
         line_slopes = (
@@ -244,15 +253,17 @@ class UnilateralWheel(AbstractContactWheel):
             require_stepwise_shape(FRICTION_NAME, friction, n_steps)
         friction = jnp.broadcast_to(friction[:n_steps] if friction.ndim else friction, n_steps)
         previous_friction = jnp.append(friction[:1], friction[:-1])
+        if heights is not None:
+            rises = compute_rises(heights, n_steps)
+            return line_slopes[:-1], friction, previous_friction, rises[:-1], rises[1:]
         return line_slopes[:-1], friction, previous_friction, line_slopes[1:] - line_slopes[:-1]
 
     def with_step_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["UnilateralWheel", WheelParams]:
-        slope, friction, previous_friction, tilt = step_ground
-        model = dataclasses.replace(
-            self, friction=friction, uneven=UnevenGround(previous_friction, tilt)
-        )
+        slope, friction, previous_friction, *ground = step_ground
+        uneven = UnevenGround(previous_friction, tuple(ground))
+        model = dataclasses.replace(self, friction=friction, uneven=uneven)
         return model, eqx.tree_at(lambda wheel: wheel.slope, params, slope)
 
     def advance(self, params: WheelParams, x: FullState, options: StepOptions) -> AdvanceResult:

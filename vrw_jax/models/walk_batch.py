@@ -117,6 +117,33 @@ def complete_slopes_over_steps(known_slopes_by_step: np.ndarray, n_steps: int) -
     )
 
 
+def make_height_terms(
+    input_indices: tuple[int, int], n_given: int, n_steps: int
+) -> StepwiseParameter:
+    """Return the terms by which heights of footholds enter the two rises of each gait step.
+
+    - `n_given`: number of given heights, n_steps + 1 or n_steps + 2.
+    """
+    first_foothold = n_steps + 1 - n_given
+    rise_terms = ((0, 0, 1.0), (0, -1, -1.0), (1, 1, 1.0), (1, 0, -1.0))
+    return StepwiseParameter(
+        input_indices,
+        n_given,
+        lambda k: tuple(
+            (input_position, k + offset - first_foothold, derivative)
+            for input_position, offset, derivative in rise_terms
+            if k + offset >= first_foothold
+        ),
+    )
+
+
+def compute_rises_over_steps(heights: np.ndarray, n_steps: int) -> np.ndarray:
+    """Return the height of each foothold minus that of the foothold before, shape (n_steps + 1,
+    lanes), m; see `models.compute_rises`.
+    """
+    return np.diff(heights.T, axis=0, prepend=0.0)[-(n_steps + 1) :]
+
+
 LANE_ARRAY_NAMES = ("section_state", "durations", "outcome", "n_stepped", "solver_steps")
 """Names of the arrays that a `WalkBatch` has in common with its `StepBatchResult`."""
 

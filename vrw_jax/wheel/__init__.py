@@ -2,6 +2,7 @@
 
 from vrw_jax.wheel.foot_contact import ContactMode
 from vrw_jax.wheel.geometry import Motion, compute_landing_foot_height, compute_rear_foot_height
+from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
     FRICTION_NAME,

@@ -493,20 +493,20 @@ def stack_parameters(params: WheelParams) -> Array:
 
 
 def make_wheel_from_parameters(
-    parameter_values: Array | tuple[Array, ...], n_legs: int, next_slope: Elementwise | None = None
+    parameter_values: Array | tuple[Array, ...], n_legs: int, *ground: Elementwise
 ) -> WheelParams:
     """Return a wheel from its floating-point parameters in the order of `PARAMETER_NAMES`.
 
-    - `next_slope`: slope of the next line of uneven ground, rad. If it is given, the parameter
-      `slope` has both slopes on a leading axis.
+    - `ground`: values that describe uneven ground in addition to the slope. The parameter `slope`
+      then has all of them on a leading axis, see `models.step_inputs.select_stance_line`.
     """
     wheel_params = WheelParams(
         **dict(zip(PARAMETER_NAMES, parameter_values, strict=True)), n_legs=n_legs
     )
-    if next_slope is None:
+    if not ground:
         return wheel_params
     return eqx.tree_at(
         lambda wheel_params: wheel_params.slope,
         wheel_params,
-        jnp.stack([wheel_params.slope, next_slope]),
+        jnp.stack([wheel_params.slope, *ground]),
     )

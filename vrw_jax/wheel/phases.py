@@ -100,9 +100,9 @@ class AbstractPhase(abc.ABC):
     s: Symbols
     phase_constants: Vector  # constants of the phase: in double support the distance of the feet, m
     stop_at_lift_off: bool  # whether the phase ends when the ground would pull
-    tilt_sine_cosine: Vector = ()
-    """Sine and cosine of the angle by which the next line of the ground is steeper; empty on flat
-    ground.
+    ground_ahead: Vector = ()
+    """Sine and cosine of the tilt of `GroundAhead` and, if heights are given, its rise; empty on
+    flat ground.
     """
 
     phase_name: ClassVar[str]
@@ -190,18 +190,20 @@ class AbstractPhase(abc.ABC):
         return motion
 
     def compute_landing_height(self, motion: Motion) -> Elementwise:
-        """Return the height of the next foot above the line of the ground on which it lands, m.
+        """Return the height of the next foot above the place where it lands, m.
 
-        The line begins at the foot of Leg 1. In the frame of this line, the height has the same
-        form as on flat ground.
+        In the frame of the reference line (see `GroundAhead`), the height has the same form as on
+        flat ground.
         """
-        if self.tilt_sine_cosine:
-            tilt_sin, tilt_cos = self.tilt_sine_cosine
+        rise: Vector = ()
+        if self.ground_ahead:
+            (tilt_sin, tilt_cos), rise = self.ground_ahead[:2], self.ground_ahead[2:]
             motion = motion._replace(
                 sin_theta=motion.sin_theta * tilt_cos - motion.cos_theta * tilt_sin,
                 cos_theta=motion.cos_theta * tilt_cos + motion.sin_theta * tilt_sin,
             )
-        return compute_landing_foot_height(self.s, motion)
+        height = compute_landing_foot_height(self.s, motion)
+        return height - rise[0] if rise else height
 
     @property
     def coordinate_units(self) -> Vector:
@@ -533,14 +535,14 @@ PAPER_PHASES: tuple[type[AbstractPhase], ...] = (DoubleSupport, SingleSupport1, 
 
 
 def make_paper_phases(
-    s: Symbols, foot_distance: Elementwise, stop_at_lift_off: bool, tilt_sine_cosine: Vector = ()
+    s: Symbols, foot_distance: Elementwise, stop_at_lift_off: bool, ground_ahead: Vector = ()
 ) -> tuple[AbstractPhase, ...]:
     """Return the three phases of a step that begins with feet `foot_distance` m apart.
 
-    - `tilt_sine_cosine`: see `AbstractPhase.tilt_sine_cosine`.
+    - `ground_ahead`: see `AbstractPhase.ground_ahead`.
     """
     phase_constants = ((foot_distance,), (), ())
     return tuple(
-        phase(s, constants_of_phase, stop_at_lift_off, tilt_sine_cosine)
+        phase(s, constants_of_phase, stop_at_lift_off, ground_ahead)
         for phase, constants_of_phase in zip(PAPER_PHASES, phase_constants, strict=True)
     )
