@@ -88,20 +88,78 @@ def test_the_derivative_of_a_long_life_is_a_central_difference():
     assert abs(gradient / difference - 1.0) < 1e-6
 
 
-@pytest.mark.parametrize("degrees", mark_slow(1.25, 2.0, 3.0))
-def test_samples_agree_with_quadrature_within_their_error(degrees):
+def count_rigid_steps(ground_sd, has_heights, n_walks=20_000):
+    """Return mean steps of walks from the gait, and their standard error, by energy conservation.
+
+    On random heights, the wheel comes from the mean line and lands on a random foothold.
+    """
+    half, mean, random = np.pi / 8, 8.0 * DEGREE, np.random.default_rng(3)
+    distance, is_walking = 2.0 * np.sin(half), np.ones(n_walks, bool)
+    height, lives = np.zeros(n_walks), np.zeros(n_walks)
+
+    def draw_line(height):
+        z = ground_sd * random.standard_normal(n_walks)
+        if not has_heights:
+            return mean + z, height
+        return mean - np.arcsin(np.clip((z - height) / distance, -1.0, 1.0)), z
+
+    # Half of the squared rate remains in a landing.
+    rate_before_landing = 4.0 * (np.cos(half - mean) - np.cos(half + mean))
+    slope, height = draw_line(height) if has_heights else (mean, height)
+    while np.any(is_walking):
+        rate = 0.5 * rate_before_landing - 2.0 * (1.0 - np.cos(half - slope))  # at the vertical
+        is_walking &= (np.abs(slope) < np.pi / 2) & ((rate > 0.0) | (slope > half))
+        lives += is_walking
+        slope, height = draw_line(height)
+        rate_before_landing = rate + 2.0 * (1.0 - np.cos(half + slope))
+    return lives.mean(), lives.std() / np.sqrt(n_walks)
+
+
+@pytest.mark.parametrize("choices", [{"slope_sd": 2.0}, {"slope_sd": 0.2}, {"height_sd": 0.05}])
+def test_means_on_very_uneven_ground_and_on_heights_are_those_of_counted_walks(choices):
+    ((name, ground_sd),) = choices.items()
+    passage = vrw.first_passage(BYL, **choices, model=RIGID)
+    counted, standard_error = count_rigid_steps(ground_sd, name == "height_sd")
+    # 99.9 % of normal numbers are within 3.3 standard deviations.
+    assert abs(float(passage.mean_steps_from_gait) - counted) < 3.3 * standard_error
+    assert "within the tolerance" in passage.ending
+
+
+def test_derivatives_on_random_heights_are_central_differences():
+    """Of the distance and of the steps from the gait, with one number of nodes."""
+
+    def solve(slope, height_sd):
+        params = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=1.0, slope=slope)
+        passage = vrw.first_passage(params, height_sd=height_sd, model=RIGID, tol=1.0)
+        return jax.numpy.stack([passage.mean_distance, passage.mean_steps_from_gait])
+
+    point, h = np.array([8.0 * DEGREE, 0.04]), 1e-5
+    jacobian = jax.jacfwd(lambda point: solve(*point))(point)
+    for i, by in enumerate(jacobian.T):
+        ends = [solve(*(point + sign * h * np.eye(2)[i])) for sign in (1, -1)]
+        # The limits of the nodes move in differences only, which changes their errors of 1e-6.
+        np.testing.assert_allclose(by, (ends[0] - ends[1]) / (2.0 * h), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("sd_name", "ground_sd"),
+    mark_slow(*(("slope_sd", d * DEGREE) for d in (1.25, 2.0, 3.0)), ("height_sd", 0.03)),
+)
+def test_samples_agree_with_quadrature_within_their_error(sd_name, ground_sd):
     gait = vrw.limit_cycle(BYL, model=RIGID)
-    start, slope_sd = np.asarray(gait.section_state), degrees * DEGREE
+    start = np.asarray(gait.section_state)
     random, options = np.random.default_rng(0), vrw.StepOptions()
-    groups = WalkerGroups(BYL, start, slope_sd, RIGID, options, 4096, random)
+    groups = WalkerGroups(BYL, start, ground_sd, RIGID, options, 4096, random, sd_name=sd_name)
     sample = sample_passage(groups, float(gait.spectral_radius), 0.03, 1_000_000)
-    exact = vrw.first_passage(BYL, slope_sd, model=RIGID)
+    exact = vrw.first_passage(BYL, **{sd_name: ground_sd}, model=RIGID)
     assert sample.relative_error < 0.05
     mean = 1.0 / sample.failure_probability
     assert abs(mean / float(exact.mean_steps) - 1.0) < sample.relative_error
     from_gait = sample.mean_steps_from_gait / float(exact.mean_steps_from_gait)
     assert abs(from_gait - 1.0) < 1.5 * sample.relative_error
     assert abs(sample.kappa_2 - float(exact.kappa_2)) < 0.01
+    distance = float(exact.mean_distance / exact.mean_steps)
+    assert abs(sample.mean_step_distance - distance) < sample.step_distance_error
     assert tuple(sample.fraction_by_outcome) == ("FELL_BACK",)
 
 
@@ -133,6 +191,21 @@ def test_every_failed_status_names_an_argument_to_change():
     for status in PassageStatus:
         names = ("tol", "max_steps", "n_nodes", "n_walkers")
         assert status == PassageStatus.CONVERGED or any(name in status.meaning for name in names)
+
+
+@pytest.mark.parametrize(
+    ("damping", "counted", "error"), [(200.0, 5.9, 0.13), *mark_slow((150.0, 67.1, 1.6))]
+)
+def test_the_papers_wheel_lasts_on_heights_as_long_as_walks_on_such_slopes(damping, counted, error):
+    """Counts of slopes between random heights, by an independent simulator."""
+    passage = vrw.first_passage(vrw.WheelParams(damping=damping), height_sd=0.01)
+    relative_error = 1.5 * float(passage.error / passage.mean_steps)
+    difference = float(passage.mean_steps_from_gait) - counted
+    assert abs(difference) < relative_error * counted + 2.58 * error
+    assert passage.ending == "The error estimate is within the tolerance."
+    step_distance = float(passage.mean_distance / passage.mean_steps)
+    assert step_distance == pytest.approx(0.711, abs=0.001)  # as on even ground, to second order
+    assert 0.0 < float(passage.distance_error) < 0.025 * float(passage.mean_distance)
 
 
 def count_failure_share(params, slope_sd, n_walkers, n_steps, model=None):
@@ -356,6 +429,9 @@ def test_no_failure_is_an_ending_and_not_an_error():
     ("changes", "choices", "sentence"),
     [
         ({}, {"slope_sd": 0.0}, "slope_sd is 0, but it must be positive"),
+        ({}, {"height_sd": 0.01}, "slope_sd is 0.01 and height_sd is 0.01"),
+        ({}, {"slope_sd": None}, "slope_sd is None and height_sd is None"),
+        ({}, {"slope_sd": None, "height_sd": -1.0}, "height_sd is -1, but it must be positive"),
         ({}, {"slope_sd": 5.0, "n_walkers": 64}, "with which hardly any step"),
         ({"damping": 300.0}, {}, "this wheel has no gait"),
         ({}, {"model": vrw.RigidWheel()}, "stop_at_lift_off=False"),

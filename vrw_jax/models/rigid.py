@@ -411,11 +411,40 @@ class VerticalRateMap(NamedTuple):
             cosine_coefficient**2 + sine_coefficient**2
         )
 
+    def compute_flattest_slope(self, x: Elementwise) -> Elementwise:
+        """Return the slope below which the wheel falls back, rad."""
+        slope_cosine = -self.compute_slope_independent_squared_rate(x) / self.squared_rate_amplitude
+        # At the limits, the derivative of the arccosine is finite.
+        slope_cosine = jnp.clip(slope_cosine, -1.0 + 1e-15, 1.0 - 1e-15)
+        return self.slope_of_largest_squared_rate - jnp.arccos(slope_cosine)
+
     def compute_slope_independent_squared_rate(self, x: Elementwise) -> Elementwise:
         """Return the part of x' that does not depend on the slope, 1/s^2."""
         return self.retained_squared_rate_fraction * x - self.doubled_gravity_stiffness * (
             1.0 - self.retained_squared_rate_fraction
         )
+
+    def compute_next_squared_rate(self, x: Elementwise, slope: Elementwise) -> Elementwise:
+        """Return x', 1/s^2, for the slope of the next line, rad."""
+        return self.compute_slope_independent_squared_rate(
+            x
+        ) + self.squared_rate_amplitude * jnp.cos(slope - self.slope_of_largest_squared_rate)
+
+    def compute_rate_after_landing(self, x: Elementwise, slope: Elementwise) -> Elementwise:
+        """Return the squared rate after the landing on a line with this slope (rad), 1/s^2."""
+        drop = self.doubled_gravity_stiffness * (1.0 - jnp.cos(self.half_angle + slope))
+        return self.retained_squared_rate_fraction * (x + drop)
+
+    def compute_climb(self, slope: Elementwise) -> Elementwise:
+        """Return the squared rate that a wheel loses between the landing on a line with this slope
+        (rad) and the vertical, 1/s^2.
+        """
+        return self.doubled_gravity_stiffness * (1.0 - jnp.cos(self.half_angle - slope))
+
+    def find_flattest_landing_slope(self, rate_after_landing: Elementwise) -> Elementwise:
+        """Return the slope below which a wheel with this squared rate falls back, rad."""
+        climb_cosine = 1.0 - rate_after_landing / self.doubled_gravity_stiffness
+        return self.half_angle - jnp.arccos(jnp.maximum(climb_cosine, -1.0 + 1e-15))
 
     def compute_fixed_point(self, slope: Elementwise) -> Elementwise:
         """Return the squared angular rate that repeats after a step on even ground, in 1/s^2.

@@ -35,13 +35,23 @@ from vrw_jax.models.stepping import (
     require_single_wheel,
 )
 from vrw_jax.studies.passage_gradient import differentiate_log_mean_steps
-from vrw_jax.studies.rigid_passage import solve_rigid_passage
+from vrw_jax.studies.rigid_passage import (
+    RigidPassage,
+    solve_passage_by_interpolation,
+    solve_passage_on_slopes,
+)
 from vrw_jax.studies.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
-MAX_QUADRATURE_NODES = 3200
-"""Largest number n of quadrature nodes, chosen because an n by n matrix then takes 80 MB."""
+MAX_QUADRATURE_NODES = 1600
+"""Largest number of quadrature nodes to which the number is doubled.
+
+The value is chosen because quadrature then takes seconds.
+"""
+
+SD_UNITS = {"slope_sd": "rad", "height_sd": "m"}
+"""Units of the standard deviations of the ground, by the name of the argument."""
 
 SAMPLED_STEP_TOLERANCE = 1e-5
 """Relative and absolute tolerance of sampled gait steps without unilateral contact.
@@ -87,7 +97,11 @@ class FirstPassage(AbstractPrintable):
 
     - `mean_steps`: mean for starts from the quasi-stationary distribution, 1/(1 - kappa_1);
     - `mean_steps_from_gait`: mean for a start on the gait, before a landing on a line of the mean
-      slope. If walks are sampled, its relative error is at most 1.5 times that of `mean_steps`;
+      slope, or on a foothold of random height after a foothold on the mean line. If walks are
+      sampled, its relative error is at most 1.5 times that of `mean_steps`;
+    - `mean_distance`: distance of `mean_steps` steps along the mean slope, m. It is `mean_steps`
+      times the mean distance of completed steps from the quasi-stationary distribution;
+    - `distance_error`: error estimate of `mean_distance`, m;
     - `failure_probability`: probability 1 - kappa_1 that a step from the quasi-stationary
       distribution fails;
     - `kappa_2`: second eigenvalue, the factor per step by which the effect of the start decays. If
@@ -97,8 +111,9 @@ class FirstPassage(AbstractPrintable):
       confidence interval, plus the effect of the start. It is infinite if the sampled walks miss
       failures, if a few walks dominate the mean, or if `kappa_2` is NaN;
     - `states`: states of the quasi-stationary distribution. For quadrature, they are squared
-      angular rates at the instant at which the stance leg is vertical, 1/s^2, shape (n, 1). For
-      sampled walks, they are section states with the slope as last component;
+      angular rates at the instant at which the stance leg is vertical, 1/s^2, shape (n, 1), and
+      with random heights the height of the foothold, m. For sampled walks, they are section states
+      with the slope, or the heights of the last two footholds, as last components;
     - `weights`: weights of the states, with the sum 1;
     - `status`: a `PassageStatus`;
     - `end_names`, `end_fractions`: names of the outcomes that end walks, and the fraction of walks
@@ -115,6 +130,8 @@ class FirstPassage(AbstractPrintable):
 
     mean_steps: Scalar
     mean_steps_from_gait: Scalar
+    mean_distance: Scalar
+    distance_error: Scalar
     failure_probability: Scalar
     kappa_2: Scalar
     error: Scalar
@@ -148,6 +165,10 @@ class FirstPassage(AbstractPrintable):
         return [
             ("mean steps", f"{float(self.mean_steps):,.6g} (error {float(self.error):.2g})"),
             ("from the gait", f"{float(self.mean_steps_from_gait):,.6g}"),
+            (
+                "mean distance",
+                f"{float(self.mean_distance):,.6g} m (error {float(self.distance_error):.2g} m)",
+            ),
             ("failure probability of a step", f"{float(self.failure_probability):.6g}"),
             ("ends", ", ".join(end_texts) or "none"),
             ("sampled steps", f"{self.n_steps:,}" if self.n_steps else "none: quadrature"),
@@ -159,8 +180,9 @@ class FirstPassage(AbstractPrintable):
 @with_default_jax_settings
 def first_passage(
     params: WheelParams,
-    slope_sd: float | Scalar,
+    slope_sd: float | Scalar | None = None,
     *,
+    height_sd: float | Scalar | None = None,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
     seed: int = 0,
@@ -169,18 +191,19 @@ def first_passage(
     tol: float | None = None,
     max_steps: int = 5_000_000,
 ) -> FirstPassage:
-    """Return the mean number of gait steps until failure on random slopes (Byl and Tedrake 2009).
+    """Return the mean number of gait steps until failure on random ground (Byl and Tedrake 2009).
 
-    The slopes of the lines that join the footholds are independent and normal, with mean
-    `params.slope`. A walk ends at the first step whose outcome is not STEPPED. A landing on a slope
-    outside the domain of slopes also ends the walk. In the paper's model, a failure is a departure
-    from the sequence of phases, and need not be a fall. Walks of a `UnilateralWheel` continue after
-    such a departure.
+    Either the slopes of the lines that join the footholds are independent and normal, with mean
+    `params.slope`. Or the heights of the footholds above a line of this slope are independent and
+    normal, with mean 0, as in `walk`. A walk ends at the first step whose outcome is not STEPPED. A
+    landing on a slope outside the domain of slopes also ends the walk. In the paper's model, a
+    failure is a departure from the sequence of phases, and need not be a fall. Walks of a
+    `UnilateralWheel` continue after such a departure.
 
-    For the rigid wheel, the kernel of its one-dimensional map has a closed form. Quadrature then
-    computes the mean, even if walks take billions of steps. The model must be
-    `RigidWheel(stop_at_lift_off=False)`, and `mean_steps` has first derivatives with respect to
-    `params` and `slope_sd`.
+    For the rigid wheel, the map of a step has a closed form. Quadrature then computes the mean,
+    even if walks take billions of steps. The model must be `RigidWheel(stop_at_lift_off=False)`,
+    and `mean_steps` and `mean_distance` have first derivatives with respect to `params`, `slope_sd`
+    and `height_sd`.
 
     For other models, walks are sampled. Importance sampling makes failures frequent, so that the
     number of sampled steps does not grow with the mean. The error is then half the width of a 99 %
@@ -195,24 +218,25 @@ def first_passage(
     Args:
         params: parameters of the wheel; the slope is the mean slope.
         slope_sd: standard deviation of the slopes, rad.
+        height_sd: standard deviation of the heights, m, instead of `slope_sd`.
         model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
         options: numerical options of sampled gait steps; by default rtol and atol are 1e-5, or with
             unilateral contact those of `StepOptions()`.
-        seed: seed of the random slopes.
+        seed: seed of the random slopes or heights.
         n_nodes: initial number of quadrature nodes, doubled until the relative error is at most
             `tol`.
         n_walkers: number of walks that are simulated at the same time, rounded up to 32 times a
             power of two.
-        tol: relative error of `mean_steps`; by default 1e-8 for quadrature and 0.02 for sampled
-            walks.
+        tol: relative error of `mean_steps`; by default 1e-8 for quadrature on slopes, 1e-6 for
+            quadrature on heights, and 0.02 for sampled walks.
         max_steps: number of sampled gait steps after which no further walks begin.
 
     Returns:
         A `FirstPassage`: the mean number of steps, its error, and the outcomes that end walks.
 
     Raises:
-        TypeError, ValueError: if an argument is invalid, if the wheel has no gait, or if the slopes
-            are so uneven that no step succeeds.
+        TypeError, ValueError: if an argument is invalid, if the wheel has no gait, or if the ground
+            is so uneven that no step succeeds.
 
     Examples:
         >>> passage = vrw.first_passage(vrw.WheelParams(), 0.02, tol=0.1)
@@ -220,15 +244,22 @@ def first_passage(
         ('TOUCHDOWN_BEFORE_STOPPER',)
     """
     require_single_wheel(params, "take one after the other")
-    if not has_traced_leaf(slope_sd):
-        slope_sd = check_positive("slope_sd", slope_sd)
+    if (slope_sd is None) == (height_sd is None):
+        raise ValueError(
+            f"slope_sd is {slope_sd} and height_sd is {height_sd}, but the ground has one standard "
+            "deviation: give slope_sd in rad or height_sd in m."
+        )
+    sd_name = "slope_sd" if height_sd is None else "height_sd"
+    ground_sd: Any = slope_sd if height_sd is None else height_sd
+    if not has_traced_leaf(ground_sd):
+        ground_sd = check_positive(sd_name, ground_sd)
     seed, n_nodes = check_int("seed", seed, 0), check_int("n_nodes", n_nodes, 8)
     n_walkers, max_steps = check_int("n_walkers", n_walkers), check_int("max_steps", max_steps)
     tol = None if tol is None else check_positive("tol", tol)
     resolved_model: Any = convert_model_argument(resolve_model(params, model))
     if resolved_model.capabilities.passage_method == PassageMethod.QUADRATURE:
         return _solve_passage_by_quadrature(
-            params, jnp.asarray(slope_sd), resolved_model, n_nodes, tol or 1e-8
+            params, jnp.asarray(ground_sd), resolved_model, n_nodes, tol, sd_name
         )
     require_untraced_arguments(
         "vrw.first_passage", "differentiate by the wheel only", resolved_model
@@ -241,6 +272,7 @@ def first_passage(
         )
     estimate_passage = functools.partial(
         _estimate_passage_by_sampling,
+        sd_name=sd_name,
         model=resolved_model,
         options=convert_step_options(options),
         seed=seed,
@@ -248,71 +280,97 @@ def first_passage(
         relative_tolerance=tol or 0.02,
         max_steps=max_steps,
     )
-    if not has_traced_leaf(params, slope_sd):
-        return estimate_passage(params, float(slope_sd))[0]
-    return _estimate_differentiable_passage(estimate_passage, params, slope_sd)
+    if not has_traced_leaf(params, ground_sd):
+        return estimate_passage(params, float(ground_sd))[0]
+    return _estimate_differentiable_passage(estimate_passage, params, ground_sd)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _estimate_differentiable_passage(
     estimate_passage: Callable[..., tuple[FirstPassage, dict[str, float]]],
     params: WheelParams,
-    slope_sd: Any,
+    ground_sd: Any,
 ) -> FirstPassage:
     """Return the `FirstPassage` that sampled walks estimate, with means that JAX can differentiate.
 
     Raise TypeError if the parameters of the wheel are abstract, as inside `jit` and `vmap`.
     """
-    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
-    return estimate_passage(params, float(slope_sd))[0]
+    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, ground_sd)
+    return estimate_passage(params, float(ground_sd))[0]
 
 
 @functools.partial(_estimate_differentiable_passage.defjvp, symbolic_zeros=True)
 def _differentiate_passage(
-    estimate_passage: Callable[..., tuple[FirstPassage, dict[str, float]]],
+    estimate_passage: functools.partial,
     primals: tuple[WheelParams, Any],
     tangents: tuple[WheelParams, Any],
 ) -> tuple[FirstPassage, FirstPassage]:
     """Return the `FirstPassage` that sampled walks estimate, and its tangent."""
-    params, slope_sd = primals
-    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, slope_sd)
-    params_tangent, slope_sd_tangent = tangents
+    params, ground_sd = primals
+    model, sd_name = (estimate_passage.keywords[name] for name in ("model", "sd_name"))
+    require_untraced_arguments("vrw.first_passage", SAMPLED_TRACING_REMEDY, params, ground_sd)
+    params_tangent, ground_sd_tangent = tangents
     tangent_by_name = {name: getattr(params_tangent, name) for name in PARAMETER_NAMES}
     tangent_by_name = {
         name: tangent
-        for name, tangent in (tangent_by_name | {"slope_sd": slope_sd_tangent}).items()
+        for name, tangent in (tangent_by_name | {sd_name: ground_sd_tangent}).items()
         if not isinstance(tangent, SymbolicZero)
     }
     sampled_passage, derivative_by_name = estimate_passage(
-        params, float(slope_sd), differentiated_parameter_names=tuple(tangent_by_name)
+        params, float(ground_sd), differentiated_parameter_names=tuple(tangent_by_name)
     )
     log_mean_steps_tangent = sum(
         derivative_by_name[name] * tangent for name, tangent in tangent_by_name.items()
     )
+    # The mean distance of a step changes as that of a step of the gait.
+    gait_distance, gait_distance_tangent = jax.jvp(
+        lambda wheel: model.compute_foot_distance(
+            wheel, limit_cycle(wheel, model=model).section_state
+        ),
+        (params,),
+        (
+            jax.tree.map(
+                lambda x, tangent: (
+                    jnp.zeros_like(x) if isinstance(tangent, SymbolicZero) else tangent
+                ),
+                params,
+                params_tangent,
+            ),
+        ),
+    )
     passage_tangent = eqx.tree_at(
-        lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability),
+        lambda p: (p.mean_steps, p.mean_steps_from_gait, p.failure_probability, p.mean_distance),
         make_zero_tangent(sampled_passage),
         (
             sampled_passage.mean_steps * log_mean_steps_tangent,
             sampled_passage.mean_steps_from_gait * log_mean_steps_tangent,
             -sampled_passage.failure_probability * log_mean_steps_tangent,
+            sampled_passage.mean_distance
+            * (log_mean_steps_tangent + gait_distance_tangent / gait_distance),
         ),
     )
     return sampled_passage, passage_tangent
 
 
 def _solve_passage_by_quadrature(
-    params: WheelParams, slope_sd: Array, model: Any, n_nodes: int, relative_tolerance: float
+    params: WheelParams,
+    ground_sd: Array,
+    model: Any,
+    n_nodes: int,
+    relative_tolerance: float | None,
+    sd_name: str,
 ) -> FirstPassage:
     """Return the `FirstPassage` of the rigid wheel, computed by quadrature.
 
-    The number of nodes is doubled until the error is within `relative_tolerance`. For traced
-    arguments, the number is not doubled. Raise ValueError if the model stops at lift-off or the
-    wheel has no gait.
+    The number of nodes is doubled until the error is within `relative_tolerance`, by default 1e-8
+    on slopes and 1e-6 on heights. For traced arguments, the number is not doubled. Raise ValueError
+    if the model stops at lift-off or the wheel has no gait.
+
+    - `sd_name`: "slope_sd" or "height_sd", the name of `ground_sd`.
     """
     if model.stop_at_lift_off:
         raise ValueError(
-            "RigidWheel has stop_at_lift_off=True, but the kernel in closed form has no lift-off: "
+            "RigidWheel has stop_at_lift_off=True, but the map in closed form has no lift-off: "
             "give vrw.RigidWheel(stop_at_lift_off=False)."
         )
     if (
@@ -323,32 +381,51 @@ def _solve_passage_by_quadrature(
             f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "
             "steeper one."
         )
-    survival_analysis, *_ = solve_rigid_passage(params, slope_sd, model, n_nodes // 2)
+    has_heights, is_traced = sd_name == "height_sd", has_traced_leaf(params, ground_sd)
+    relative_tolerance = relative_tolerance or (1e-6 if has_heights else 1e-8)
+    solve_by_interpolation = functools.partial(
+        solve_passage_by_interpolation, params, ground_sd, model, has_heights=has_heights
+    )
+    solve_passage: Callable[..., RigidPassage] = solve_by_interpolation
+    if not has_heights:
+        solve_passage = functools.partial(solve_passage_on_slopes, params, ground_sd, model)
+    previous_error: Any = np.inf
+    coarse_passage = solve_passage(n_nodes=n_nodes // 2)
+    if not is_traced and (
+        coarse_passage.omitted_probability
+        > 0.5 * relative_tolerance * coarse_passage.survival_analysis.failure_probability
+    ):
+        solve_passage = solve_by_interpolation
+        coarse_passage = solve_passage(n_nodes=n_nodes // 2)
     while True:
-        coarse_mean_steps = 1.0 / survival_analysis.failure_probability
-        survival_analysis, mean_steps_from_gait, squared_rate_nodes = solve_rigid_passage(
-            params, slope_sd, model, n_nodes
+        passage = solve_passage(n_nodes=n_nodes)
+        mean_steps, mean_distance = passage.compute_means()
+        coarse_mean_steps, coarse_mean_distance = coarse_passage.compute_means()
+        omission_error = mean_steps * passage.omitted_probability
+        error = mean_steps * omission_error + jnp.abs(mean_steps - coarse_mean_steps)
+        distance_error = mean_distance * omission_error + jnp.abs(
+            mean_distance - coarse_mean_distance
         )
-        mean_steps = 1.0 / survival_analysis.failure_probability
-        error = lax.stop_gradient(jnp.abs(mean_steps - coarse_mean_steps))
-        is_within_tolerance = error <= relative_tolerance * mean_steps
-        if (
-            has_traced_leaf(params, slope_sd)
-            or bool(is_within_tolerance)
-            or n_nodes >= MAX_QUADRATURE_NODES
-        ):
+        # Round-off may exceed the failure probability of an extremely long life.
+        is_within_tolerance = (error <= relative_tolerance * mean_steps) & (mean_steps > 0.0)
+        if is_traced or bool(is_within_tolerance) or 2 * n_nodes > MAX_QUADRATURE_NODES:
             break
-        n_nodes *= 2
+        if not error < 0.5 * previous_error:  # More nodes cannot reduce round-off.
+            break
+        n_nodes, coarse_passage, previous_error = 2 * n_nodes, passage, error
     status = jnp.where(
         is_within_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET
     )
+    survival_analysis = passage.survival_analysis
     return FirstPassage(
         mean_steps=mean_steps,
-        mean_steps_from_gait=mean_steps_from_gait,
+        mean_steps_from_gait=passage.mean_steps_from_gait,
+        mean_distance=mean_distance,
+        distance_error=lax.stop_gradient(distance_error),
         failure_probability=survival_analysis.failure_probability,
         kappa_2=survival_analysis.kappa_2,
-        error=error,
-        states=squared_rate_nodes[:, None],
+        error=lax.stop_gradient(error),
+        states=passage.states,
         weights=survival_analysis.quasi_stationary_weights,
         status=status.astype(jnp.int32),
         end_fractions=jnp.ones(1, mean_steps.dtype),
@@ -358,7 +435,8 @@ def _solve_passage_by_quadrature(
 
 def _estimate_passage_by_sampling(
     params: WheelParams,
-    slope_sd: float,
+    ground_sd: float,
+    sd_name: str,
     model: Any,
     options: StepOptions,
     *,
@@ -384,11 +462,12 @@ def _estimate_passage_by_sampling(
     walker_groups = WalkerGroups(
         params,
         np.asarray(limit_cycle_result.section_state),
-        slope_sd,
+        ground_sd,
         model,
         options,
         n_walkers,
         np.random.default_rng(seed),
+        sd_name=sd_name,
     )
     try:
         sampled_passage = sample_passage(
@@ -396,8 +475,8 @@ def _estimate_passage_by_sampling(
         )
     except ExtinctGroupError as error:
         raise ValueError(
-            f"slope_sd is {slope_sd:g} rad, with which hardly any step of this wheel succeeds: "
-            "give a smaller one."
+            f"{sd_name} is {ground_sd:g} {SD_UNITS[sd_name]}, with which hardly any step of this "
+            "wheel succeeds: give a smaller one."
         ) from error
     derivative_by_name = {}
     if differentiated_parameter_names:
@@ -420,6 +499,12 @@ def _estimate_passage_by_sampling(
     passage_numbers = {
         "mean_steps": mean_steps,
         "mean_steps_from_gait": sampled_passage.mean_steps_from_gait,
+        "mean_distance": mean_steps * sampled_passage.mean_step_distance,
+        "distance_error": mean_steps
+        * (
+            sampled_passage.relative_error * sampled_passage.mean_step_distance
+            + sampled_passage.step_distance_error
+        ),
         "failure_probability": failure_probability,
         "kappa_2": sampled_passage.kappa_2,
         "error": mean_steps * sampled_passage.relative_error,

@@ -25,7 +25,7 @@ class FailingWalks(NamedTuple):
     """Walks that start from the quasi-stationary distribution and fail in their last step."""
 
     section_states: np.ndarray  # at the starts, (walks, components)
-    start_slopes: np.ndarray  # of the lines at the starts, (walks,), rad
+    start_ground: np.ndarray  # slope or heights at the starts, as in `WalkerGroups`
     slope_deviation_directions: np.ndarray  # unit vectors of slope deviations, (walks, lines)
     slope_deviation_norms: np.ndarray  # norms of the slope deviations, (walks,)
 
@@ -38,7 +38,7 @@ class FailingWalks(NamedTuple):
         walk_results = walker_groups.run_walks_with_changes(
             params,
             self.section_states,
-            self.start_slopes,
+            self.start_ground,
             norms[:, None] * self.slope_deviation_directions,
         )
         return walk_results.outcome != Outcome.STEPPED
@@ -84,15 +84,16 @@ def differentiate_log_mean_steps(
 ) -> dict[str, float]:
     """Return the derivatives of the logarithm of the mean number of gait steps, by parameter name.
 
-    The name "slope_sd" means the standard deviation of the slopes. A derivative is NaN if a wheel
-    with a slightly changed parameter has no gait. The result neglects the influence of failures on
-    the quasi-stationary distribution. The neglected terms have the relative size 1/`mean_steps`.
+    The name `walker_groups.sd_name` means the standard deviation of the ground. A derivative is NaN
+    if a wheel with a slightly changed parameter has no gait. The result neglects the influence of
+    failures on the quasi-stationary distribution. The neglected terms have the relative size
+    1/`mean_steps`.
 
     - `walk_density`: density from which the slope deviations of walks are drawn.
     """
     from scipy import stats  # This import is slow.
 
-    params, slope_sd = walker_groups.params, walker_groups.slope_sd
+    params, ground_sd = walker_groups.params, walker_groups.ground_sd
     failing_walks = _draw_failing_walks(walker_groups, walk_density)
     zero_radii = np.zeros_like(failing_walks.slope_deviation_norms)
     survives_on_mean_slopes = ~failing_walks.test_failures(walker_groups, params, zero_radii)
@@ -113,8 +114,8 @@ def differentiate_log_mean_steps(
         """Return the derivatives of all failure radii with respect to one parameter, shape
         (walks,).
         """
-        if parameter_name == "slope_sd":
-            return -failure_radii / slope_sd
+        if parameter_name == walker_groups.sd_name:
+            return -failure_radii / ground_sd
         parameter_value = float(getattr(params, parameter_name))
         change_size = RELATIVE_PARAMETER_STEP * abs(parameter_value)
         changed_failure_radii = []
@@ -131,8 +132,12 @@ def differentiate_log_mean_steps(
                 section_states=failing_walks.section_states
                 + np.asarray(changed_cycle.section_state)
                 - walker_groups.gait_state,
-                start_slopes=failing_walks.start_slopes
-                + (parameter_change if parameter_name == "slope" else 0.0),
+                start_ground=failing_walks.start_ground
+                + (
+                    parameter_change
+                    if parameter_name == "slope" and not walker_groups.has_heights
+                    else 0.0
+                ),
             )
             changed_failure_radii.append(
                 walks_of_changed_wheel.bisect_failure_radii(
@@ -180,9 +185,11 @@ def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixtu
         if np.any(walk_weights):
             n_effective_walks = np.sum(walk_weights) ** 2 / np.sum(walk_weights**2)
     if n_effective_walks == 0.0:
+        sd_text = f"{walker_groups.sd_name} {walker_groups.ground_sd:g}"
         raise ValueError(
-            f"no sampled walk failed with slope_sd {walker_groups.slope_sd:g} rad, so that the "
-            "mean number of steps has no derivative: give a larger slope_sd or n_walkers."
+            f"no sampled walk failed with {sd_text} {'m' if walker_groups.has_heights else 'rad'}, "
+            "so that the mean number of steps has no derivative: give a larger "
+            f"{walker_groups.sd_name} or n_walkers."
         )
     walk_indices = walker_groups.random.choice(
         len(walk_weights), N_FAILING_WALKS, p=walk_weights / np.sum(walk_weights)
@@ -191,7 +198,7 @@ def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixtu
     slope_deviation_norms = np.linalg.norm(slope_deviations, axis=1)
     return FailingWalks(
         walker_groups.states[walk_indices % n_walkers],
-        walker_groups.slopes[walk_indices % n_walkers],
+        walker_groups.ground[walk_indices % n_walkers],
         slope_deviations / slope_deviation_norms[:, None],
         slope_deviation_norms,
     )

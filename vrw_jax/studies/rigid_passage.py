@@ -1,12 +1,13 @@
-"""First-passage times of the rigid wheel by quadrature, with a kernel in closed form.
+"""First-passage times of the rigid wheel by quadrature, with a map in closed form.
 
-The state is one number: the squared angular rate at the instant at which the stance leg is
-vertical. This rate and the slope of the next line of the ground determine the next rate. The
-probability density of the slopes therefore determines the kernel.
+The state is the squared angular rate at the instant at which the stance leg is vertical. If the
+ground consists of independent heights, the height of the foothold is a second component. This state
+and the next line of the ground determine the next rate.
 """
 
 import functools
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,73 +18,255 @@ from jaxtyping import Array, Float
 
 from vrw_jax.base.types import Scalar
 from vrw_jax.studies.survival import SurvivalAnalysis, analyze_survival_operator, compute_mean_steps
+from vrw_jax.wheel.ground import compute_line_slope
 from vrw_jax.wheel.params import WheelParams
 
-MAX_SLOPE_STANDARD_DEVIATIONS = 10.0
-"""Largest deviation of a slope from its mean, in standard deviations.
+N_DEVIATION_NODES = 80
+"""Number of quadrature nodes over the next slope or height.
 
-The limit bounds the states. The value is chosen because larger deviations have a probability of
-only 1e-23.
+The value is chosen because the normal density over 20 standard deviations is then integrated to
+round-off.
+"""
+MAX_SLOPE_DEVIATION, MAX_HEIGHT_DEVIATION = 10.0, 8.0
+"""Largest deviations of a slope and of a height from their means, in standard deviations.
+
+The limits bound the states. The values are chosen because larger slopes have a probability of
+1e-23, and larger heights one of 1e-15. More heights would need more nodes.
 """
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
-def solve_rigid_passage(
-    params: WheelParams, slope_sd: Scalar, rigid_model: Any, n_nodes: int
-) -> tuple[SurvivalAnalysis, Scalar, Float[Array, " n"]]:
-    """Analyze the survival of the rigid wheel, by quadrature with `n_nodes` nodes.
+class RigidPassage(NamedTuple):
+    """First-passage times of the rigid wheel, computed with one number of nodes."""
 
-    Return the analysis, the mean number of steps from the gait until the wheel fails, and the
-    nodes. The nodes are squared angular rates with the stance leg vertical, 1/s^2.
+    survival_analysis: SurvivalAnalysis
+    mean_steps_from_gait: Scalar
+    mean_step_distance: Scalar  # to the next foothold, from the quasi-stationary distribution, m
+    states: Float[Array, "n n_state"]
+    omitted_probability: Scalar  # of slopes or heights that the operator omits
+
+    def compute_means(self) -> tuple[Scalar, Scalar]:
+        """Return the mean number of steps, and the mean distance of their footholds, m."""
+        mean_steps = 1.0 / self.survival_analysis.failure_probability
+        return mean_steps, mean_steps * self.mean_step_distance
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def solve_passage_on_slopes(
+    params: WheelParams, slope_sd: Scalar, rigid_model: Any, n_nodes: int
+) -> RigidPassage:
+    """Analyze the survival of the rigid wheel on random slopes, by quadrature over the next state.
+
+    All terms are positive, so that the failure probability of the longest life has digits. The
+    kernel omits slopes beyond that of the largest next rate.
 
     - `slope_sd`: standard deviation of the slopes, rad.
     """
-    vertical_rate_map, mean_slope = rigid_model.make_vertical_rate_map(params), params.slope
+    rate_map, mean_slope = rigid_model.make_vertical_rate_map(params), params.slope
+    foot_distance = rigid_model.compute_foot_distance(params, jnp.zeros_like(mean_slope)[None])
     steepest_slope = jnp.minimum(
-        mean_slope + MAX_SLOPE_STANDARD_DEVIATIONS * slope_sd,
-        vertical_rate_map.slope_of_largest_squared_rate,
+        mean_slope + MAX_SLOPE_DEVIATION * slope_sd, rate_map.slope_of_largest_squared_rate
     )
-    largest_squared_rate = lax.stop_gradient(vertical_rate_map.compute_fixed_point(steepest_slope))
+    largest_squared_rate = lax.stop_gradient(rate_map.compute_fixed_point(steepest_slope))
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(n_nodes)
     squared_rate_nodes = 0.5 * largest_squared_rate * (1.0 + legendre_nodes)
     node_weights = 0.5 * largest_squared_rate * legendre_weights
 
     def evaluate_kernel_row(squared_rate: Array) -> tuple[Array, Array]:
-        """Return the row of the survival operator for a start at `squared_rate`, and the
-        probability that the step fails.
+        """Return the row of the survival operator, and the probability that the step fails.
 
         The row contains the kernel at all nodes, multiplied by the quadrature weights.
         """
-        compute_slope_cosine = lambda next_squared_rate: (
-            (
-                next_squared_rate
-                - vertical_rate_map.compute_slope_independent_squared_rate(squared_rate)
-            )
-            / vertical_rate_map.squared_rate_amplitude
-        )
-        slope_cosine = compute_slope_cosine(squared_rate_nodes)
+        slope_cosine = (
+            squared_rate_nodes - rate_map.compute_slope_independent_squared_rate(squared_rate)
+        ) / rate_map.squared_rate_amplitude
         is_node_reachable = jnp.abs(slope_cosine) < 1.0
         slope_cosine = jnp.where(is_node_reachable, slope_cosine, 0.0)
         slope_deviation = (
-            vertical_rate_map.slope_of_largest_squared_rate - jnp.arccos(slope_cosine) - mean_slope
+            rate_map.slope_of_largest_squared_rate - jnp.arccos(slope_cosine) - mean_slope
         ) / slope_sd
         squared_rate_density = jnp.exp(-0.5 * slope_deviation**2) / (
             jnp.sqrt(2.0 * jnp.pi) * slope_sd
         )
         squared_rate_density = squared_rate_density / (
-            vertical_rate_map.squared_rate_amplitude * jnp.sqrt(1.0 - slope_cosine**2)
+            rate_map.squared_rate_amplitude * jnp.sqrt(1.0 - slope_cosine**2)
         )
-        flattest_slope = vertical_rate_map.slope_of_largest_squared_rate - jnp.arccos(
-            jnp.clip(compute_slope_cosine(0.0), -1.0, 1.0)
+        survival_row = jnp.where(is_node_reachable, squared_rate_density, 0.0) * node_weights
+        failure_probability = ndtr(
+            (rate_map.compute_flattest_slope(squared_rate) - mean_slope) / slope_sd
         )
-        return jnp.where(is_node_reachable, squared_rate_density, 0.0) * node_weights, ndtr(
-            (flattest_slope - mean_slope) / slope_sd
-        )
+        return survival_row, failure_probability
 
-    survival_matrix, failure_probabilities = jax.vmap(evaluate_kernel_row)(squared_rate_nodes)
-    survival_analysis = analyze_survival_operator(survival_matrix, failure_probabilities)
-    survival_row_of_gait = evaluate_kernel_row(vertical_rate_map.compute_fixed_point(mean_slope))
-    mean_steps_from_gait = compute_mean_steps(
-        survival_analysis, survival_matrix, *survival_row_of_gait
+    rows = jax.vmap(evaluate_kernel_row)(squared_rate_nodes)
+    start_row = evaluate_kernel_row(rate_map.compute_fixed_point(mean_slope))
+    # The cosine of a normal number has this mean.
+    step_distances = foot_distance * jnp.exp(-0.5 * slope_sd**2) * jnp.ones(n_nodes)
+    omitted_probability = ndtr((mean_slope - rate_map.slope_of_largest_squared_rate) / slope_sd)
+    return _analyze_passage(
+        *rows, step_distances, start_row, squared_rate_nodes[:, None], omitted_probability
     )
-    return survival_analysis, mean_steps_from_gait, squared_rate_nodes
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3, 4))
+def solve_passage_by_interpolation(
+    params: WheelParams, ground_sd: Scalar, rigid_model: Any, n_nodes: int, has_heights: bool
+) -> RigidPassage:
+    """Analyze the survival of the rigid wheel on random heights, or on slopes of any size.
+
+    Functions of the state are interpolated between Chebyshev nodes, about `n_nodes` in all. They
+    are integrated over the slopes or heights on which a step succeeds, in which they are smooth. A
+    vertical line ends the walk. Terms have both signs, so that extremely long lives lose digits.
+
+    - `ground_sd`: standard deviation of the slopes, rad, or of the heights, m;
+    - `has_heights`: whether heights are random, so that the last height is part of the state.
+    """
+    rate_map, mean_slope = rigid_model.make_vertical_rate_map(params), params.slope
+    foot_distance = rigid_model.compute_foot_distance(params, jnp.zeros_like(mean_slope)[None])
+    n_heights = round(0.5 * n_nodes**0.5) if has_heights else 1
+    n_rates = n_nodes // n_heights
+    z_max = MAX_HEIGHT_DEVIATION if has_heights else MAX_SLOPE_DEVIATION
+
+    def find_slope(z: Array, next_z: Array) -> Array:
+        """Return the slope of a line, from the standardized deviations of its two ends."""
+        if has_heights:
+            return compute_line_slope(mean_slope, ground_sd * (next_z - z), foot_distance)
+        return mean_slope + ground_sd * next_z
+
+    def find_next_deviation(z: Array, slope: Array | float) -> Array:
+        """Return the deviation with which `find_slope` returns the slope."""
+        if has_heights:
+            return z + jnp.sin(mean_slope - slope) * foot_distance / ground_sd
+        return (slope - mean_slope) / ground_sd
+
+    def find_level_rate(squared_rate: Array, z: Array) -> Array:
+        """Return the next squared rate if the next foothold is on the mean line.
+
+        After a foothold of any height, the probability of a failure depends on hardly anything
+        else. On random slopes, the squared rate itself has this property.
+        """
+        if not has_heights:
+            return squared_rate
+        linear_slope = mean_slope + ground_sd * z / foot_distance
+        return rate_map.compute_next_squared_rate(squared_rate, linear_slope)
+
+    level_rate_limits = [
+        rate_map.compute_fixed_point(jnp.minimum(slope, rate_map.slope_of_largest_squared_rate))
+        for slope in map(find_slope, jnp.zeros(2), jnp.array([z_max, -z_max]))
+    ]
+    gait_squared_rate = rate_map.compute_fixed_point(mean_slope)
+    retained_fraction = rate_map.retained_squared_rate_fraction
+    if has_heights:  # Extreme heights cannot follow each other as steep slopes can.
+        lowest, highest = (
+            gait_squared_rate + (1.0 - retained_fraction) * (limit - gait_squared_rate)
+            for limit in level_rate_limits
+        )
+    else:
+        lowest, highest = jnp.zeros_like(mean_slope), level_rate_limits[0]
+    lowest, highest = lax.stop_gradient((lowest, highest))
+    rate_angles, height_angles = ((np.arange(n) + 0.5) * (np.pi / n) for n in (n_rates, n_heights))
+    level_rates = lowest + 0.5 * (highest - lowest) * (1.0 + np.cos(rate_angles))
+    level_rates = jnp.repeat(level_rates, n_heights)
+    deviations = jnp.tile(jnp.asarray(z_max * np.cos(height_angles)), n_rates)
+    zero_rates = jnp.zeros_like(level_rates)
+    squared_rates = level_rates
+    if has_heights:
+        squared_rates = (level_rates - find_level_rate(zero_rates, deviations)) / retained_fraction
+    legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(N_DEVIATION_NODES)
+
+    def make_deviation_quadrature(
+        z: Array, flattest_slope: Array | float
+    ) -> tuple[Array, Array, Array]:
+        """Return nodes and weights of the deviations between a slope and the vertical line, and the
+        probability of all other deviations.
+        """
+        limits = [
+            jnp.clip(find_next_deviation(z, slope), -z_max, z_max)
+            for slope in (flattest_slope, 0.5 * np.pi)
+        ]
+        lower, upper = reversed(limits) if has_heights else limits
+        next_z = lower + 0.5 * (upper - lower) * (1.0 + legendre_nodes)
+        density = jnp.exp(-0.5 * next_z**2) / np.sqrt(2.0 * np.pi)
+        weights = 0.5 * (upper - lower) * legendre_weights * density
+        return next_z, weights, ndtr(lower) + ndtr(-upper)
+
+    def compute_step_distance(z: Array) -> Array:
+        """Return the mean distance to a next foothold that the wheel can reach, m."""
+        steepest_climb = mean_slope - 0.5 * np.pi if has_heights else -0.5 * np.pi
+        next_z, weights, _ = make_deviation_quadrature(z, steepest_climb)
+        line_angles = find_slope(z, next_z) - mean_slope
+        return foot_distance * (weights @ jnp.cos(line_angles)) / jnp.sum(weights)
+
+    def evaluate_kernel_row(
+        z: Array, flattest_slope: Array, compute_next_squared_rate: Callable[[Array], Array]
+    ) -> tuple[Array, Array]:
+        """Return the row of the survival operator, and the probability that the step fails.
+
+        The arguments are those of a foothold: its deviation, the slope of the next line below which
+        the wheel falls back, and the next squared rate for each slope.
+        """
+        next_z, weights, failure_probability = make_deviation_quadrature(z, flattest_slope)
+        next_slopes = find_slope(z, next_z)
+        next_level_rates = find_level_rate(compute_next_squared_rate(next_slopes), next_z)
+        rate_basis = _evaluate_chebyshev_basis(
+            2.0 * (next_level_rates - lowest) / (highest - lowest) - 1.0, rate_angles
+        )
+        height_basis = _evaluate_chebyshev_basis(next_z / z_max, height_angles)
+        return jnp.ravel((weights[:, None] * rate_basis).T @ height_basis), failure_probability
+
+    evaluate_state_row = lambda squared_rate, z: evaluate_kernel_row(
+        z,
+        rate_map.compute_flattest_slope(squared_rate),
+        functools.partial(rate_map.compute_next_squared_rate, squared_rate),
+    )
+    rows = jax.vmap(evaluate_state_row)(squared_rates, deviations)
+    mean_deviation = jnp.zeros_like(mean_slope)
+    start_row = evaluate_state_row(gait_squared_rate, mean_deviation)
+    n_steps_before_start = 0
+    if has_heights:
+        # The gait lands on a foothold of random height, and the step before is not counted.
+        landing_rate = rate_map.compute_rate_after_landing(gait_squared_rate, mean_slope)
+        start_row = evaluate_kernel_row(
+            mean_deviation,
+            rate_map.find_flattest_landing_slope(landing_rate),
+            lambda slope: landing_rate - rate_map.compute_climb(slope),
+        )
+        n_steps_before_start = 1
+    states = jnp.stack([squared_rates, ground_sd * deviations][: 1 + has_heights], 1)
+    step_distances = jax.vmap(compute_step_distance)(deviations)
+    passage = _analyze_passage(*rows, step_distances, start_row, states, 2.0 * ndtr(-z_max))
+    return passage._replace(
+        mean_steps_from_gait=passage.mean_steps_from_gait - n_steps_before_start
+    )
+
+
+def _analyze_passage(
+    survival_matrix: Array,
+    failure_probabilities: Array,
+    step_distances: Array,
+    start_row: Any,
+    states: Array,
+    omitted_probability: Any,
+) -> RigidPassage:
+    """Return first-passage times for a survival operator, see `RigidPassage`.
+
+    - `step_distances`: mean distance to the next foothold from each state, m;
+    - `start_row`: row of the operator for a start on the gait, and its failure probability.
+    """
+    survival_analysis = analyze_survival_operator(survival_matrix, failure_probabilities)
+    return RigidPassage(
+        survival_analysis,
+        compute_mean_steps(survival_analysis, survival_matrix, *start_row),
+        survival_analysis.quasi_stationary_weights @ step_distances,
+        states,
+        omitted_probability,
+    )
+
+
+def _evaluate_chebyshev_basis(x: Array, node_angles: np.ndarray) -> Array:
+    """Return the polynomials that are 1 at one Chebyshev node and 0 at all others, at each of the
+    points x in [-1, 1], shape (points, nodes).
+    """
+    degrees = np.arange(len(node_angles))
+    coefficients = np.cos(degrees[:, None] * node_angles) * (2.0 / len(node_angles))
+    coefficients[0] *= 0.5
+    x = jnp.clip(x, -1.0 + 1e-15, 1.0 - 1e-15)  # where the arccosine has finite derivatives
+    return jnp.cos(degrees * jnp.arccos(x)[:, None]) @ coefficients

@@ -1,10 +1,10 @@
 """First-passage times from sampled walks, with failures made frequent by importance sampling.
 
-Groups of simulated wheels, the walkers, walk over random slopes until the effect of the start has
-decayed. A walker that fails is replaced by a copy of another walker of its group (Fleming and
-Viot). All walkers then have the quasi-stationary distribution. From there, walks of a few steps are
-sampled with slopes from a density for which many walks fail in their last step. Likelihood ratios
-give the probability of that failure without bias. Groups are independent, so that the spread
+Groups of simulated wheels, the walkers, walk over random slopes or heights until the effect of the
+start has decayed. A walker that fails is replaced by a copy of another walker of its group (Fleming
+and Viot). All walkers then have the quasi-stationary distribution. From there, walks of a few steps
+are sampled with ground from a density for which many walks fail in their last step. Likelihood
+ratios give the probability of that failure without bias. Groups are independent, so that the spread
 between groups gives the error.
 """
 
@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.options import StepOptions
@@ -163,39 +164,49 @@ class SampledPassage(NamedTuple):
     relative_error: float  # of the mean; half a confidence interval plus `start_effect`
     start_effect: float  # relative effect of the start of the walks on the mean
     mean_steps_from_gait: float
+    mean_step_distance: float  # of a completed step, along the mean slope, m
+    step_distance_error: float  # half a confidence interval, m
     kappa_2: float  # NaN if the walkers are too few for an estimate
-    quasi_stationary_states: np.ndarray  # with the slope as last component, (n, components)
+    quasi_stationary_states: np.ndarray  # as in `stack_states_and_ground`, (n, components)
     fraction_by_outcome: dict[str, float]
     n_sampled_steps: int
-    # of the slope deviations of walks that may fail in their last step
+    # of the deviations of the ground in walks that may fail in their last step
     walk_density: GaussianMixture
 
 
 class StepTransition(NamedTuple):
-    """States of all walkers before and after one gait step, with the slope as last component."""
+    """States of all walkers before and after one gait step, see `stack_states_and_ground`."""
 
     states_before_step: np.ndarray
     is_walker_alive: np.ndarray
-    slope_deviations: np.ndarray  # of the slopes on which the step ends
+    ground_deviations: np.ndarray  # of the slopes or heights on which the step ends
     states_after_step: np.ndarray
 
 
 @dataclass
 class WalkerGroups:
-    """Groups of walkers (simulated wheels) on random slopes, simulated as one batch.
+    """Groups of walkers (simulated wheels) on random slopes or heights, simulated as one batch.
 
+    By the Markov property, the section state and the ground of a walker determine the distribution
+    of later states. The ground is the slope of its line, or the heights of the two last footholds.
     At first, the state of every walker is the section state of the gait. The number of walkers per
     group is rounded up to a power of two, because a digital net has such a number of points.
     """
 
     params: WheelParams
     gait_state: np.ndarray
-    slope_sd: float
+    ground_sd: float  # of slopes, rad, or of heights, m
     model: Any
     step_options: StepOptions
     n_walkers: int
     random: np.random.Generator
     options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS
+    sd_name: str = "slope_sd"  # or "height_sd"
+
+    @property
+    def has_heights(self) -> bool:
+        """Return whether heights of footholds are random, instead of slopes."""
+        return self.sd_name == "height_sd"
 
     def __post_init__(self) -> None:
         self.n_groups = self.options.n_walker_groups
@@ -206,42 +217,50 @@ class WalkerGroups:
         self.restart_at_gait()
 
     def run_walks(
-        self, slope_deviations: np.ndarray
+        self, ground_deviations: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, StepBatchResult]:
         """Return whether walks fail in their last step, whether they fail, and their results.
 
         The walks begin at the current states of the walkers. Walk i begins at walker i modulo the
         number of walkers.
 
-        - `slope_deviations`: standardized deviations of the slopes on which the wheels land, shape
-          (walks, lines).
+        - `ground_deviations`: standardized deviations of the slopes or heights on which the wheels
+          land, shape (walks, lines).
         """
-        walker_indices = np.arange(len(slope_deviations)) % self.n_walkers
+        walker_indices = np.arange(len(ground_deviations)) % self.n_walkers
         walk_results = self.run_walks_with_changes(
-            self.params, self.states[walker_indices], self.slopes[walker_indices], slope_deviations
+            self.params, self.states[walker_indices], self.ground[walker_indices], ground_deviations
         )
         has_failed = walk_results.outcome != Outcome.STEPPED
         self.n_steps += int(np.sum(walk_results.n_stepped) + np.sum(has_failed))
-        is_in_last_step = walk_results.n_stepped == slope_deviations.shape[1] - 1
+        is_in_last_step = walk_results.n_stepped == ground_deviations.shape[1] - 1
         return has_failed & is_in_last_step, has_failed, walk_results
 
     def run_walks_with_changes(
         self,
         params: WheelParams,
         section_states: np.ndarray,
-        start_slopes: np.ndarray,
-        slope_deviations: np.ndarray,
+        start_ground: np.ndarray,
+        ground_deviations: np.ndarray,
     ) -> StepBatchResult:
-        """Return the results of walks of the wheel `params` from given states and slopes."""
-        landing_slopes = float(params.slope) + self.slope_sd * slope_deviations
-        ground_line_slopes = np.concatenate([start_slopes[:, None], landing_slopes], 1)
+        """Return the results of walks of the wheel `params` from given states on given ground."""
+        ground = np.concatenate([start_ground, self.compute_ground(params, ground_deviations)], 1)
+        heights = ground if self.has_heights else None
+        if heights is None:
+            params = eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, ground)
         return step_batch(
-            eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, ground_line_slopes),
+            params,
             section_states,
-            slope_deviations.shape[1],
+            ground_deviations.shape[1],
             model=self.model,
             options=self.step_options,
+            heights=heights,
         )
+
+    def compute_ground(self, params: WheelParams, ground_deviations: np.ndarray) -> np.ndarray:
+        """Return slopes (rad) or heights (m) for their standardized deviations."""
+        mean = 0.0 if self.has_heights else float(params.slope)
+        return mean + self.ground_sd * ground_deviations
 
     def run_biased_walks(
         self, walk_density: GaussianMixture, slope_deviations: np.ndarray
@@ -271,17 +290,33 @@ class WalkerGroups:
             self.weight_by_outcome[int(outcome_code)] += outcome_weight
 
     def restart_at_gait(self) -> None:
-        """Reset all walkers to the section state of the gait, on ground of the mean slope."""
-        self.states = np.tile(self.gait_state, (self.n_walkers, 1))
-        self.slopes = np.full(self.n_walkers, float(self.params.slope))
-
-    def stack_states_and_slopes(self) -> np.ndarray:
-        """Return section states with the slope as last component, shape (walkers, components).
-
-        By the Markov property, the section state and the current slope determine the distribution
-        of later states.
+        """Reset all walkers to the section state of the gait, on a line of the mean slope, or from
+        the mean line to a foothold of random height.
         """
-        return np.concatenate([self.states, self.slopes[:, None]], 1)
+        self.states = np.tile(self.gait_state, (self.n_walkers, 1))
+        start_deviations = np.zeros((self.n_walkers, 1 + self.has_heights))
+        if self.has_heights:
+            start_deviations[:, 1] = self.random.standard_normal(self.n_walkers)
+        self.ground = self.compute_ground(self.params, start_deviations)
+
+    def stack_states_and_ground(self) -> np.ndarray:
+        """Return section states with the ground as last components, shape (walkers, components)."""
+        return np.concatenate([self.states, self.ground], 1)
+
+    def compute_step_distances(self, states_after_step: np.ndarray) -> np.ndarray:
+        """Return the distance of each step along the mean slope, m.
+
+        - `states_after_step`: as in `StepTransition`, shape (steps, components).
+        """
+        foot_distances = np.asarray(
+            self.model.compute_foot_distance(
+                self.params, jnp.asarray(states_after_step[:, : self.states.shape[1]].T)
+            )
+        )
+        if self.has_heights:
+            rises = states_after_step[:, -1] - states_after_step[:, -2]
+            return np.sqrt(foot_distances**2 - rises**2)
+        return foot_distances * np.cos(states_after_step[:, -1] - float(self.params.slope))
 
     def step_and_replace_failures(self) -> StepTransition:
         """Simulate one gait step of every walker, and replace walkers that fail by copies of
@@ -289,9 +324,9 @@ class WalkerGroups:
 
         Raise `ExtinctGroupError` if no walker of a group survived.
         """
-        states_before_step = self.stack_states_and_slopes()
-        slope_deviations = self.random.standard_normal((self.n_walkers, 1))
-        _, has_failed, walk_results = self.run_walks(slope_deviations)
+        states_before_step = self.stack_states_and_ground()
+        ground_deviations = self.random.standard_normal((self.n_walkers, 1))
+        _, has_failed, walk_results = self.run_walks(ground_deviations)
         self.add_failure_weights(walk_results.outcome, has_failed.astype(float))
         source_indices = np.arange(self.n_walkers).reshape(self.n_groups, -1)
         for indices_of_group, has_walk_failed in zip(
@@ -303,10 +338,12 @@ class WalkerGroups:
                 indices_of_group[~has_walk_failed], np.sum(has_walk_failed)
             )
         self.states = walk_results.section_state[source_indices.ravel()]
-        landing_slopes = float(self.params.slope) + self.slope_sd * slope_deviations[:, 0]
-        self.slopes = landing_slopes[source_indices.ravel()]
+        ground = np.concatenate(
+            [self.ground, self.compute_ground(self.params, ground_deviations)], 1
+        )
+        self.ground = ground[source_indices.ravel(), 1:]
         return StepTransition(
-            states_before_step, ~has_failed, slope_deviations[:, 0], self.stack_states_and_slopes()
+            states_before_step, ~has_failed, ground_deviations[:, 0], self.stack_states_and_ground()
         )
 
     def advance_without_counting(self, n_steps: int = 1) -> collections.Counter:
@@ -368,6 +405,7 @@ def sample_passage(
         kappa_2 = _estimate_kappa_2(
             late_transitions,
             int(walker_groups.model.count_continuous_section_entries(walker_groups.params)),
+            walker_groups.ground.shape[1],
         )
         # The effect of the start, divided by the survival probability, decays by this factor.
         start_effect_factor = 1.0 if np.isnan(kappa_2) else max(kappa_2 / kappa_1, spectral_radius)
@@ -433,6 +471,9 @@ def sample_passage(
         )
     if np.isnan(kappa_2):
         relative_error = np.inf
+    mean_step_distance, step_distance_error = _estimate_step_distance(
+        walker_groups, late_transitions
+    )
     mean_steps_from_gait = np.inf
     if failure_probability > 0.0:
         mean_steps_from_gait = float(
@@ -443,8 +484,10 @@ def sample_passage(
         relative_error=relative_error,
         start_effect=start_effect,
         mean_steps_from_gait=mean_steps_from_gait,
+        mean_step_distance=mean_step_distance,
+        step_distance_error=step_distance_error,
         kappa_2=kappa_2,
-        quasi_stationary_states=walker_groups.stack_states_and_slopes(),
+        quasi_stationary_states=walker_groups.stack_states_and_ground(),
         fraction_by_outcome={
             Outcome(outcome_code).name: outcome_weight / walker_groups.weight_by_outcome.total()
             for outcome_code, outcome_weight in walker_groups.weight_by_outcome.most_common()
@@ -612,6 +655,30 @@ def _step_until_start_is_forgotten(
     return np.mean(fractions_by_round, 0), step_transitions
 
 
+def _estimate_step_distance(
+    walker_groups: WalkerGroups, step_transitions: Sequence[StepTransition]
+) -> tuple[float, float]:
+    """Return the mean distance of completed steps along the mean slope, and its error, m."""
+    from scipy import stats  # This import is slow.
+
+    n_groups, options = walker_groups.n_groups, walker_groups.options
+    distance_sums, n_completed = np.zeros((2, n_groups))
+    for transition in step_transitions:
+        is_alive = transition.is_walker_alive
+        distances = np.zeros(len(is_alive))
+        distances[is_alive] = walker_groups.compute_step_distances(
+            transition.states_after_step[is_alive]
+        )
+        distance_sums += distances.reshape(n_groups, -1).sum(1)
+        n_completed += is_alive.reshape(n_groups, -1).sum(1)
+    quantile = stats.t.isf(0.5 * (1.0 - options.confidence_level), n_groups - 1)
+    group_means = distance_sums / n_completed
+    return (
+        float(np.sum(distance_sums) / np.sum(n_completed)),
+        float(quantile * np.std(group_means, ddof=1) / np.sqrt(n_groups)),
+    )
+
+
 def _has_missed_failures(walker_groups: WalkerGroups, max_failure_probability: float) -> bool:
     """Return whether some outcome occurs in more simulated steps than importance sampling predicts.
 
@@ -692,7 +759,9 @@ def _solve_failure_probability(
 
 
 def _estimate_kappa_2(
-    step_transitions: Sequence[tuple[np.ndarray, ...]], n_continuous_entries: int
+    step_transitions: Sequence[tuple[np.ndarray, ...]],
+    n_continuous_entries: int,
+    n_ground_entries: int = 1,
 ) -> float:
     """Return kappa_2, the second eigenvalue of the survival operator's projection on quadratic
     functions.
@@ -706,14 +775,15 @@ def _estimate_kappa_2(
     the linear projection exceeds kappa_1 too, because no second eigenvalue exceeds the leading one.
 
     - `step_transitions`: `StepTransition` of each gait step;
-    - `n_continuous_entries`: number of continuous components of a section state.
+    - `n_continuous_entries`: number of continuous components of a section state;
+    - `n_ground_entries`: number of components of the ground, which are the last ones.
     """
     states_before_step, is_walker_alive, landing_deviations, states_after_step = (
         np.concatenate(arrays_by_step) for arrays_by_step in zip(*step_transitions, strict=True)
     )
     varying_components = [
         i
-        for i in (*range(n_continuous_entries), states_before_step.shape[1] - 1)
+        for i in (*range(n_continuous_entries), *range(-n_ground_entries, 0))
         if np.ptp(states_before_step[:, i])
     ]
     mean_state = states_before_step.mean(0)

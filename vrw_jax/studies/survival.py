@@ -16,6 +16,9 @@ from vrw_jax.base.types import Scalar
 MAX_POWER_ITERATIONS = 5000
 """Largest number of power iterations, chosen because it suffices for kappa_2 up to 0.99 kappa_1."""
 
+SECOND_EIGENVALUE_TOLERANCE = 1e-12
+"""Change of the second eigenvalue at which power iteration ends, chosen above round-off."""
+
 POWER_ITERATION_TOLERANCE = 1e-15
 """Relative change of an eigenvector at which power iteration ends, chosen near round-off."""
 
@@ -36,22 +39,29 @@ def analyze_survival_operator(
 
     Let q be the quasi-stationary distribution and u the right eigenvector, with q.1 = q.u = 1. The
     failure probability is q.F, where F is `failure_probabilities`. Its first derivatives are those
-    of q.(F - K (u - 1)) with constant q and u.
+    of q.(F - K (u - 1)) with constant q and u. Derivatives of q and u solve linear equations.
     """
     K = lax.stop_gradient(survival_matrix)
-    quasi_stationary_weights = _compute_leading_eigenvector(K.T)
+    q = _compute_leading_eigenvector(K.T)
     unscaled_eigenvector = _compute_leading_eigenvector(K)
-    survival_eigenvector = unscaled_eigenvector / (quasi_stationary_weights @ unscaled_eigenvector)
-    projected_eigenvalues = jnp.sort(jnp.abs(jnp.linalg.eigvals(K)))
-    eigenvector_correction = survival_matrix @ (survival_eigenvector - 1.0)
-    failure_probability = quasi_stationary_weights @ (
+    u = unscaled_eigenvector / (q @ unscaled_eigenvector)
+    eigenvector_correction = survival_matrix @ (u - 1.0)
+    failure_probability = q @ (
         failure_probabilities - (eigenvector_correction - lax.stop_gradient(eigenvector_correction))
     )
+    kappa_2 = _compute_second_eigenvalue(K, q, u)
+    # The change of K is zero and has the derivative of K.
+    K_change, kappa_1 = survival_matrix - K, q @ K @ u
+    kappa_change = q @ K_change @ u
+    regular_matrix = kappa_1 * jnp.eye(len(q)) - K + jnp.outer(u, q)
+    q_change = jnp.linalg.solve(regular_matrix.T, q @ K_change - kappa_change * q)
+    u_change = jnp.linalg.solve(regular_matrix, K_change @ u - kappa_change * u)
+    scale_change = jnp.sum(q_change)
     return SurvivalAnalysis(
         failure_probability,
-        projected_eigenvalues[-2],
-        quasi_stationary_weights,
-        survival_eigenvector,
+        kappa_2,
+        q + q_change - scale_change * q,
+        u + u_change + scale_change * u,
     )
 
 
@@ -86,6 +96,32 @@ def _compute_leading_eigenvector(nonnegative_matrix: Array) -> Array:
         apply_matrix,
         (0, initial_eigenvector, jnp.ones((), nonnegative_matrix.dtype)),
     )[1]
+
+
+def _compute_second_eigenvalue(K: Array, q: Array, u: Array) -> Scalar:
+    """Return the modulus of the second eigenvalue, by power iteration without the leading
+    eigenvectors q and u, which have q.u = 1.
+    """
+
+    def has_not_converged(loop_state: tuple) -> Array:
+        iteration_index, _, modulus, previous_modulus = loop_state
+        return (iteration_index < MAX_POWER_ITERATIONS) & (
+            jnp.abs(modulus - previous_modulus) > SECOND_EIGENVALUE_TOLERANCE
+        )
+
+    def apply_deflated_matrix(loop_state: tuple) -> tuple:
+        iteration_index, vector, modulus, _ = loop_state
+        vector = K @ vector
+        vector = vector - (q @ vector) * u
+        norm = jnp.linalg.norm(vector)
+        return iteration_index + 1, vector / norm, norm, modulus
+
+    initial_vector = jnp.cos(jnp.arange(len(u), dtype=u.dtype))
+    return lax.while_loop(
+        has_not_converged,
+        apply_deflated_matrix,
+        (0, initial_vector, jnp.inf * q[0], jnp.zeros_like(q[0])),
+    )[2]
 
 
 def compute_mean_steps(
