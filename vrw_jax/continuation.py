@@ -14,6 +14,7 @@ __all__ = (
     "ArclengthOptions",
     "FixedPointProblem",
     "FixedPointResult",
+    "continue_from",
     "floquet_multipliers",
     "solve_fixed_point",
 )  # The list of `help`.

@@ -313,7 +313,8 @@ def test_a_figure_is_written_to_the_given_file_and_the_data_to_the_usual_folder(
     assert "paper/fig3.pdf" in result.stdout
     assert [path.name for path in Path("paper").iterdir()] == ["fig3.pdf"]
     assert b"/MediaBox [ 0 0 244.8 " in Path("paper/fig3.pdf").read_bytes()  # 3.4 inches
-    assert [path.name for path in Path("results/small").iterdir()] == ["scan.zarr"]
+    stored = sorted(path.name for path in Path("results/small").iterdir())
+    assert stored == ["figures.json", "scan.zarr"]
     config.write_text(SCAN_CONFIG + '[figures]\nformats = ["pdf"]\n')
     assert run_command("scan", config).exit_code == 0
     assert Path("results/small/scan_over_stiffness.pdf").exists()

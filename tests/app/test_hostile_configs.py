@@ -6,6 +6,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import vrw_jax as vrw
 from vrw_jax.app import config
 from vrw_jax.models import list_model_config_names
 
@@ -55,6 +56,7 @@ PLACES = [(table, key) for table, keys in KEYS.items() for key in keys]
 )  # fmt: skip
 @given(place=st.sampled_from(PLACES), literal=LITERALS)
 def test_a_key_takes_or_refuses_a_hostile_value(model_name, place, literal):
+    vrw.CycleOptions()  # Types are checked in the first call of a test; the config checks others.
     table, key = place
     named = "" if place == ("model", "name") else f'name = "{model_name}"\n'
     lines = [line for line in SOUND.get(table, "").splitlines() if not line.startswith(f"{key} =")]
