@@ -7,7 +7,7 @@ import pytest
 from jax import lax
 from support.slow_variants import mark_slow
 
-from vrw_jax import lanes
+from vrw_jax.lanes import compile_batch_function, mark_noinline, program
 from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.lanes.rules import PRIMITIVE_RULES
 
@@ -16,7 +16,7 @@ RANDOM_GENERATOR = np.random.default_rng(0)
 
 def make_program(function, lanes, uniform=()):
     """Return `function(uniform, lanes)` as machine code."""
-    return lanes.compile_batch_function(function).run
+    return compile_batch_function(function).run
 
 
 def run_both_backends(function, lanes, uniform=()):
@@ -112,9 +112,9 @@ def test_scans_run_over_their_constants():
 def test_a_lane_gives_the_same_bits_in_any_batch_and_on_any_number_of_cores(monkeypatch, n):
     lanes = [RANDOM_GENERATOR.normal(size=5_003) for _ in range(2)]
     run = make_program(evaluate_arithmetic, lanes, [np.float64(0.7)])
-    monkeypatch.setattr(lanes.program, "count_available_cores", lambda: 1)
+    monkeypatch.setattr(program, "count_available_cores", lambda: 1)
     results_of_all_lanes = run([np.float64(0.7)], lanes)
-    monkeypatch.setattr(lanes.program, "count_available_cores", lambda: 3)
+    monkeypatch.setattr(program, "count_available_cores", lambda: 3)
     selection = RANDOM_GENERATOR.permutation(5_003)[:n]
     for part, all_ in zip(
         run([np.float64(0.7)], [x[selection] for x in lanes]), results_of_all_lanes, strict=True
@@ -206,7 +206,7 @@ def overwrite_in_loops(x):
 
 def test_in_place_updates_of_loops_do_not_change_other_readers():
     x = RANDOM_GENERATOR.uniform(0.0, 6.0, (2, 12, 37))
-    call = lanes.compile_batch_function(overwrite_in_loops)
+    call = compile_batch_function(overwrite_in_loops)
     for solution, expected in zip(jax.jit(call)(x), overwrite_in_loops(x), strict=True):
         np.testing.assert_allclose(solution, expected, rtol=1e-12, atol=1e-12)
 
@@ -240,7 +240,7 @@ def pick_rows(x, large):
 @pytest.mark.parametrize("n", [*mark_slow(1, 4), 1001])
 def test_array_functions_are_called_from_jax_programs(n):
     x = jnp.asarray(RANDOM_GENERATOR.normal(size=(20, 3, n)))
-    call = lanes.compile_batch_function(use_arrays_in_loops)
+    call = compile_batch_function(use_arrays_in_loops)
     # One lane after the other: no lane may see another.
     expected = jax.vmap(
         lambda one: jax.tree.map(lambda y: y[..., 0], use_arrays_in_loops(one[..., None])), -1, -1
@@ -264,7 +264,7 @@ def test_noinline_functions_are_called_and_give_the_same():
         return run
 
     lanes = [RANDOM_GENERATOR.normal(size=11) for _ in range(2)]
-    called = make_program(cubes(lanes.mark_noinline), lanes)([], lanes)
+    called = make_program(cubes(mark_noinline), lanes)([], lanes)
     for called_result, expected in zip(called, cubes(jax.jit)((), lanes), strict=True):
         np.testing.assert_allclose(called_result, expected, rtol=1e-13, atol=1e-13)
 
@@ -286,9 +286,9 @@ def test_integers_and_booleans_compare_and_multiply_as_in_jax():
 
 def test_a_new_primitive_needs_one_row_of_the_table(monkeypatch):
     lanes = [RANDOM_GENERATOR.normal(size=9)]
+    with pytest.warns(UserWarning, match="tan has no machine code"):
+        make_program(lambda _, lanes: (jnp.tan(lanes[0]), lanes[0]), lanes)([], lanes)
     tangent = lambda _, lanes: (jnp.tan(lanes[0]),)
-    with pytest.raises(NotImplementedError, match="tan has no machine code"):
-        make_program(tangent, lanes)
     monkeypatch.setitem(
         ELEMENTWISE_RULES, "tan",
         lambda operation, x: operation.value_emitter.llvm_builder.fdiv(

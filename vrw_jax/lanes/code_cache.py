@@ -31,6 +31,7 @@ from vrw_jax.lanes.machine import (
     describe_compiler_settings,
     require_object_file,
 )
+from vrw_jax.lanes.settings import with_default_jax_settings
 
 ResultShapesAndDtypes = tuple[tuple[tuple[int, ...], np.dtype], ...]
 """For each result of machine code, the lengths of all axes before the lanes, and the dtype."""
@@ -106,6 +107,7 @@ def _load_lane_program(index_name: str) -> LaneProgram | None:
     return machine_code and LaneProgram(machine_code, jax.tree.structure(skeleton))
 
 
+@with_default_jax_settings  # The trace has calls also where the caller has disabled `jax.jit`.
 def _compile_lane_program(
     lane_function: Callable,
     argument_shapes: Any,
