@@ -188,6 +188,15 @@ def test_static_and_shared_arguments():
     np.testing.assert_allclose(compiled(X[1], table, "sum", 1.0), X[1, 0] + 66.0)
 
 
+@pytest.mark.parametrize("n", [8, 13])
+def test_arrays_in_any_memory_order_are_read_alike(n):
+    x = GENERATOR.normal(size=(n, 5))
+    compiled = lanes.compile_batch_function(lambda x: x[1:] - 2.0 * x[:-1])
+    expected = x.T[1:] - 2.0 * x.T[:-1]
+    for ordered in (x.T, np.ascontiguousarray(x.T), np.repeat(x, 2, 0)[::2].T):
+        np.testing.assert_array_equal(compiled.run(ordered), expected)
+
+
 def test_batches_of_different_lengths_are_refused_in_one_sentence():
     compiled = lanes.jit(lambda x, y: x + y)
     with pytest.raises(ValueError, match=r"lengths \[3, 4\]: give 0 or None for each argument"):

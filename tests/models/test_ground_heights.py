@@ -158,12 +158,6 @@ def test_a_foothold_that_no_foot_can_reach_ends_one_walk_and_not_its_batch():
             lambda: vrw.step_batch(WHEEL, np.tile(START, (2, 1)), 3, heights=np.zeros(4)),
             r"heights have shape \(4,\), but there are 2 states and 3 steps",
         ),
-        (
-            lambda: vrw.step_batch(
-                WHEEL, np.tile(START, (2, 1)), 3, heights=np.zeros((2, 4)), engine="collocation"
-            ),
-            "engine is 'collocation'",
-        ),
     ],
 )
 def test_bad_heights_are_one_sentence(call, sentence):

@@ -163,9 +163,9 @@ def run_machine_code(get_program: GetProgram, argument_leaves: Sequence[np.ndarr
     pad_lanes = lambda x: [(0, 0)] * (x.ndim - 1) + [(0, n_padded_lanes - n_lanes)]
     # The last lane is repeated until the last group is full.
     padded_arguments = [
-        np.pad(x, pad_lanes(x), "edge")
-        if x.ndim and n_padded_lanes > n_lanes
-        else np.ascontiguousarray(x)
+        np.ascontiguousarray(  # The order of a transposed array outlives its padding.
+            np.pad(x, pad_lanes(x), "edge") if x.ndim and n_padded_lanes > n_lanes else x
+        )
         for x in argument_leaves
     ]
     padded_results = [
