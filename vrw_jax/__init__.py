@@ -146,9 +146,13 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Return the version, or the module of figures, which is imported on first use."""
+    """Return the version, or a public module, which is imported on first use."""
     if name == "__version__":
         return importlib.metadata.version("vrw-jax")
+    if name == "continuation":
+        return importlib.import_module("vrw_jax.continuation")
+    if name == "hybrid":
+        return importlib.import_module("vrw_jax.hybrid")
     if name == "plot":  # imports matplotlib only if figures are drawn
         return importlib.import_module("vrw_jax.plot")
     raise AttributeError(
