@@ -102,7 +102,9 @@ class CompiledBatchFunction:
         if is_machine_code_available() and self._has_machine_code():
             with contextlib.suppress(_NoMachineCodeError):
                 return run_machine_code(functools.partial(self._get_program, structure), leaves)
-        program_key = self._find_key(structure)
+        # Each program is traced once, while the function has the values of the key.
+        argument_types = [(x.shape[:-1] if x.ndim else None, x.dtype) for x in leaves]
+        program_key = self._find_key(structure, argument_types)
         xla_program = _xla_programs.get(program_key, jax.jit(flat_function))
         if program_key:
             _xla_programs[program_key] = xla_program
