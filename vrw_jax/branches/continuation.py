@@ -167,8 +167,8 @@ class GaitContinuation(AbstractContinuation):
         )
 
 
-@announce_wait("gaits, their derivatives and special points", "30 s")
 @with_default_jax_settings
+@announce_wait("gaits, their derivatives and special points", "30 s")
 def continue_branch(
     params: WheelParams,
     name: str,
@@ -247,8 +247,8 @@ def continue_branch(
     return branch
 
 
-@announce_wait("gaits, their derivatives and special points", "30 s")
 @with_default_jax_settings
+@announce_wait("gaits, their derivatives and special points", "30 s")
 def continue_branches(
     params: WheelParams,
     name: str,
@@ -564,7 +564,7 @@ class MapContinuation(AbstractContinuation):
         return {"x": self.state_units * section_states}
 
     def continue_in_both_directions(
-        self, z: Array, parameter_values: Array, is_branch_requested: np.ndarray
+        self, z: Any, parameter_values: Array, is_branch_requested: np.ndarray
     ) -> ContinuationResult:
         """Continue the branch of one map in both directions, and return all points.
 
@@ -626,8 +626,8 @@ class MapContinuation(AbstractContinuation):
         return jax.device_put(select_tree_rows((points.z, points.p), np.flatnonzero(is_usable)[:1]))
 
 
-@announce_wait("the map and its derivatives", "10 s")
 @with_default_jax_settings
+@announce_wait("the map and its derivatives", "10 s")
 def continue_map(
     function: Callable[[Any, Array, Array], Array],
     x: object,

@@ -114,8 +114,8 @@ class HybridSolution(NamedTuple):
         return describe_step_ending(self.termination, Termination)
 
 
-@announce_wait("the system's equations and guards", "10 s")
 @with_default_jax_settings
+@announce_wait("the system's equations and guards", "10 s")
 def simulate_hybrid(
     modes: Sequence[Mode] | Mode,
     start: ArrayLike | Sequence,

@@ -93,8 +93,8 @@ def limit_cycle(
 ) -> LimitCycle | ReturnMapCycle: ...
 
 
-@announce_wait("the search for a gait", "10 s, or 50 s if it finds no gait")
 @with_default_jax_settings
+@announce_wait("the search for a gait", "10 s, or 50 s if it finds no gait")
 def limit_cycle(
     params: WheelParams,
     *,
@@ -170,8 +170,8 @@ def limit_cycle(
     return cycle.replace_missing_gaits_by_nan(params) if fills_missing_gait_with_nan else cycle
 
 
-@announce_wait("the search for gaits", "10 s, or 50 s if it finds no gait")
 @with_default_jax_settings
+@announce_wait("the search for gaits", "10 s, or 50 s if it finds no gait")
 def limit_cycles(
     params: WheelParams,
     *,

@@ -24,8 +24,8 @@ from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 
-@announce_wait("the gait with its derivatives", "15 s")
 @with_default_jax_settings
+@announce_wait("the gait with its derivatives", "15 s")
 def sensitivities(
     params: WheelParams,
     *,

@@ -16,6 +16,7 @@ import operator
 import sys
 import sysconfig
 import types
+import weakref
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -292,6 +293,8 @@ class _Digester:
             self.add_all("wrapper", value.__wrapped__)  # from jax.jit or functools.cache
         elif isinstance(value, C_FUNCTION_TYPES):
             self.add_all("attribute", value.__name__, value.__objclass__)
+        elif isinstance(value, weakref.ref):
+            self.add_all("reference", value())
         elif value_type is object:
             self.write("sentinel")  # Its later occurrences have its position.
         elif isinstance(value, property | classmethod | staticmethod):

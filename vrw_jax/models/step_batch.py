@@ -85,8 +85,8 @@ GROUND_INPUT_INDEX = len(PARAMETER_NAMES) + 3
 """Index, among the inputs of a gait step, of the first value of uneven ground."""
 
 
-@announce_wait("batches of gait steps", "10 s")
 @with_default_jax_settings
+@announce_wait("batches of gait steps", "10 s")
 def step_batch(
     params: WheelParams,
     states: Array | np.ndarray,

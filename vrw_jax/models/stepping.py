@@ -239,8 +239,8 @@ def step(
 ) -> StepResult: ...
 
 
-@announce_wait("a gait step", "5 s")
 @with_default_jax_settings
+@announce_wait("a gait step", "5 s")
 def step(
     params: WheelParams,
     x: SectionStateLike,
@@ -280,8 +280,8 @@ def step(
     return model.take_step(params, section_state, options)
 
 
-@announce_wait("a gait step", "5 s")
 @with_default_jax_settings
+@announce_wait("a gait step", "5 s")
 def return_map(
     params: WheelParams,
     x: SectionStateLike,
@@ -413,8 +413,8 @@ def _simulate_walk_by_scan(
     return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
 
 
-@announce_wait("a gait step", "5 s")
 @with_default_jax_settings
+@announce_wait("a gait step", "5 s")
 def walk(
     params: WheelParams,
     x: SectionStateLike,
@@ -563,8 +563,8 @@ def start_walk_toward_gait(
     return walk(params, model.compute_default_start(params), n_steps, model=model, options=options)
 
 
-@announce_wait("a gait step of each model", "20 s")
 @with_default_jax_settings
+@announce_wait("a gait step of each model", "20 s")
 def choose_model(
     params: WheelParams,
     start: SectionStateLike,

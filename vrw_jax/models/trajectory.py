@@ -46,8 +46,8 @@ from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 
-@announce_wait("gait steps and their samples", "5 s")
 @with_default_jax_settings
+@announce_wait("gait steps and their samples", "5 s")
 def simulate(
     params: WheelParams,
     x: SectionStateLike | None = None,

@@ -76,8 +76,8 @@ class BasinShare(AbstractPrintable):
         ]
 
 
-@announce_wait("gaits and walks", "20 s")
 @with_default_jax_settings
+@announce_wait("gaits and walks", "20 s")
 def basin_share(
     params: WheelParams,
     box: StartBox,

@@ -39,8 +39,8 @@ an axis.
 """
 
 
-@announce_wait("batches of gait steps", "10 s")
 @with_default_jax_settings
+@announce_wait("batches of gait steps", "10 s")
 def basin(
     params: WheelParams,
     grid: StartGrid,

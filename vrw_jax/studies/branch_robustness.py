@@ -37,8 +37,8 @@ BASIN_VARIABLE_ATTRS = {
 """Unit and meaning of each variable in the dataset that `measure_basins` returns."""
 
 
-@announce_wait("gaits and walks", "20 s")
 @with_default_jax_settings
+@announce_wait("gaits and walks", "20 s")
 def measure_basins(
     branch: Branch,
     box: StartBox | None = None,
@@ -117,8 +117,8 @@ def measure_basins(
     )
 
 
-@announce_wait("gaits and their response to slopes", "20 s")
 @with_default_jax_settings
+@announce_wait("gaits and their response to slopes", "20 s")
 def measure_gait_sensitivity(
     branch: Branch,
     measures: str | Sequence[str],

@@ -176,8 +176,8 @@ class FirstPassage(AbstractPrintable):
         ]
 
 
-@announce_wait("gaits and random walks", "10 s")
 @with_default_jax_settings
+@announce_wait("gaits and random walks", "10 s")
 def first_passage(
     params: WheelParams,
     slope_sd: float | Scalar | None = None,

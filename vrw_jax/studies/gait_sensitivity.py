@@ -100,8 +100,8 @@ class GaitSensitivity(AbstractPrintable):
         ]
 
 
-@announce_wait("the gait and its response to slopes", "15 s")
 @with_default_jax_settings
+@announce_wait("the gait and its response to slopes", "15 s")
 def gait_sensitivity(
     params: WheelParams,
     measures: str | Sequence[str],

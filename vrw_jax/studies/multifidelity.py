@@ -129,8 +129,8 @@ GAIT_ERROR_FRACTION = 0.1
 MIN_PILOT_GAITS = 8
 
 
-@announce_wait("gaits of each model", "30 s")
 @with_default_jax_settings
+@announce_wait("gaits of each model", "30 s")
 def multifidelity_mean(
     measure: str,
     params: WheelParams,

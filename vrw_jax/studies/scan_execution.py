@@ -57,8 +57,8 @@ class ScanProgress:
     n_reused: int  # samples that an earlier run computed
 
 
-@announce_wait("batches of gaits and gait steps", "15 s")
 @with_default_jax_settings
+@announce_wait("batches of gaits and gait steps", "15 s")
 def scan(
     design: AbstractSampleDesign,
     measures: Iterable[str] | None = None,

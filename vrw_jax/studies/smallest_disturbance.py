@@ -89,8 +89,8 @@ class SmallestDisturbance(AbstractPrintable):
         ]
 
 
-@announce_wait("gaits, walks and derivatives", "20 s")
 @with_default_jax_settings
+@announce_wait("gaits, walks and derivatives", "20 s")
 def smallest_disturbance(
     params: WheelParams,
     *,

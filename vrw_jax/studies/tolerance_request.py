@@ -63,8 +63,8 @@ from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, convert_friction
 MIN_TOL_FOR_TIGHT_STEPS = 1e-7
 
 
-@announce_wait("gait steps of each model", "30 s")
 @with_default_jax_settings
+@announce_wait("gait steps of each model", "30 s")
 def measure_to_tolerance(
     measures: str | Sequence[str],
     params: WheelParams,

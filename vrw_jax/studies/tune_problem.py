@@ -120,8 +120,8 @@ WALK_VALIDATION_OPTIONS = WalkValidationOptions()
 """Options of all walks that validate tuned wheels."""
 
 
-@announce_wait("the gait, objective and constraints with derivatives", "25 s")
 @with_default_jax_settings
+@announce_wait("the gait, objective and constraints with derivatives", "25 s")
 def tune(
     params: WheelParams,
     objective: ObjectiveSpecification,
