@@ -72,7 +72,31 @@ def return_constants(x, k):
     return jnp.float64(2.0), jnp.arange(3), x > 0.0, None
 
 
+def call_elementary_functions(x, k):
+    y = jnp.stack([x, 1e-9 * x, -x]) + 1e-12 * k
+    positive = jnp.abs(y) + 1e-3
+    return (
+        [f(y) for f in (jnp.tan, jnp.tanh, jnp.sinh, jnp.cosh, jnp.expm1, jnp.cbrt)],
+        [f(y) for f in (jnp.sign, jnp.ceil, jax.nn.sigmoid)],
+        [jnp.log1p(positive), lax.rsqrt(positive), positive**x, y**2.0, y**-3.0, 0.0 * y**0.0],
+        jnp.clip(y, -0.3, 0.2 * x),
+    )
+
+
+def index_by_arrays(x, k):
+    y = jnp.concatenate([x, 2.0 * x])
+    table = y.reshape(2, 3)
+    return (
+        (y[jnp.array([4, 0])], table[:, jnp.array([2, 1, 1])], y[k], table[k % 1]),
+        (y.at[1].set(7.0), y.at[jnp.array([0, 0, 5])].add(x), table.at[1, :2].multiply(3.0)),
+        (jnp.argmax(y), jnp.argmin(table, axis=1), y[::-1]),
+        jnp.select([k == 0, k == 1, k == 2], [x[0], x[1], x[2]], -1.0),
+    )
+
+
 FUNCTIONS = (
+    call_elementary_functions,
+    index_by_arrays,
     halve_until_small,
     sum_by_scan,
     choose,

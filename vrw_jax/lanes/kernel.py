@@ -128,11 +128,17 @@ class _LaneGroupAccess:
                     entry_value,
                     self.array_emitter.value_emitter.make_llvm_constant(llvm_stored_type, 0),
                 )
-            return (
-                self.array_emitter.value_emitter.to_lane_vector(entry_value)
-                if self.has_single_lane and aval.shape
-                else entry_value
-            )
+            if not (self.has_single_lane and aval.shape):
+                return entry_value
+            vector = self.array_emitter.value_emitter.to_lane_vector(entry_value)
+            if aval.dtype.kind != "f":
+                return vector
+            # The vector is read from memory. LLVM would else compute only one of two equal entries,
+            # and then might not fuse the same products and sums.
+            memory = self.array_emitter.allocate_memory_array((2,), entry_value.type)
+            for i in range(2):
+                memory.emit_entry_store((i,), entry_value)
+            return llvm_builder.load(memory.base_pointer, typ=vector.type, align=8)
 
         argument_array = LazyArray(
             aval.shape[:-1], self.array_emitter.get_entry_type(aval), emit_entry_load
@@ -169,10 +175,15 @@ class _LaneGroupAccess:
             entry_value = self.array_emitter.value_emitter.to_lane_vector(
                 self.array_emitter.get_array_entry(result_array, entry_index)
             )
-            if self.has_single_lane:
-                entry_value = llvm_builder.extract_element(entry_value, ir.Constant(I64, 0))
             if aval.dtype.kind == "b":
-                entry_value = llvm_builder.zext(entry_value, llvm_stored_type)
+                stored_vector_type = self.array_emitter.value_emitter.make_vector_type(I8)
+                entry_value = llvm_builder.zext(entry_value, stored_vector_type)
+            if self.has_single_lane:
+                # The lane is read from memory, because LLVM would reduce an extracted entry, and
+                # all operations before it, to scalars.
+                memory = self.array_emitter.allocate_memory_array((), entry_value.type)
+                llvm_builder.store(entry_value, memory.base_pointer)
+                entry_value = llvm_builder.load(memory.base_pointer, typ=llvm_stored_type)
             llvm_builder.store(entry_value, entry_address, align=aval.dtype.itemsize)
             return []
 

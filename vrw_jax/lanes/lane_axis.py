@@ -16,6 +16,7 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, Literal
 
 from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
+from vrw_jax.lanes.decompositions import DECOMPOSITIONS
 from vrw_jax.lanes.lowering import CALLED_JAXPR_PARAMETERS, NOINLINE_FUNCTION_NAME, mark_noinline
 from vrw_jax.lanes.reductions import COMBINING_PRIMITIVE_BY_REDUCTION
 
@@ -123,6 +124,9 @@ def _evaluate_with_lanes(
     name = equation.primitive.name
     if name in RULES:
         return RULES[name](n_lanes, equation, operands)
+    if name in DECOMPOSITIONS and not (name in ELEMENTWISE_RULES and len(operands) <= 3):
+        decomposed = jax.make_jaxpr(functools.partial(DECOMPOSITIONS[name], **equation.params))
+        return _evaluate(n_lanes, decomposed(*(x.aval for x in equation.invars)), operands)
     if name in CALLED_JAXPR_PARAMETERS:
         return _call(n_lanes, equation, operands)
     arrays = [_with_lanes(n_lanes, x) for x in operands]
@@ -226,7 +230,8 @@ def _update_slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) ->
         return _bind(equation, [x.array for x in operands], False)
     lane_array, lane_part = (_with_lanes(n_lanes, x) for x in (array, part))
     varying_axes = [axis for axis, index in enumerate(indices) if index.has_lanes]
-    lane_start = jnp.zeros((), indices[0].array.dtype) if indices else 0
+    indices = [LaneValue(jnp.asarray(x, jnp.int32), flag) for x, flag in indices]
+    lane_start = jnp.zeros((), jnp.int32)
     if not varying_axes:
         starts = [*(x.array for x in indices), lane_start]
         return [LaneValue(lax.dynamic_update_slice(lane_array, lane_part, starts), True)]
@@ -242,6 +247,7 @@ def _update_slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) ->
         for axis, last, index in zip(varying_axes, last_starts, clipped, strict=True):
             flat_start, starts[axis] = divmod(flat_start, last + 1)
             is_here &= index == starts[axis]
+            starts[axis] = jnp.asarray(starts[axis], jnp.int32)
         updated = lax.dynamic_update_slice(lane_array, lane_part, [*starts, lane_start])
         result = jnp.where(is_here, updated, result)
     return [LaneValue(result, True)]

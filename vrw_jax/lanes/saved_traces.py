@@ -7,6 +7,7 @@ contains traces. The key of a trace contains everything on which the trace depen
 library's source code.
 """
 
+import contextlib
 import functools
 import hashlib
 from collections.abc import Callable
@@ -150,10 +151,13 @@ def _load_or_export_trace(
     finally:
         _is_exporting_trace.reset(export_flag_token)
     if function_key:
-        store.save_cache_record(
-            cache_record_name,
-            " ".join(ffi_target_names).encode() + b"\n" + bytes(exported_trace.serialize()),
-        )
+        # A result of a user's own class cannot be saved.
+        with contextlib.suppress(ValueError):
+            serialized_trace = bytes(exported_trace.serialize())
+            store.save_cache_record(
+                cache_record_name,
+                " ".join(ffi_target_names).encode() + b"\n" + serialized_trace,
+            )
     return exported_trace
 
 

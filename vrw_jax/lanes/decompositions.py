@@ -1,0 +1,176 @@
+"""Primitives without a rule of their own, written for one lane in terms of others."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+
+def _find_extremum(is_better: Callable, x: jax.Array, *, axes: Any, index_dtype: Any) -> Any:
+    """Return the index of the first smallest or largest entry on an axis."""
+    x = x.astype(jnp.int32) if x.dtype == bool else x
+    best, *others = (
+        lax.index_in_dim(x, i, axes[0], keepdims=False) for i in range(x.shape[axes[0]])
+    )
+    index = jnp.zeros(best.shape, index_dtype)
+    for i, entry in enumerate(others, 1):
+        is_better_entry = is_better(entry, best)
+        index = jnp.where(is_better_entry, jnp.asarray(i, index_dtype), index)
+        best = jnp.where(is_better_entry, entry, best)
+    return index
+
+
+def _select_case(index: jax.Array, *cases: jax.Array) -> jax.Array:
+    select = lambda selected, i: lax.select(index == i, cases[i], selected)
+    return functools.reduce(select, range(1, len(cases)), cases[0])
+
+
+def _locate_window(
+    x: jax.Array, index: jax.Array, axes: Sequence[int], sizes: Sequence[int]
+) -> tuple[list[Any], jax.Array]:
+    """Return the start of the window of a gather or scatter, and whether it is inside the array."""
+    starts: list[Any] = [jnp.zeros((), index.dtype)] * x.ndim
+    is_inside = jnp.asarray(True)
+    for position, axis in enumerate(axes):
+        starts[axis] = index[position]
+        is_inside &= (starts[axis] >= 0) & (starts[axis] <= x.shape[axis] - sizes[axis])
+    return starts, is_inside
+
+
+def _gather(
+    x: jax.Array,
+    indices: jax.Array,
+    *,
+    dimension_numbers: Any,
+    slice_sizes: Any,
+    mode: Any,
+    **_: Any,
+) -> jax.Array:
+    _require_no_batch(dimension_numbers.operand_batching_dims)
+    windows = []
+    for index in indices.reshape(-1, indices.shape[-1]):
+        starts, is_inside = _locate_window(x, index, dimension_numbers.start_index_map, slice_sizes)
+        window = lax.squeeze(
+            lax.dynamic_slice(x, starts, slice_sizes), dimension_numbers.collapsed_slice_dims
+        )
+        if mode == lax.GatherScatterMode.FILL_OR_DROP and jnp.issubdtype(x.dtype, jnp.floating):
+            window = jnp.where(is_inside, window, jnp.nan)
+        windows.append(window)
+    gathered = jnp.stack(windows).reshape(*indices.shape[:-1], *windows[0].shape)
+    n_batch = indices.ndim - 1
+    batch_axes = [a for a in range(gathered.ndim) if a not in dimension_numbers.offset_dims]
+    return jnp.moveaxis(gathered, range(n_batch), batch_axes)
+
+
+def _scatter(
+    combine: Callable,
+    x: jax.Array,
+    indices: jax.Array,
+    updates: jax.Array,
+    *,
+    dimension_numbers: Any,
+    mode: Any,
+    **_: Any,
+) -> jax.Array:
+    _require_no_batch(dimension_numbers.operand_batching_dims)
+    inserted = dimension_numbers.inserted_window_dims
+    window_axes = dimension_numbers.update_window_dims
+    batch_axes = [a for a in range(updates.ndim) if a not in window_axes]
+    window_sizes = iter(updates.shape[a] for a in window_axes)
+    sizes = [1 if axis in inserted else next(window_sizes) for axis in range(x.ndim)]
+    updates = jnp.moveaxis(updates, batch_axes, range(len(batch_axes))).reshape(-1, *sizes)
+    rows = indices.reshape(-1, indices.shape[-1])
+    for index, update in zip(rows, updates, strict=True):
+        starts, is_inside = _locate_window(
+            x, index, dimension_numbers.scatter_dims_to_operand_dims, sizes
+        )
+        previous = lax.dynamic_slice(x, starts, sizes)
+        changed = combine(previous, update)
+        if mode == lax.GatherScatterMode.FILL_OR_DROP:
+            changed = jnp.where(is_inside, changed, previous)
+        x = lax.dynamic_update_slice(x, changed, starts)
+    return x
+
+
+def _reverse(x: jax.Array, *, dimensions: Sequence[int]) -> jax.Array:
+    for axis in dimensions:
+        entries = [lax.slice_in_dim(x, i, i + 1, axis=axis) for i in range(x.shape[axis])]
+        x = lax.concatenate(entries[::-1], axis)
+    return x
+
+
+def _require_no_batch(batching_dims: Sequence[int]) -> None:
+    if batching_dims:
+        raise NotImplementedError("an index array with a batch axis has no rule for lanes")
+
+
+def _expm1(x: jax.Array, **_: Any) -> jax.Array:
+    """Return exp(x) - 1 by W. Kahan's quotient, in which the errors of both logarithms cancel."""
+    u = jnp.exp(x)
+    is_small, is_minus_one = u == 1.0, u - 1.0 == -1.0
+    is_simple = is_small | is_minus_one | jnp.isinf(u)
+    quotient = (u - 1.0) * x / jnp.where(is_simple, 1.0, jnp.log(jnp.where(is_simple, 2.0, u)))
+    return jnp.where(is_small, x, jnp.where(is_simple, u - 1.0, quotient))
+
+
+def _log1p(x: jax.Array, **_: Any) -> jax.Array:
+    u = 1.0 + x
+    return jnp.where(u == 1.0, x, jnp.log(u) * x / jnp.where(u == 1.0, 1.0, u - 1.0))
+
+
+def _tanh(x: jax.Array, **_: Any) -> jax.Array:
+    t = _expm1(-2.0 * jnp.abs(x))
+    return jnp.where(x < 0.0, t, -t) / (t + 2.0)
+
+
+def _sinh(x: jax.Array, **_: Any) -> jax.Array:
+    t = _expm1(jnp.abs(x))
+    magnitude = 0.5 * (t + t / (t + 1.0))
+    return jnp.where(x < 0.0, -magnitude, magnitude)
+
+
+def _pow(x: jax.Array, y: jax.Array, **_: Any) -> jax.Array:
+    if not jnp.issubdtype(y.dtype, jnp.floating):
+        y = y.astype(x.dtype)
+    magnitude = jnp.exp(y * jnp.log(jnp.where(x == 0.0, 1.0, jnp.abs(x))))
+    at_zero = jnp.where(y == 0.0, 1.0, jnp.where(y > 0.0, 0.0, jnp.inf))
+    half = 0.5 * y
+    is_odd = half != jnp.floor(half)
+    of_negative = jnp.where(y == jnp.floor(y), jnp.where(is_odd, -magnitude, magnitude), jnp.nan)
+    return jnp.where(x == 0.0, at_zero, jnp.where(x < 0.0, of_negative, magnitude))
+
+
+def _cbrt(x: jax.Array, **_: Any) -> jax.Array:
+    size = jnp.abs(x)
+    root = jnp.exp(jnp.log(jnp.where(size > 0.0, size, 1.0)) / 3.0)
+    root = root - (root - size / (root * root)) / 3.0  # Newton's step removes the error of exp.
+    return jnp.where(size > 0.0, jnp.where(x < 0.0, -root, root), x)
+
+
+DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
+    "argmax": functools.partial(_find_extremum, lax.gt),
+    "argmin": functools.partial(_find_extremum, lax.lt),
+    "cbrt": _cbrt,
+    "ceil": lambda x: -jnp.floor(-x),
+    "clamp": lambda lower, x, upper: jnp.minimum(jnp.maximum(x, lower), upper),
+    "cosh": lambda x, **_: 0.5 * (jnp.exp(x) + jnp.exp(-x)),
+    "expm1": _expm1,
+    "gather": _gather,
+    "log1p": _log1p,
+    "logistic": lambda x, **_: 1.0 / (1.0 + jnp.exp(-x)),
+    "pow": _pow,
+    "rev": _reverse,
+    "rsqrt": lambda x, **_: 1.0 / jnp.sqrt(x),
+    "scatter": functools.partial(_scatter, lambda previous, update: update),
+    "scatter-add": functools.partial(_scatter, jnp.add),
+    "scatter-mul": functools.partial(_scatter, jnp.multiply),
+    "select_n": _select_case,
+    "sign": lambda x: jnp.where(x > 0, 1, jnp.where(x < 0, -1, 0)).astype(x.dtype),
+    "sinh": _sinh,
+    "tan": lambda x, **_: jnp.sin(x) / jnp.cos(x),
+    "tanh": _tanh,
+}
+"""Functions of the operands and parameters of a primitive, by its name."""
