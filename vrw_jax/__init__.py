@@ -12,8 +12,10 @@ from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
 from vrw_jax.branches.continuation import continue_branch, continue_branches, continue_map
 from vrw_jax.branches.special_point_curves import continue_special_point
+from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point
 from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles
+from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.margin_defaults import default_margins
 from vrw_jax.gaits.options import CycleOptions
@@ -71,6 +73,8 @@ __all__ = (
     "FirstPassage",
     "FixedPointResult",
     "GaitSensitivity",
+    "HybridGait",
+    "HybridSystem",
     "LadderStep",
     "LadderWheel",
     "LimitCycle",

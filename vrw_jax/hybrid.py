@@ -10,6 +10,7 @@ from vrw_jax.flow.hybrid_simulation import (
     simulate_hybrid,
     time_errors,
 )
+from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
 from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
 from vrw_jax.flow.return_map import ReturnMap
 from vrw_jax.flow.saltation import flow_jacobian_determinant
@@ -18,6 +19,8 @@ from vrw_jax.flow.segments import product_multipliers, segment_maps
 __all__ = (
     "Guard",
     "HybridSolution",
+    "HybridStep",
+    "HybridSystem",
     "LCPStatus",
     "Mode",
     "ReturnMap",

@@ -50,6 +50,8 @@ from vrw_jax.branches.branch_location import (
 from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME, QuantitiesByName
 from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
 from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
+from vrw_jax.branches.hybrid_branch import find_parameter, make_section_map
+from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder, resolve_model
 from vrw_jax.gaits.fixed_points import (
@@ -60,6 +62,7 @@ from vrw_jax.gaits.fixed_points import (
     has_unit_multiplier,
 )
 from vrw_jax.gaits.floquet import floquet_multipliers
+from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
@@ -170,13 +173,13 @@ class GaitContinuation(AbstractContinuation):
 @with_default_jax_settings
 @announce_wait("gaits, their derivatives and special points", "30 s")
 def continue_branch(
-    params: WheelParams,
+    params: Any,
     name: str,
     bounds: tuple[float, float],
     *,
-    cycle: LimitCycle | ReturnMapCycle | None = None,
+    cycle: Any = None,
     period_n: int = 1,
-    model: ModelLike | None = None,
+    model: ModelLike | HybridSystem | None = None,
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
@@ -204,6 +207,9 @@ def continue_branch(
     Model "auto" is replaced by the model that is selected for the start. If a margin of the paper's
     model is violated, the branch has a special point with the name of the margin. Beyond this point
     unilateral contact would be selected.
+
+    For a `HybridSystem`, `params` are its parameters, `name` is that of one of their entries, and
+    `cycle` is the `HybridGait` at `params`. Its bifurcations are located, as by `continue_map`.
 
     Args:
         params: one wheel; its gait is on the branch.
@@ -234,6 +240,17 @@ def continue_branch(
         >>> print(point.name, f"{point.value:.6f}", branch.ends[1])
         lambda_4_plus 219.847688 lambda 4 plus at 219.847688 ends it.
     """
+    if isinstance(model, HybridSystem):
+        check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
+        return continue_map(
+            make_section_map(model, name, period_n, step_options),
+            cycle.section_state,
+            float(find_parameter(params, name)),
+            bounds,
+            constants=params,
+            name=name,
+            options=options,
+        )
     require_single_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
         check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")

@@ -107,6 +107,7 @@ class SolverStepEnd(NamedTuple):
 
     end_time: Scalar
     state: StateArray
+    state_rate: StateArray
     solver_state: Any
     guard_and_margin_values: Float[Array, " n_guards_and_margins"]
     guard_and_margin_rates: Float[Array, " n_guards_and_margins"]
@@ -162,7 +163,7 @@ def make_empty_interior_margin_minima(
     zero_margins = jnp.zeros((n_margins,), start_state.dtype)
     return InteriorMarginMinima(
         zero_margins + jnp.inf,
-        jnp.tile(start_state, (n_margins, 1)),
+        jnp.broadcast_to(start_state, (n_margins, len(start_state))),
         zero_margins,
         zero_margins,
         zero_margins,
@@ -244,6 +245,10 @@ def select_entry_by_mask(entry_index: Int[Array, ""], stacked_entries: Array) ->
     )
 
 
+def select_flag(index: Int[Array, ""], flags: Bool[Array, " n"]) -> Bool[Array, ""]:
+    return jnp.any(flags & (jnp.arange(len(flags)) == index))
+
+
 def advance_margin_minimum_refinement(
     margin_minimum_refinement: MarginMinimumRefinement,
     guards_and_margins: GuardsAndMargins,
@@ -251,7 +256,6 @@ def advance_margin_minimum_refinement(
     tried_step_end: SolverStepEnd,
     step_length: Scalar,
     is_refining: Bool[Array, ""],
-    is_phase_start: Bool[Array, ""],
     is_phase_end: Bool[Array, ""],
     max_iterations: int,
     min_iterations: int = 3,
@@ -264,8 +268,6 @@ def advance_margin_minimum_refinement(
 
     - `tried_step_end`: end of the last solver step;
     - `is_refining`: whether `tried_step_end` was such an iteration;
-    - `is_phase_start`: whether `tried_step_end` is the start of the phase, where the margins are
-      stored;
     - `is_phase_end`: whether the integration has ended, so that the first margin is refined next;
     - `max_iterations`, `min_iterations`: largest and smallest number of iterations per margin. The
       smallest number is required because each iteration makes the derivatives of the minimum's time
@@ -299,9 +301,6 @@ def advance_margin_minimum_refinement(
         jnp.minimum(margin_value, lowest_margin_values),
         lowest_margin_values,
     )
-    start_margin_values = jnp.where(
-        jnp.asarray(guards_and_margins.includes_phase_start), margin_values, jnp.inf
-    )
     needs_margin_refinement = jnp.isfinite(interior_margin_minima.interior_minimum_values) & (
         is_phase_end | (margin_indices > margin_index)
     )
@@ -326,7 +325,7 @@ def advance_margin_minimum_refinement(
             n_iterations,
             best_step_length,
             best_margin_rate,
-            jnp.where(is_phase_start, start_margin_values, lowest_margin_values),
+            lowest_margin_values,
         ),
         jnp.where(is_next_margin_selected, jnp.any(needs_margin_refinement), is_refining),
         jnp.where(is_next_margin_selected, time_to_minimum, proposed_step_length),

@@ -24,8 +24,13 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.status_codes import StatusCode, describe_step_ending
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
-from vrw_jax.flow.phase_integration import VectorField, integrate_phase
+from vrw_jax.flow.diffrax_minima import (
+    GuardsAndMargins,
+    StateArray,
+    select_entry_by_mask,
+)
+from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
+from vrw_jax.flow.solver_steps import VectorField
 from vrw_jax.lanes.batching import make_opaque_loop_condition
 from vrw_jax.lanes.program_cache import call_compiled_program
 from vrw_jax.lanes.settings import with_default_jax_settings
@@ -42,12 +47,23 @@ class Guard(NamedTuple):
     """Guard function `value`, with the reset and the next mode that follow its event.
 
     The function `value` of the state is positive inside its mode. The mode ends when `value` falls
-    to zero. Then `reset` is applied to the state, and the mode with the index `target_mode` begins.
+    to zero. Then `reset` is applied to the state, and the mode `target_mode` begins. A guard with a
+    function `armed` counts only while `armed` is positive, for example so that a foot that swings
+    through the ground at mid-stance does not land there. The mode also ends if `value` is negative
+    when `armed` becomes positive.
     """
 
-    value: Callable[[StateArray], Scalar]
-    reset: Callable[[StateArray], StateArray] = lambda y: y
-    target_mode: int | None = None  # index of the next mode; None stands for the same mode
+    value: Callable[..., Scalar]
+    reset: Callable[..., StateArray] = lambda y, *_: y
+    target_mode: Any = None  # index or name of the next mode; None stands for the same mode
+    armed: Callable[..., Scalar] | None = None
+
+    def evaluate(self, *state_and_parameters: Any) -> Any:
+        """Return the value that ends the mode when it falls to zero."""
+        value = self.value(*state_and_parameters)
+        return (
+            value if self.armed is None else jnp.maximum(value, -self.armed(*state_and_parameters))
+        )
 
 
 class Mode(NamedTuple):
@@ -58,11 +74,11 @@ class Mode(NamedTuple):
     """
 
     field: VectorField
-    guards: tuple[Guard, ...]
+    guards: Any  # Guards in a tuple; in a `HybridSystem`, a dictionary of Guards by name
 
     def guard_values(self, y: StateArray) -> Array:
         """Return the values of all guards at the state `y`, shape (guards,)."""
-        return jnp.stack([guard.value(y) for guard in self.guards])
+        return jnp.stack([guard.evaluate(y) for guard in self.guards])
 
 
 class Termination(StatusCode):
@@ -80,6 +96,7 @@ class Termination(StatusCode):
         5,
         "The steps are too short, or an event is not located: a singular field or a noisy guard.",
     )
+    SECTION_REACHED = 6, "The step is complete: it has reached the section."
 
 
 STATUS_RUNNING_CODE = -1
@@ -162,7 +179,7 @@ def simulate_hybrid(
         _check_output_shape(f"the field of mode {mode_number}", field, start, start.shape)
         for guard_number, guard in enumerate(guards):
             guard_name = f"guard {guard_number} of mode {mode_number}"
-            _check_output_shape(guard_name, guard.value, start, ())
+            _check_output_shape(guard_name, guard.evaluate, start, ())
             _check_output_shape(f"the reset of {guard_name}", guard.reset, start, start.shape)
             if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
                 raise ValueError(
@@ -171,7 +188,7 @@ def simulate_hybrid(
                 )
     options.check_tolerances(start.dtype)
     mode_index = jnp.asarray(mode, jnp.int32)
-    solution = call_compiled_program(_simulate_modes, (modes, events), options, start, mode_index)
+    solution = call_compiled_program(simulate_modes, (modes, events), options, start, mode_index)
     return forbid_reverse_mode("simulate_hybrid", solution)
 
 
@@ -215,7 +232,7 @@ def _estimate_time_errors(
     def compute_time_change(tolerance_factor: Array) -> Array:
         looser_options = options.with_tightened_tolerances(tolerance_factor)
         modes_and_max_events = (modes, len(event_indices))
-        looser_solution = _simulate_modes(
+        looser_solution = simulate_modes(
             modes_and_max_events, looser_options, start, solution.modes[0]
         )
         is_same_event = (looser_solution.guards == solution.guards) & (
@@ -261,6 +278,7 @@ def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
         modes = (modes,)  # type: ignore[assignment]
     check_type("modes", modes, (list, tuple), "give Modes in a list")
     modes_with_guard_tuples = []
+    mode: Any
     for mode in modes:
         check_type("a mode", mode, Mode, "give Mode(field, guards)")
         guards = (mode.guards,) if isinstance(mode.guards, Guard) else mode.guards
@@ -292,13 +310,16 @@ def _check_output_shape(
 
 
 def _simulate_one_event(
-    modes: tuple[Mode, ...], mode_index: int, options: StepOptions, state: Array, time: Array
-) -> tuple:
-    """Integrate one phase in a mode, apply the reset at its end, and return both results.
+    modes: tuple[Mode, ...],
+    mode_index: int,
+    options: StepOptions,
+    state: Array,
+    time: Array,
+) -> tuple[PhaseEnd, Array, Array, Array]:
+    """Integrate one phase in a mode, and apply the reset at its end.
 
-    The result consists of the end of the phase, whether a guard is violated at its start, the
-    errors of the event time due to tolerance and to round-off of the state (s), the next state and
-    the next mode. The errors are large if the guard is grazed.
+    Return the end of the phase, whether a guard is violated at its start, the next state and the
+    next mode.
     """
     mode = modes[mode_index]
     compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
@@ -325,22 +346,121 @@ def _simulate_one_event(
     )
     phase_end = integrate_phase(mode.field, guards_and_margins, state, ~is_guard_violated, options)
     guard_index = jnp.maximum(phase_end.end_guard_index, 0)
-    end_state = lax.stop_gradient(phase_end.state)
-    guard_gradient = jax.jacfwd(mode.guard_values)(end_state)[guard_index]
-    state_roundoff = jnp.finfo(state.dtype).eps * jnp.abs(end_state)
-    state_tolerance = options.atol + options.rtol * jnp.abs(end_state)
-    guard_rate = jnp.abs(guard_gradient @ mode.field(end_state))
-    event_time_errors = [
-        lax.stop_gradient(jnp.abs(guard_gradient) @ state_error_bound / guard_rate)
-        for state_error_bound in (state_tolerance, state_roundoff)
-    ]
     next_state = lax.switch(guard_index, [g.reset for g in mode.guards], phase_end.state)
     next_modes = [mode_index if g.target_mode is None else g.target_mode for g in mode.guards]
-    next_mode = jnp.asarray(next_modes, jnp.int32)[guard_index]
-    return phase_end, is_guard_violated, event_time_errors, next_state, next_mode
+    next_mode = select_entry_by_mask(guard_index, jnp.asarray(next_modes, jnp.int32))
+    return phase_end, is_guard_violated, next_state, next_mode.astype(jnp.int32)
 
 
-def _simulate_modes(
+class EventRun(NamedTuple):
+    """Simulation after some events."""
+
+    time: Scalar
+    time_remainder: Scalar  # rounding error of the sum of durations, s
+    state: StateArray
+    mode: Int[Array, ""]
+    n_events: Int[Array, ""]
+    n_events_without_progress: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+    termination: Int[Array, ""]  # a Termination
+    log: Any
+
+
+class Event(NamedTuple):
+    """Event of a simulation, with the state before and after its reset."""
+
+    time: Scalar
+    duration: Scalar  # since the event before, s
+    state_before: StateArray
+    state_after: StateArray
+    mode: Int[Array, ""]
+    guard: Int[Array, ""]
+
+
+def run_events(
+    modes: tuple[Mode, ...],
+    options: StepOptions,
+    start: StateArray,
+    first_mode: Array,
+    max_events: int,
+    log: Any,
+    update_log: Callable[[Any, Array, Array, Event], Any],
+    is_last_event: Callable[[Event], Array] = lambda event: jnp.asarray(False),
+) -> EventRun:
+    """Simulate until an event is the last, until `max_events` events, or until a failure.
+
+    - `log`, `update_log`: what is recorded; `update_log(log, n_events, has_event, event)` returns
+      the log after a phase, for the number of events before its end. If the phase ends without an
+      event, `has_event` is False, and the log must not change.
+    """
+    mode_branches = [
+        functools.partial(_simulate_one_event, modes, mode_index, options)
+        for mode_index in range(len(modes))
+    ]
+    # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
+    max_simultaneous_events = sum(len(mode.guards) ** 2 for mode in modes)
+
+    def simulate_next_event(run: EventRun) -> EventRun:
+        phase_end, is_guard_violated, next_state, next_mode = lax.switch(
+            run.mode, mode_branches, run.state, run.time
+        )
+        has_event = ~is_guard_violated & (phase_end.end_guard_index >= 0)
+        # D. E. Knuth's two-sum returns the rounded sum of two times and its rounding error.
+        duration = phase_end.duration + run.time_remainder
+        time = run.time + duration
+        rounded_duration = time - run.time
+        time_remainder = (run.time - (time - rounded_duration)) + (duration - rounded_duration)
+        n_without_progress = jnp.where(time > run.time, 0, run.n_events_without_progress + 1)
+        event = Event(
+            time, phase_end.duration, phase_end.state, next_state, run.mode,
+            phase_end.end_guard_index,
+        )  # fmt: skip
+        # The first condition that holds determines the termination.
+        termination = jnp.select(
+            [
+                has_event & (n_without_progress > max_simultaneous_events),
+                has_event & is_last_event(event),
+                has_event & (run.n_events + 1 >= max_events),
+                has_event,
+                is_guard_violated,
+                phase_end.has_integration_failed
+                & (phase_end.solver_steps >= options.max_solver_steps),
+                phase_end.is_timed_out,
+            ],
+            [
+                Termination.ZENO,
+                Termination.SECTION_REACHED,
+                Termination.MAX_EVENTS_REACHED,
+                STATUS_RUNNING_CODE,
+                Termination.GUARD_VIOLATED_AT_ENTRY,
+                Termination.MAX_STEPS_REACHED,
+                Termination.MAX_TIME_REACHED,
+            ],
+            Termination.STEP_SIZE_UNDERFLOW,
+        )
+        return EventRun(
+            time=time,
+            time_remainder=time_remainder,
+            state=jnp.where(has_event, next_state, phase_end.state),
+            mode=jnp.where(has_event, next_mode, run.mode).astype(jnp.int32),
+            n_events=run.n_events + has_event,
+            n_events_without_progress=n_without_progress.astype(jnp.int32),
+            solver_steps=run.solver_steps + phase_end.solver_steps,
+            termination=termination.astype(jnp.int32),
+            log=update_log(run.log, run.n_events, has_event, event),
+        )
+
+    count, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
+    first_run = EventRun(
+        zero, zero, start, count + first_mode, count, count, count, count + STATUS_RUNNING_CODE, log
+    )
+    is_running = lambda run: make_opaque_loop_condition(
+        run.termination == STATUS_RUNNING_CODE, run.n_events
+    )
+    return lax.while_loop(is_running, simulate_next_event, first_run)
+
+
+def simulate_modes(
     modes_and_max_events: tuple[tuple[Mode, ...], int],
     options: StepOptions,
     start: Array,
@@ -352,99 +472,46 @@ def _simulate_modes(
     """
     modes, events = modes_and_max_events
 
-    mode_branches = [
-        functools.partial(_simulate_one_event, modes, mode_index, options)
-        for mode_index in range(len(modes))
-    ]
-    # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
-    max_simultaneous_events = sum(len(mode.guards) ** 2 for mode in modes)
+    def estimate_time_errors(state: Array, mode_index: int) -> list[Array]:
+        """Return errors of an event's time due to tolerance and to round-off, for all guards, s."""
+        mode = modes[mode_index]
+        guard_gradients = jax.jacfwd(mode.guard_values)(state)
+        guard_rates = jnp.abs(guard_gradients @ mode.field(state))
+        n_absent = max(len(mode.guards) for mode in modes) - len(mode.guards)
+        return [
+            jnp.pad(jnp.abs(guard_gradients) @ state_errors / guard_rates, (0, n_absent))
+            for state_errors in (
+                options.atol + options.rtol * jnp.abs(state),
+                jnp.finfo(state.dtype).eps * jnp.abs(state),
+            )
+        ]
 
-    def simulate_next_event(loop_carry: tuple) -> tuple:
-        solution, n_events_without_progress, time_roundoff_remainder = loop_carry
-        phase_end, is_guard_violated, event_time_errors, next_state, next_mode = lax.switch(
-            solution.mode, mode_branches, solution.state, solution.time
+    def record_event(
+        log: list[Array], n_events: Array, has_event: Array, event: Event
+    ) -> list[Array]:
+        event_index = jnp.minimum(n_events, events - 1)
+        time_errors = lax.switch(
+            event.mode,
+            [functools.partial(estimate_time_errors, mode_index=i) for i in range(len(modes))],
+            lax.stop_gradient(event.state_before),
         )
-        has_event = ~is_guard_violated & (phase_end.end_guard_index >= 0)
-        # D. E. Knuth's two-sum returns the rounded sum of two times and its rounding error.
-        duration = phase_end.duration + time_roundoff_remainder
-        time = solution.time + duration
-        rounded_duration = time - solution.time
-        time_roundoff_remainder = (solution.time - (time - rounded_duration)) + (
-            duration - rounded_duration
-        )
-        n_events_without_progress = jnp.where(
-            time > solution.time, 0, n_events_without_progress + 1
-        )
-        # The first condition that holds determines the termination.
-        termination = jnp.select(
-            [
-                has_event & (n_events_without_progress > max_simultaneous_events),
-                has_event & (solution.n_events + 1 >= events),
-                has_event,
-                is_guard_violated,
-                phase_end.has_integration_failed
-                & (phase_end.solver_steps >= options.max_solver_steps),
-                phase_end.is_timed_out,
-            ],
-            [
-                Termination.ZENO,
-                Termination.MAX_EVENTS_REACHED,
-                STATUS_RUNNING_CODE,
-                Termination.GUARD_VIOLATED_AT_ENTRY,
-                Termination.MAX_STEPS_REACHED,
-                Termination.MAX_TIME_REACHED,
-            ],
-            Termination.STEP_SIZE_UNDERFLOW,
-        )
-        event_index = jnp.where(has_event, solution.n_events, events)
-        event_entries = (
-            time,
-            *event_time_errors,
-            phase_end.state,
-            next_state,
-            solution.mode,
-            phase_end.end_guard_index,
-        )
-        times, time_tolerance, time_roundoff, states_before, states_after, modes, guards = (
-            record.at[event_index].set(entry, mode="drop")
-            for record, entry in zip(solution[: len(event_entries)], event_entries, strict=True)
-        )
-        return (
-            HybridSolution(
-                times,
-                time_tolerance,
-                time_roundoff,
-                states_before,
-                states_after,
-                modes,
-                guards,
-                n_events=solution.n_events + has_event,
-                time=time,
-                state=jnp.where(has_event, next_state, phase_end.state),
-                mode=jnp.where(has_event, next_mode, solution.mode).astype(jnp.int32),
-                solver_steps=solution.solver_steps + phase_end.solver_steps,
-                termination=termination.astype(jnp.int32),
-            ),
-            n_events_without_progress,
-            time_roundoff_remainder,
+        entries = (
+            event.time,
+            *(select_entry_by_mask(event.guard, x) for x in lax.stop_gradient(time_errors)),
+            *event[2:],
         )
 
-    initial_count, float_zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
-    initial_states = jnp.zeros((events, start.size)) + float_zero
-    initial_indices = jnp.zeros((events,), jnp.int32)
-    initial_times = jnp.zeros(events) + float_zero
-    initial_time_errors = lax.stop_gradient(initial_times)
-    initial_solution = HybridSolution(
-        times=initial_times, time_tolerance=initial_time_errors, time_roundoff=initial_time_errors,
-        states_before=initial_states, states_after=initial_states,
-        modes=initial_indices, guards=initial_indices, n_events=initial_count,
-        time=float_zero, state=start,
-        mode=initial_count + first_mode_index,
-        solver_steps=initial_count, termination=initial_count + STATUS_RUNNING_CODE,
-    )  # fmt: skip
-    is_running = lambda loop_carry: make_opaque_loop_condition(
-        loop_carry[0].termination == STATUS_RUNNING_CODE, loop_carry[0].n_events
-    )
-    return lax.while_loop(
-        is_running, simulate_next_event, (initial_solution, initial_count, float_zero)
-    )[0]
+        def write(record: Array, entry: Array) -> Array:
+            previous = lax.dynamic_index_in_dim(record, event_index, keepdims=False)
+            entry = jnp.where(has_event, entry, previous).astype(record.dtype)
+            return lax.dynamic_update_index_in_dim(record, entry, event_index, 0)
+
+        return list(map(write, log, entries))
+
+    zero = 0.0 * start[0]
+    times, states = jnp.zeros(events) + zero, jnp.zeros((events, start.size)) + zero
+    time_errors, indices = lax.stop_gradient(times), jnp.zeros((events,), jnp.int32)
+    log = [times, time_errors, time_errors, states, states, indices, indices]
+    run = run_events(modes, options, start, first_mode_index, events, log, record_event)
+    last_values = run.n_events, run.time, run.state, run.mode, run.solver_steps, run.termination
+    return HybridSolution._make((*run.log, *last_values))

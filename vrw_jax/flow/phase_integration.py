@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -35,15 +34,14 @@ from vrw_jax.flow.diffrax_minima import (
     is_guard_at_roundoff,
     make_empty_interior_margin_minima,
     select_entry_by_mask,
+    select_flag,
     update_interior_margin_minima,
 )
+from vrw_jax.flow.solver_steps import AbstractStepper, VectorField, make_stepper
 from vrw_jax.lanes.batching import make_opaque_loop_condition, select_trees_by_condition
 
 if TYPE_CHECKING:
-    import diffrax
-
-VectorField = Callable[[StateArray], StateArray]
-"""Autonomous vector field of a phase: function that returns the time derivative of the state."""
+    pass
 
 
 class PhaseEnd(NamedTuple):
@@ -61,46 +59,24 @@ class PhaseEnd(NamedTuple):
 class StepPurpose(IntEnum):
     """Purpose of the next solver step."""
 
-    START = 0  # A step of length zero evaluates the start.
-    INTEGRATION = 1
-    EVENT_SEARCH = 2  # The step locates a bracketed event.
-    REFINEMENT = 3  # The step refines the minimum of a margin.
-    DONE = 4  # No further step is taken.
+    INTEGRATION = 0
+    EVENT_SEARCH = 1  # The step locates a bracketed event.
+    REFINEMENT = 2  # The step refines the minimum of a margin.
+    DONE = 3  # No further step is taken.
 
 
-@dataclass(frozen=True)
-class EventSearchOptions:
-    """Options of the search for an event, and of the growth of solver steps."""
+EVENT_TIME_ACCURACY = 1e-8
+"""Largest correction of the event's time by a Newton iteration that ends the search.
 
-    max_solver_step_growth: float = 2.0
-    """Largest ratio of the lengths of successive solver steps.
+The correction is relative to the time since the phase began. The value is chosen because the state
+is extrapolated linearly over the correction, with an error of its square, which is round-off.
+"""
+STALLED_CORRECTION_RATIO = 0.9
+"""Ratio of successive corrections of the event's time above which a correction is round-off.
 
-    The error estimate for a solver step far shorter than needed is round-off. A length derived from
-    that estimate would grow without bound. The result for a batch element would then differ by
-    1e-12 from the result for the same system alone. The value is chosen to avoid this difference,
-    which is more than a hundred times the round-off.
-    """
-    n_required_confirming_steps: int = 3
-    """Number of solver steps to the located event that must confirm the event's time.
-
-    The value is chosen because Newton's method squares `max_confirming_time_correction` twice. The
-    last step evaluates the state at the event.
-    """
-    max_confirming_time_correction: float = 1e-4
-    """Largest correction of the event's time by a Newton iteration that confirms this time.
-
-    The correction is relative to the duration of the phase. The value is chosen because Newton's
-    method squares the correction in each of the next two iterations, to 1e-16 in the last.
-    """
-    min_stalled_correction_ratio: float = 0.9
-    """Ratio of successive corrections of the event's time above which a correction is round-off.
-
-    The value is chosen because Newton's method at least halves the corrections. The exception is a
-    triple root, at which it reduces them to two thirds.
-    """
-
-
-EVENT_SEARCH_OPTIONS = EventSearchOptions()
+The value is chosen because Newton's method at least halves the corrections. The exception is a
+triple root, at which it reduces them to two thirds.
+"""
 
 
 class _EventSearch(NamedTuple):
@@ -113,7 +89,7 @@ class _EventSearch(NamedTuple):
     upper_step_length_bound: Scalar
     time_tolerance: Scalar  # tolerance of the event's time, s
     n_iterations: Int[Array, ""]
-    n_confirming_steps: Int[Array, ""]  # number of solver steps that confirmed the time
+    is_located: Bool[Array, ""]
     last_event_time_correction: Scalar  # last correction of the event's time, s
 
     def propose_event_time(
@@ -155,15 +131,18 @@ class _EventSearch(NamedTuple):
         upper_step_length_bound = jnp.where(
             is_step_before_event, self.upper_step_length_bound, lax.stop_gradient(step_length)
         )
-        earliest_proposed_step_length = proposed_step_lengths[proposing_guard_index]
+        is_proposal_finite = jnp.isfinite(jnp.min(proposed_step_lengths))
+        finite_proposed_step_length = select_entry_by_mask(
+            proposing_guard_index,
+            jnp.where(jnp.isfinite(proposed_step_lengths), proposed_step_lengths, 0.0),
+        )
         # A proposal within round-off of a collapsed bracket counts as inside.
         is_proposal_in_bracket = (
-            earliest_proposed_step_length >= lower_step_length_bound - self.time_tolerance
-        ) & (earliest_proposed_step_length <= upper_step_length_bound + self.time_tolerance)
-        # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
-        finite_proposed_step_length = jnp.where(
-            jnp.isfinite(earliest_proposed_step_length), earliest_proposed_step_length, 0.0
+            is_proposal_finite
+            & (finite_proposed_step_length >= lower_step_length_bound - self.time_tolerance)
+            & (finite_proposed_step_length <= upper_step_length_bound + self.time_tolerance)
         )
+        # If round-off moves Newton's proposal out of the bracket, its derivative is still valid.
         bisected_step_length = 0.5 * (lower_step_length_bound + upper_step_length_bound) + (
             finite_proposed_step_length - lax.stop_gradient(finite_proposed_step_length)
         )
@@ -194,122 +173,6 @@ class _PhaseState(NamedTuple):
     n_tried_steps: Int[Array, ""]
 
 
-class _SolverStepper(NamedTuple):
-    """diffrax solver and step-size controller for single solver steps in one vector field."""
-
-    vector_field: VectorField
-    diffrax_solver: diffrax.AbstractAdaptiveSolver
-    step_size_controller: diffrax.PIDController
-    ode_term: diffrax.ODETerm
-
-    def init_solver_and_controller(
-        self, state: StateArray, options: StepOptions
-    ) -> tuple[Any, Any]:
-        """Return the initial internal states of diffrax's solver and step-size controller."""
-        zero_duration = jnp.zeros((), state.dtype)
-        _, controller_state = self.step_size_controller.init(
-            self.ode_term,
-            zero_duration,
-            options.dt0,
-            lax.stop_gradient(state),
-            options.dt0,
-            None,
-            lambda terms, t, y, args: terms.vf(t, y, args),
-            self.diffrax_solver.error_order(self.ode_term),
-        )
-        return self.init_solver_state(state, options), controller_state
-
-    def init_solver_state(self, state: StateArray, options: StepOptions) -> Any:
-        """Return the internal state of diffrax's solver for a start at `state`."""
-        zero_duration = jnp.zeros((), state.dtype)
-        return self.diffrax_solver.init(self.ode_term, zero_duration, options.dt0, state, None)
-
-    def take_solver_step(
-        self, state: StateArray, solver_state: Any, step_length: Scalar
-    ) -> tuple[StateArray, StateArray, Any]:
-        """Return the state after a solver step of `step_length`, s, and its error estimate.
-
-        The third result is the new internal state of the solver.
-        """
-        import diffrax  # This import is slow.
-
-        zero_duration = jnp.zeros_like(step_length)
-        end_state, error_estimate, _, solver_state, solver_result = self.diffrax_solver.step(
-            self.ode_term, zero_duration, step_length, state, None, solver_state, jnp.asarray(False)
-        )
-        if error_estimate is None:
-            raise ValueError(
-                f"{type(self.diffrax_solver).__name__} gives no error estimate, but the step size "
-                "is controlled by one: take 'Dopri8', 'Tsit5' or 'Kvaerno5'."
-            )
-        error_estimate = jnp.where(
-            solver_result == diffrax.RESULTS.successful, error_estimate, jnp.inf
-        )
-        return end_state, error_estimate, solver_state
-
-    def control_step_size(
-        self,
-        start_state: StateArray,
-        end_state: StateArray,
-        error_estimate: StateArray,
-        step_length: Scalar,
-        controller_state: Any,
-    ) -> tuple[Bool[Array, ""], Scalar, Any]:
-        """Return whether the error of a solver step is acceptable, and the next step length, s.
-
-        The third result is the new state of the controller. The results have no derivatives,
-        because only the solver steps are differentiated.
-        """
-        start_state, end_state, error_estimate = lax.stop_gradient(
-            (start_state, end_state, error_estimate)
-        )
-        is_end_state_finite = jnp.all(jnp.isfinite(end_state))
-        is_within_tolerance, next_step_start, next_step_end, _, controller_state, _ = (
-            self.step_size_controller.adapt_step_size(
-                jnp.zeros_like(step_length),
-                step_length,
-                start_state,
-                jnp.where(is_end_state_finite, end_state, start_state),
-                None,
-                jnp.where(is_end_state_finite, error_estimate, jnp.inf),
-                self.diffrax_solver.error_order(self.ode_term),  # type: ignore[arg-type]
-                controller_state,
-            )
-        )
-        return (
-            jnp.asarray(is_within_tolerance),
-            jnp.asarray(next_step_end - next_step_start),
-            controller_state,
-        )
-
-
-def _make_stepper(vector_field: VectorField, options: StepOptions) -> _SolverStepper:
-    """Return the solver and step-size controller that `options` select for a vector field.
-
-    The solver is configured for forward-mode derivatives.
-    """
-    import diffrax  # This import is slow.
-
-    diffrax_solver_class = getattr(diffrax, options.solver)
-    field_names = diffrax_solver_class.__dataclass_fields__
-    solver_arguments: dict[str, Any] = {}
-    if "scan_kind" in field_names:
-        solver_arguments["scan_kind"] = "lax"
-    if "root_finder" in field_names:
-        tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
-        solver_arguments["root_finder"] = diffrax.VeryChord(**tolerances)
-    return _SolverStepper(
-        vector_field=vector_field,
-        diffrax_solver=diffrax_solver_class(**solver_arguments),
-        step_size_controller=diffrax.PIDController(
-            rtol=options.rtol,
-            atol=options.atol,
-            factormax=EVENT_SEARCH_OPTIONS.max_solver_step_growth,
-        ),
-        ode_term=diffrax.ODETerm(lambda t, y, args: vector_field(y)),
-    )
-
-
 def integrate_phase(
     vector_field: VectorField,
     guards_and_margins: GuardsAndMargins,
@@ -330,7 +193,7 @@ def integrate_phase(
     the phase. If `is_active` is False, nothing is integrated. Errors are those of the solver for
     the tolerances of `options`.
     """
-    phase_context = _PhaseContext(_make_stepper(vector_field, options), guards_and_margins, options)
+    phase_context = _PhaseContext(make_stepper(vector_field, options), guards_and_margins, options)
     phase_state = lax.while_loop(
         lambda phase_state: make_opaque_loop_condition(
             phase_state.step_purpose != StepPurpose.DONE, phase_state.n_tried_steps
@@ -366,15 +229,14 @@ def _attach_event_derivatives(
     solver_stepper, guards_and_margins, _ = phase_context
     step_start, step_end = phase_state.last_step_start, phase_state.last_accepted_step_end
     guard_index = phase_state.triggered_guard_index
-    was_located = (guard_index >= 0) & (
-        phase_state.event_search.n_confirming_steps
-        >= EVENT_SEARCH_OPTIONS.n_required_confirming_steps
-    )
+    was_located = (guard_index >= 0) & phase_state.event_search.is_located
 
     def evaluate_event_equations(event: tuple[Scalar, StateArray]) -> tuple[Scalar, StateArray]:
         end_time, state = event
-        guard_value = guards_and_margins.evaluate_guards_and_margins(state)[guard_index]
-        reached_state, _, _ = solver_stepper.take_solver_step(
+        guard_value = select_entry_by_mask(
+            guard_index, guards_and_margins.evaluate_guards_and_margins(state)
+        )
+        reached_state, *_ = solver_stepper.step(
             step_start.state, step_start.solver_state, end_time - step_start.end_time
         )
         return (
@@ -406,7 +268,7 @@ def _attach_event_derivatives(
 class _PhaseContext(NamedTuple):
     """Arguments of the integration loop that do not change during a phase."""
 
-    solver_stepper: _SolverStepper
+    solver_stepper: AbstractStepper
     guards_and_margins: GuardsAndMargins
     step_options: StepOptions
 
@@ -419,48 +281,50 @@ def _init_phase_state(
     All arrays that the loop batches or differentiates are batched or differentiated from the start.
     Otherwise JAX would trace the loop again for each array that becomes batched or differentiated.
     """
-    solver_stepper, guards_and_margins, options = phase_context
-    zero_duration = 0.0 * start_state[0]
-    initial_count = jnp.where(is_active, 0, 0).astype(jnp.int32)
-    initial_values = (
-        jnp.zeros(
-            jax.eval_shape(guards_and_margins.evaluate_guards_and_margins, start_state).shape,
-            start_state.dtype,
-        )
-        + zero_duration
+    stepper, guards_and_margins, options = phase_context
+    n_guards = guards_and_margins.n_guards
+    no_time = 0.0 * start_state[0]
+    rate, memory, control_state = stepper.start(start_state, options)
+    values, rates = jax.jvp(guards_and_margins.evaluate_guards_and_margins, (start_state,), (rate,))
+    is_guard_met, is_guard_falling = find_guards_met_at_start(
+        guards_and_margins, values[:n_guards], rates[:n_guards]
     )
-    initial_flag = is_active & False
-    float_zero = lax.stop_gradient(zero_duration)
-    solver_state, controller_state = solver_stepper.init_solver_and_controller(start_state, options)
-    is_guard_crossing = jnp.zeros((guards_and_margins.n_guards,), bool) | initial_flag
-    start = SolverStepEnd(zero_duration, start_state, solver_state, initial_values, initial_values)
+    first_met_guard = jnp.argmax(is_guard_met).astype(jnp.int32)
+    # An event at time zero is searched for like any other, because its time depends on the start.
+    is_event_searched = is_active & select_flag(first_met_guard, is_guard_falling)
+    has_event = is_active & jnp.any(is_guard_met) & ~is_event_searched
+    float_zero, count = lax.stop_gradient(no_time), jnp.where(is_active, 0, 0).astype(jnp.int32)
+    start = SolverStepEnd(no_time, start_state, rate, memory, values, rates)
+    purpose = jnp.where(is_event_searched, StepPurpose.EVENT_SEARCH, StepPurpose.INTEGRATION)
+    includes_start = jnp.asarray(guards_and_margins.includes_phase_start, bool)
     return _PhaseState(
-        step_purpose=jnp.where(is_active, StepPurpose.START, StepPurpose.DONE).astype(jnp.int32),
+        step_purpose=jnp.where(is_active & ~has_event, purpose, StepPurpose.DONE).astype(jnp.int32),
         last_accepted_step_end=start,
         last_step_start=start,
-        next_step_length=zero_duration,  # The first step has length zero and evaluates the start.
-        controller_state=jax.tree.map(lambda x: x + float_zero, controller_state),
+        next_step_length=no_time
+        + jnp.where(is_event_searched, 0.0, jnp.minimum(options.dt0, options.max_phase_time)),
+        controller_state=jax.tree.map(lambda x: x + float_zero, control_state),
         event_search=_EventSearch(
-            is_guard_crossing,
-            float_zero,
-            float_zero,
-            float_zero,
-            initial_count,
-            initial_count,
-            float_zero,
+            is_guard_crossing=is_event_searched & (jnp.arange(n_guards) == first_met_guard),
+            lower_step_length_bound=float_zero,
+            upper_step_length_bound=float_zero,
+            time_tolerance=float_zero,
+            n_iterations=count,
+            is_located=is_active & False,
+            last_event_time_correction=float_zero + jnp.inf,
         ),
         interior_margin_minima=make_empty_interior_margin_minima(guards_and_margins, start_state),
         margin_minimum_refinement=MarginMinimumRefinement(
-            initial_count,
-            initial_count,
+            count,
+            count,
             float_zero,
             float_zero,
-            initial_values[guards_and_margins.n_guards :] + jnp.inf,
+            jnp.where(includes_start, values[n_guards:], jnp.inf),
         ),
-        triggered_guard_index=initial_count - 1,
-        is_timed_out=initial_flag,
-        has_integration_failed=initial_flag,
-        n_tried_steps=initial_count,
+        triggered_guard_index=jnp.where(has_event, first_met_guard, -1) + count,
+        is_timed_out=is_active & False,
+        has_integration_failed=is_active & False,
+        n_tried_steps=count,
     )
 
 
@@ -470,93 +334,51 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
     The searches for the event and for minima of margins are updated.
     """
     _, guards_and_margins, options = phase_context
-    n_guards, event_search = guards_and_margins.n_guards, phase_state.event_search
     previous_step_end = phase_state.last_accepted_step_end
     step_length = phase_state.next_step_length
-    is_phase_start = phase_state.step_purpose == StepPurpose.START
     is_searching_event = phase_state.step_purpose == StepPurpose.EVENT_SEARCH
     tried_step_end, error_estimate = _try_solver_step(phase_context, phase_state)
-    guard_values = tried_step_end.guard_and_margin_values[:n_guards]
-    guard_rates = tried_step_end.guard_and_margin_rates[:n_guards]
-    is_guard_met, is_guard_falling = find_guards_met_at_start(
-        guards_and_margins, guard_values, guard_rates
-    )
-    first_met_guard_index = jnp.argmax(is_guard_met).astype(jnp.int32)
-    # An event at time zero is searched for like any other, because its time depends on the start.
-    is_start_event_searched = is_phase_start & is_guard_falling[first_met_guard_index]
-    has_immediate_event = (
-        is_phase_start & jnp.any(is_guard_met) & ~is_guard_falling[first_met_guard_index]
-    )
     step_assessment = _assess_solver_step(
         phase_context, phase_state, tried_step_end, error_estimate
     )
-    proposed_step_length, proposing_guard_index, event_search = event_search.propose_event_time(
-        guard_values, guard_rates, step_length
+    event_search, event_guard_index, event_step_length = _improve_event_search(
+        phase_context, phase_state, tried_step_end, step_assessment
     )
-    # A try confirms the event if it changes the event's time by little compared with the step. For
-    # an event much earlier than the step's end, the change is also compared with the time since the
-    # phase began. The comparison is skipped if the change is only the guard's round-off.
-    proposed_step_length_value, step_length_value, start_time = lax.stop_gradient(
-        (proposed_step_length, step_length, previous_step_end.end_time)
+    is_at_event = event_search.is_located
+    # At the event, the state is extrapolated over the last correction of the event's time.
+    correction = jnp.where(is_at_event, event_step_length - step_length, 0.0)
+    tried_step_end = tried_step_end._replace(
+        end_time=jnp.where(
+            is_at_event, previous_step_end.end_time + event_step_length, tried_step_end.end_time
+        ),
+        state=tried_step_end.state + correction * tried_step_end.state_rate,
     )
-    event_time_correction = jnp.abs(proposed_step_length_value - step_length_value)
-    is_time_correction_small = (
-        event_time_correction
-        <= EVENT_SEARCH_OPTIONS.max_confirming_time_correction
-        * (start_time + proposed_step_length_value)
-    )
-    is_search_stalled = (
-        event_time_correction
-        >= EVENT_SEARCH_OPTIONS.min_stalled_correction_ratio
-        * event_search.last_event_time_correction
-    )
-    is_event_confirmed = (event_time_correction <= event_search.time_tolerance) & (
-        is_time_correction_small | is_search_stalled
-    )
-    is_guard_at_zero, lowest_guard_index = is_guard_at_roundoff(
-        guards_and_margins, event_search.is_guard_crossing, guard_values
-    )
-    event_guard_index = jnp.where(is_guard_at_zero, lowest_guard_index, proposing_guard_index)
-    n_confirming_steps = event_search.n_confirming_steps + (
-        is_searching_event & (is_event_confirmed | is_guard_at_zero)
-    )
-    is_at_event = is_searching_event & (
-        n_confirming_steps >= EVENT_SEARCH_OPTIONS.n_required_confirming_steps
-    )
-
-    is_timed_out = step_assessment.is_accepted & (tried_step_end.end_time >= options.max_phase_time)
-    is_timed_out = is_timed_out | (is_at_event & (tried_step_end.end_time > options.max_phase_time))
+    end_time, is_accepted = tried_step_end.end_time, step_assessment.is_accepted
+    is_timed_out = is_accepted & (end_time >= options.max_phase_time)
+    is_timed_out = is_timed_out | (is_at_event & (end_time > options.max_phase_time))
     is_step_too_short = step_assessment.is_step_too_short | (
         is_searching_event
         & ~is_at_event
         & (event_search.n_iterations >= options.max_event_iterations)
     )
-    is_phase_end = has_immediate_event | is_at_event | is_timed_out | is_step_too_short
-    is_event_search_started = step_assessment.has_guard_crossed | is_start_event_searched
-    step_purpose = jnp.where(is_phase_start, StepPurpose.INTEGRATION, phase_state.step_purpose)
-    step_purpose = jnp.where(is_event_search_started, StepPurpose.EVENT_SEARCH, step_purpose)
+    is_phase_end = is_at_event | is_timed_out | is_step_too_short
+    step_purpose = jnp.where(
+        step_assessment.has_guard_crossed, StepPurpose.EVENT_SEARCH, phase_state.step_purpose
+    )
     step_purpose = jnp.where(is_phase_end, StepPurpose.DONE, step_purpose).astype(jnp.int32)
     following_step_length = jnp.where(
-        is_start_event_searched, 0.0, lax.stop_gradient(step_assessment.following_step_length)
+        is_searching_event,
+        event_step_length,
+        lax.stop_gradient(step_assessment.following_step_length),
     )
-    following_step_length = jnp.where(
-        is_searching_event, proposed_step_length, following_step_length
-    )
-    is_guard_crossing = jnp.where(
-        step_assessment.has_guard_crossed,
-        step_assessment.is_guard_crossing,
-        event_search.is_guard_crossing,
-    )
-    is_first_met_guard = is_start_event_searched & (jnp.arange(n_guards) == first_met_guard_index)
-    is_step_taken = step_assessment.is_accepted | is_at_event
-    is_step_in_phase = (step_assessment.is_accepted & ~is_phase_start) | is_at_event
+    is_step_taken = is_accepted | is_at_event
     interior_margin_minima = update_interior_margin_minima(
         guards_and_margins,
         phase_state.interior_margin_minima,
         previous_step_end,
         tried_step_end,
         step_length,
-        is_step_in_phase,
+        is_step_taken,
     )
     margin_minimum_refinement = phase_state.margin_minimum_refinement
     if guards_and_margins.includes_phase_start:
@@ -569,7 +391,6 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
                 tried_step_end,
                 step_length,
                 was_refining_minimum,
-                is_phase_start,
                 is_phase_end,
                 options.max_margin_search_iterations,
             )
@@ -580,7 +401,7 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
             is_refining, step_length_to_minimum, following_step_length
         )
     return _PhaseState(
-        step_purpose=step_purpose,
+        step_purpose=step_purpose.astype(jnp.int32),
         last_accepted_step_end=select_trees_by_condition(
             is_step_taken, tried_step_end, previous_step_end
         ),
@@ -589,44 +410,61 @@ def _advance_phase_state(phase_context: _PhaseContext, phase_state: _PhaseState)
         ),
         next_step_length=following_step_length,
         controller_state=step_assessment.controller_state,
-        event_search=_EventSearch(
-            is_guard_crossing=jnp.where(
-                is_start_event_searched, is_first_met_guard, is_guard_crossing
-            ),
-            lower_step_length_bound=jnp.where(
-                is_event_search_started, 0.0, event_search.lower_step_length_bound
-            ),
-            upper_step_length_bound=jnp.where(
-                is_event_search_started,
-                lax.stop_gradient(step_length),
-                event_search.upper_step_length_bound,
-            ),
-            time_tolerance=jnp.where(
-                step_assessment.has_guard_crossed,
-                step_assessment.time_tolerance,
-                event_search.time_tolerance,
-            ),
-            n_iterations=event_search.n_iterations + is_searching_event,
-            n_confirming_steps=n_confirming_steps,
-            last_event_time_correction=jnp.where(
-                is_event_search_started, jnp.inf, event_time_correction
-            ),
-        ),
+        event_search=event_search,
         interior_margin_minima=interior_margin_minima,
         margin_minimum_refinement=margin_minimum_refinement,
         triggered_guard_index=jnp.where(
-            has_immediate_event,
-            first_met_guard_index,
-            jnp.where(
-                is_at_event & ~is_timed_out,
-                event_guard_index,
-                phase_state.triggered_guard_index,
-            ),
+            is_at_event & ~is_timed_out, event_guard_index, phase_state.triggered_guard_index
         ),
         is_timed_out=is_timed_out | phase_state.is_timed_out,
         has_integration_failed=is_step_too_short | phase_state.has_integration_failed,
         n_tried_steps=step_assessment.n_tried_steps,
     )
+
+
+def _improve_event_search(
+    phase_context: _PhaseContext,
+    phase_state: _PhaseState,
+    tried_step_end: SolverStepEnd,
+    step_assessment: _StepAssessment,
+) -> tuple[_EventSearch, Array, Scalar]:
+    """Return the search for the event after one solver step, the event's guard, and its next time.
+
+    The time is that since the start of the solver step, s. A solver step ends the search if it
+    changes the event's time by little compared with the step. For an event much earlier than the
+    step's end, the change is also compared with the time since the phase began. The second
+    comparison is skipped if the change is only the guard's round-off.
+    """
+    guards_and_margins = phase_context.guards_and_margins
+    n_guards, step_length = guards_and_margins.n_guards, phase_state.next_step_length
+    is_searching = phase_state.step_purpose == StepPurpose.EVENT_SEARCH
+    guard_values = tried_step_end.guard_and_margin_values[:n_guards]
+    event_step_length, guard_index, search = phase_state.event_search.propose_event_time(
+        guard_values, tried_step_end.guard_and_margin_rates[:n_guards], step_length
+    )
+    proposed, tried, start_time = lax.stop_gradient(
+        (event_step_length, step_length, phase_state.last_accepted_step_end.end_time)
+    )
+    correction = jnp.abs(proposed - tried)
+    is_correction_small = correction <= EVENT_TIME_ACCURACY * (start_time + proposed)
+    is_stalled = correction >= STALLED_CORRECTION_RATIO * search.last_event_time_correction
+    is_confirmed = (correction <= search.time_tolerance) & (is_correction_small | is_stalled)
+    is_guard_at_zero, lowest_guard_index = is_guard_at_roundoff(
+        guards_and_margins, search.is_guard_crossing, guard_values
+    )
+    is_started = step_assessment.has_guard_crossed
+    search = _EventSearch(
+        is_guard_crossing=jnp.where(
+            is_started, step_assessment.is_guard_crossing, search.is_guard_crossing
+        ),
+        lower_step_length_bound=jnp.where(is_started, 0.0, search.lower_step_length_bound),
+        upper_step_length_bound=jnp.where(is_started, tried, search.upper_step_length_bound),
+        time_tolerance=jnp.where(is_started, step_assessment.time_tolerance, search.time_tolerance),
+        n_iterations=search.n_iterations + is_searching,
+        is_located=is_searching & (is_confirmed | is_guard_at_zero),
+        last_event_time_correction=jnp.where(is_started, jnp.inf, correction),
+    )
+    return search, jnp.where(is_guard_at_zero, lowest_guard_index, guard_index), event_step_length
 
 
 def _try_solver_step(
@@ -649,18 +487,18 @@ def _try_solver_step(
         )
         starts_at_minimum_step = (
             state_before_minimum,
-            solver_stepper.init_solver_state(state_before_minimum, options),
+            solver_stepper.start(state_before_minimum, options)[1],
         )
         start_state = select_trees_by_condition(
             phase_state.step_purpose == StepPurpose.REFINEMENT, starts_at_minimum_step, start_state
         )
-    end_state, error_estimate, solver_state = solver_stepper.take_solver_step(
+    end_state, end_rate, error_estimate, solver_state = solver_stepper.step(
         *start_state, phase_state.next_step_length
     )
     guard_and_margin_values, guard_and_margin_rates = jax.jvp(
         guards_and_margins.evaluate_guards_and_margins,
         (end_state,),
-        (solver_stepper.vector_field(end_state),),
+        (end_rate,),
     )
     error_estimate = jnp.where(
         jnp.all(jnp.isfinite(guard_and_margin_values)), error_estimate, jnp.inf
@@ -671,14 +509,14 @@ def _try_solver_step(
     is_last_step = is_integrating & (phase_state.next_step_length >= phase_time_limit - start_time)
     end_time = jnp.where(is_last_step, phase_time_limit, start_time + phase_state.next_step_length)
     return SolverStepEnd(
-        end_time, end_state, solver_state, guard_and_margin_values, guard_and_margin_rates
+        end_time, end_state, end_rate, solver_state, guard_and_margin_values, guard_and_margin_rates
     ), error_estimate
 
 
 class _StepAssessment(NamedTuple):
     """Acceptance of a tried solver step, crossing guards, and length of the next step."""
 
-    is_accepted: Bool[Array, ""]  # whether the step is accepted; the start is
+    is_accepted: Bool[Array, ""]  # whether the step is accepted
     has_guard_crossed: Bool[Array, ""]  # whether the step brackets an event
     is_guard_crossing: Bool[Array, " n_guards"]  # guards that are not positive at the step's end
     is_step_too_short: Bool[Array, ""]
@@ -702,14 +540,11 @@ def _assess_solver_step(
     n_guards = guards_and_margins.n_guards
     previous_step_end = phase_state.last_accepted_step_end
     step_length = phase_state.next_step_length
-    is_phase_start = phase_state.step_purpose == StepPurpose.START
     is_integrating = phase_state.step_purpose == StepPurpose.INTEGRATION
-    uninterrupted_step_length = jnp.where(is_phase_start, options.dt0, step_length)
-    is_within_tolerance, next_step_length, controller_state = solver_stepper.control_step_size(
-        previous_step_end.state,
-        tried_step_end.state,
+    is_within_tolerance, next_step_length, controller_state = solver_stepper.control(
+        (previous_step_end.state, tried_step_end.state),
         error_estimate,
-        uninterrupted_step_length,
+        step_length,
         phase_state.controller_state,
     )
     is_within_tolerance = is_within_tolerance & is_integrating
@@ -717,11 +552,8 @@ def _assess_solver_step(
     guard_cubics = tuple(
         x[:n_guards] for x in interpolate_by_cubics(previous_step_end, tried_step_end, step_length)
     )
-    minimum_fractions, may_have_minimum = _find_guard_minima(
-        guard_cubics, lax.stop_gradient(step_length), previous_step_end.end_time
-    )
-    step_length_to_minimum = step_length * jnp.min(
-        jnp.where(may_have_minimum & ~is_guard_crossing, minimum_fractions, 1.0)
+    step_length_to_minimum = step_length * _find_earliest_dip(
+        guard_cubics, is_guard_crossing, lax.stop_gradient(step_length), previous_step_end.end_time
     )
     must_shorten_step = is_within_tolerance & (step_length_to_minimum < step_length)
     has_guard_crossed = is_within_tolerance & jnp.any(is_guard_crossing) & ~must_shorten_step
@@ -729,17 +561,18 @@ def _assess_solver_step(
     has_step_failed = (n_tried_steps >= options.max_solver_steps) | (
         previous_step_end.end_time + next_step_length == previous_step_end.end_time
     )
-    following_step_length = jnp.where(is_phase_start, options.dt0, next_step_length)
-    following_step_length = jnp.where(
-        must_shorten_step, step_length_to_minimum, following_step_length
-    )
-    is_accepted = is_phase_start | (is_within_tolerance & ~has_guard_crossed & ~must_shorten_step)
+    following_step_length = jnp.where(must_shorten_step, step_length_to_minimum, next_step_length)
+    is_accepted = is_within_tolerance & ~has_guard_crossed & ~must_shorten_step
     end_time = jnp.where(is_accepted, tried_step_end.end_time, previous_step_end.end_time)
     # The last step ends at the time limit.
     remaining_phase_time = lax.stop_gradient(options.max_phase_time - end_time)
     following_step_length = jnp.minimum(following_step_length, remaining_phase_time)
-    event_step_length_guess = lax.stop_gradient(step_length) * _guess_event_fraction(
-        guard_cubics, is_guard_crossing
+    event_step_length_guess = lax.stop_gradient(step_length) * lax.cond(
+        has_guard_crossed,
+        _guess_event_fraction,
+        lambda *_: jnp.ones_like(step_length),
+        guard_cubics,
+        is_guard_crossing,
     )
     time_resolution = 1e3 * jnp.finfo(step_length.dtype).eps * tried_step_end.end_time
     return _StepAssessment(
@@ -758,10 +591,13 @@ def _assess_solver_step(
     )
 
 
-def _find_guard_minima(
-    guard_cubics: tuple[Array, ...], step_length: Scalar, start_time: Scalar
-) -> tuple[Array, Array]:
-    """Return the location of each guard's minimum, and whether the guard may be negative there.
+def _find_earliest_dip(
+    guard_cubics: tuple[Array, ...],
+    is_guard_crossing: Array,
+    step_length: Scalar,
+    start_time: Scalar,
+) -> Scalar:
+    """Return where the first guard may be negative inside a solver step; 1 if none may be.
 
     The location is a fraction of the solver step, at most nine tenths. It is the minimum of the
     guard's cubic, whose coefficients are those of `interpolate_by_cubics`. In the solver step, the
@@ -771,14 +607,16 @@ def _find_guard_minima(
     coefficients are positive or the guard is negative at the end of a step.
     """
     start_values, start_rates, end_values, end_rates = guard_cubics
-    minimum_fractions, _ = find_cubic_minimum(*guard_cubics)
-    minimum_fractions = jnp.clip(minimum_fractions, 0.1, 0.9)
-    does_step_advance_time = start_time + minimum_fractions * step_length > start_time
-    lowest_bernstein_coefficient = jnp.minimum(
-        start_values + start_rates / 3.0, end_values - end_rates / 3.0
-    )
-    may_be_negative = (lowest_bernstein_coefficient <= 0.0) & (end_rates >= 0.0)
-    return minimum_fractions, may_be_negative & does_step_advance_time
+    lowest_coefficient = jnp.minimum(start_values + start_rates / 3.0, end_values - end_rates / 3.0)
+    may_dip = (lowest_coefficient <= 0.0) & (end_rates >= 0.0) & ~is_guard_crossing
+
+    def find_minima(guard_cubics: tuple[Array, ...], may_dip: Array) -> Scalar:
+        fractions = jnp.clip(find_cubic_minimum(*guard_cubics)[0], 0.1, 0.9)
+        does_time_advance = start_time + fractions * step_length > start_time
+        return jnp.min(jnp.where(may_dip & does_time_advance, fractions, 1.0))
+
+    no_dip = lambda *_: jnp.ones_like(step_length)
+    return lax.cond(jnp.any(may_dip), find_minima, no_dip, guard_cubics, may_dip)
 
 
 def _guess_event_fraction(guard_cubics: tuple[Array, ...], is_guard_crossing: Array) -> Scalar:
@@ -852,17 +690,17 @@ def sample_phase(
     between two samples is integrated with adaptive solver steps. The last of these solver steps
     ends exactly at the time of the sample.
     """
-    solver_stepper = _make_stepper(vector_field, options)
+    solver_stepper = make_stepper(vector_field, options)
     sample_interval = duration / (n_samples - 1)
 
     def take_adaptive_step(loop_carry: tuple) -> tuple:
         time, state, solver_state, step_length, controller_state, n_tried_steps = loop_carry
         step_length = jnp.minimum(step_length, sample_interval - time)
-        end_state, error_estimate, end_solver_state = solver_stepper.take_solver_step(
+        end_state, _, error_estimate, end_solver_state = solver_stepper.step(
             state, solver_state, step_length
         )
-        is_within_tolerance, next_step_length, controller_state = solver_stepper.control_step_size(
-            state, end_state, error_estimate, step_length, controller_state
+        is_within_tolerance, next_step_length, controller_state = solver_stepper.control(
+            (state, end_state), error_estimate, step_length, controller_state
         )
         is_last_step = is_within_tolerance & (step_length >= sample_interval - time)
         time = jnp.where(
@@ -877,7 +715,7 @@ def sample_phase(
 
     def integrate_to_next_sample(state: StateArray, _sample: None) -> tuple[StateArray, StateArray]:
         initial_count = jnp.zeros((), jnp.int32)
-        solver_state, controller_state = solver_stepper.init_solver_and_controller(state, options)
+        _, solver_state, controller_state = solver_stepper.start(state, options)
         zero_duration = jnp.zeros_like(sample_interval)
         loop_carry = (
             zero_duration,

@@ -1,7 +1,7 @@
 """Find fixed points of return maps by Newton's method on the section, for any system."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -27,8 +27,8 @@ from vrw_jax.lanes.program_cache import get_compiled_program
 from vrw_jax.lanes.settings import with_default_jax_settings
 
 UNIT_MULTIPLIER_ADVICE = (
-    "A multiplier is 1, which a conserved quantity or a fold causes: take the conserved quantity "
-    "out of the state, or move the parameter away from the fold."
+    "A multiplier is 1, which a conserved quantity or a fold causes: name the conserved quantity "
+    "in invariants=, take it out of the state, or move the parameter away from the fold."
 )
 """Advice for a state at which the equations of the fixed point are singular."""
 
@@ -130,6 +130,7 @@ def solve_fixed_point(
     tolerance: float | Scalar = 1e-12,
     units: Any = None,
     max_iterations: int = MAX_NEWTON_ITERATIONS,
+    invariants: Sequence[Callable[[Array], Array]] = (),
 ) -> FixedPointResult:
     """Find a fixed point of `function` applied `period_n` times, by Newton's method.
 
@@ -148,6 +149,8 @@ def solve_fixed_point(
         units: units of the components of `start`, a number or shape (n,). By default, the unit of a
             component is its size at the start or at the fixed point, whichever is larger.
         max_iterations: largest number of Newton iterations.
+        invariants: functions of the state that the map conserves, such as an energy. Fixed points
+            then form a curve, and that with the invariants of `start` is found.
 
     Returns:
         A `FixedPointResult`: the state, its multipliers, and the status of the iteration.
@@ -162,7 +165,7 @@ def solve_fixed_point(
     """
 
     fixed_point = _solve_checked_fixed_point(
-        _run_newton_loop, function, start, period_n, tolerance, units, max_iterations
+        _run_newton_loop, function, start, period_n, tolerance, units, max_iterations, invariants
     )
     if isinstance(function, ReturnMap):
         fixed_point = fixed_point._replace(
@@ -178,6 +181,7 @@ def solve_fixed_point_implicit(
     period_n: int = 1,
     tolerance: float | Scalar = 1e-12,
     units: Any = None,
+    invariants: Sequence[Callable[[Array], Array]] = (),
 ) -> FixedPointResult:
     """Find a fixed point of a map whose second derivatives are expensive.
 
@@ -185,7 +189,14 @@ def solve_fixed_point_implicit(
     require only derivatives of order n of `function`. Derivatives of the Jacobian are NaN.
     """
     return _solve_checked_fixed_point(
-        _run_newton_implicit, function, start, period_n, tolerance, units, MAX_NEWTON_ITERATIONS
+        _run_newton_implicit,
+        function,
+        start,
+        period_n,
+        tolerance,
+        units,
+        MAX_NEWTON_ITERATIONS,
+        invariants,
     )
 
 
@@ -226,6 +237,7 @@ def _solve_checked_fixed_point(
     tolerance: float | Scalar,
     units: Any,
     max_iterations: int,
+    invariants: Sequence[Callable[[Array], Array]] = (),
 ) -> FixedPointResult:
     """Check the arguments, and find the fixed point by `newton_method`."""
     check_callable("function", function, "that maps a state to the next")
@@ -241,7 +253,7 @@ def _solve_checked_fixed_point(
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
     # A unit of 0 is replaced by the size of the component.
     units = jnp.zeros_like(start) if units is None else check_state_units(units, start)
-    newton_configuration = (newton_method, function, period_n, max_iterations)
+    newton_configuration = (newton_method, function, period_n, tuple(invariants), max_iterations)
     find_fixed_point = functools.partial(_find_fixed_point_of_iterate, newton_configuration)
     compiled_program = None
     if isinstance(function, ReturnMap):
@@ -254,14 +266,15 @@ def _solve_checked_fixed_point(
 def _find_fixed_point_of_iterate(
     newton_configuration: tuple, start: Array, tolerance: Array, units: Array
 ) -> FixedPointResult:
-    newton_method, function, period_n, max_iterations = newton_configuration
+    newton_method, function, period_n, invariants, max_iterations = newton_configuration
 
-    def apply_map_repeatedly(x: Array) -> Array:
-        for _ in range(period_n):
-            x = function(x)
-        return x
+    def evaluate_equations(x: Array) -> Array:
+        """Return the state after `period_n` maps, and the changes of the invariants at `x`."""
+        next_x = functools.reduce(lambda y, _: function(y), range(period_n), x)
+        changes = [jnp.ravel(invariant(x) - invariant(start)) for invariant in invariants]
+        return jnp.concatenate([next_x, *changes])
 
-    closure_converted_map, closed_over_values = jax.closure_convert(apply_map_repeatedly, start)
+    closure_converted_map, closed_over_values = jax.closure_convert(evaluate_equations, start)
     return newton_method(
         closure_converted_map, max_iterations, start, tolerance, units, *closed_over_values
     )
@@ -276,12 +289,25 @@ def _compute_newton_correction(
     """Return Newton's correction, the Jacobian of the map, and the largest component of the defect
     map(x) - x.
     """
-    mapped_point, jacobian = evaluate_with_jacobian(
+    values, jacobian = evaluate_with_jacobian(
         lambda y: closure_converted_map(y, *closed_over_values), x
     )
-    map_defect = mapped_point - x
-    newton_correction = jnp.linalg.solve(jnp.eye(x.size, dtype=x.dtype) - jacobian, map_defect)
-    return newton_correction, jacobian, jnp.max(jnp.abs(map_defect))
+    defect = values - jnp.pad(x, (0, len(values) - len(x)))
+    newton_correction = _solve_fixed_point_equations(jacobian, defect)
+    return newton_correction, jacobian[: len(x)], jnp.max(jnp.abs(defect))
+
+
+def _solve_fixed_point_equations(jacobian: Array, right_side: Array) -> Array:
+    """Return dx with dx - J dx = `right_side`, where rows of invariants have no dx.
+
+    With invariants there are more equations than unknowns, but they agree near a solution.
+    """
+    n_equations, n_unknowns = jacobian.shape
+    matrix = jnp.eye(n_equations, n_unknowns, dtype=jacobian.dtype) - jacobian
+    if n_equations == n_unknowns:
+        return jnp.linalg.solve(matrix, right_side)
+    q, r = jnp.linalg.qr(matrix)
+    return jax.scipy.linalg.solve_triangular(r, q.T @ right_side)
 
 
 N_DERIVATIVE_ITERATIONS = 2
@@ -437,11 +463,12 @@ def _run_newton_implicit_jvp(
     _, jacobian = evaluate_with_jacobian(
         lambda x: closure_converted_map(x, *closed_over_values), newton_result.x
     )
-    fixed_point_tangent = jnp.linalg.solve(
-        jnp.eye(newton_result.x.size, dtype=newton_result.x.dtype) - jacobian, map_output_tangent
+    fixed_point_tangent = jnp.where(
+        newton_result.converged, _solve_fixed_point_equations(jacobian, map_output_tangent), 0.0
     )
-    fixed_point_tangent = jnp.where(newton_result.converged, fixed_point_tangent, 0.0)
-    nan_jacobian_tangent = jnp.full_like(jacobian, jnp.nan) * jnp.sum(fixed_point_tangent)
+    nan_jacobian_tangent = jnp.full_like(newton_result.jacobian, jnp.nan) * jnp.sum(
+        fixed_point_tangent
+    )
     return newton_result, make_zero_tangent(newton_result)._replace(
         x=fixed_point_tangent, jacobian=nan_jacobian_tangent
     )

@@ -26,6 +26,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.attracting_gaits import find_attracting_gaits, find_slowest_gait_indices
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.collocation_search import CollocationState
@@ -45,6 +46,7 @@ from vrw_jax.gaits.gait_walks import (
     measure_period_defects,
     walk_to_gaits,
 )
+from vrw_jax.gaits.hybrid_gait import HybridGait, find_hybrid_gait
 from vrw_jax.gaits.last_gait import describe_last_gait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.options import CycleOptions
@@ -93,18 +95,29 @@ def limit_cycle(
 ) -> LimitCycle | ReturnMapCycle: ...
 
 
+@overload
+def limit_cycle(
+    params: Any,
+    *,
+    guess: Any,
+    period_n: int = 1,
+    model: HybridSystem,
+    options: StepOptions | None = None,
+) -> HybridGait: ...
+
+
 @with_default_jax_settings
 @announce_wait("the search for a gait", "10 s, or 50 s if it finds no gait")
 def limit_cycle(
-    params: WheelParams,
+    params: Any,
     *,
-    guess: UserCycleGuess | None = None,
+    guess: Any = None,
     period_n: int = 1,
-    model: ModelLike | None = None,
+    model: ModelLike | HybridSystem | None = None,
     options: CycleOptions | StepOptions | None = None,
     on_failure: FailureFillName = "zeros",
     which: GaitChoice = "slowest",
-) -> LimitCycle | ReturnMapCycle:
+) -> LimitCycle | ReturnMapCycle | HybridGait:
     """Find the limit cycle of a wheel: the gait that repeats after `period_n` gait steps.
 
     For `period_n` 1 no start is needed. A `guess` is the cycle of a similar wheel, or a section
@@ -130,6 +143,9 @@ def limit_cycle(
     for the gait on its ground. A `LimitCycle` then belongs to the paper's model, a `ReturnMapCycle`
     to unilateral contact.
 
+    For a `HybridSystem`, `params` are its parameters, and Newton's method starts at the `guess`,
+    section coordinates near the gait. The result is a `HybridGait`.
+
     Args:
         params: the wheel.
         guess: a similar wheel's cycle, or a section state near the gait; a cycle that was not found
@@ -142,7 +158,7 @@ def limit_cycle(
             speed.
 
     Returns:
-        A `LimitCycle`; a `ReturnMapCycle` for other models.
+        A `LimitCycle`; a `ReturnMapCycle` for other models, a `HybridGait` for a `HybridSystem`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -156,6 +172,8 @@ def limit_cycle(
         0.000115 per N s/m
     """
     parse_gait_choice(which)
+    if isinstance(model, HybridSystem):
+        return find_hybrid_gait(model, params, guess, period_n, options)
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, period_n)
     fills_missing_gait_with_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"

@@ -27,6 +27,7 @@ from vrw_jax.base.printing import (
 )
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.status_codes import describe_step_ending
+from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
@@ -239,16 +240,22 @@ def step(
 ) -> StepResult: ...
 
 
+@overload
+def step(
+    params: Any, x: Any, *, model: HybridSystem, options: StepOptions | None = None
+) -> HybridStep: ...
+
+
 @with_default_jax_settings
 @announce_wait("a gait step", "5 s")
 def step(
-    params: WheelParams,
-    x: SectionStateLike,
+    params: Any,
+    x: Any,
     *,
-    model: ModelLike | None = None,
+    model: ModelLike | HybridSystem | None = None,
     options: StepOptions | None = None,
     engine: EngineName = "auto",
-) -> StepResult | UnilateralStep | LadderStep:
+) -> StepResult | UnilateralStep | LadderStep | HybridStep:
     """Compute one step from touchdown to touchdown, with its indicators, margins and energies.
 
     The `outcome` of the step describes how the step ended. A fall raises no exception. Numerical
@@ -264,7 +271,8 @@ def step(
         engine: engine that computes the steps; see `StepOptions`.
 
     Returns:
-        A `StepResult`; a `UnilateralStep` with unilateral contact, or a `LadderStep` for "auto".
+        A `StepResult`; a `UnilateralStep` with unilateral contact, a `LadderStep` for "auto", or a
+        `HybridStep` for a `HybridSystem`, whose parameters are `params`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -274,6 +282,8 @@ def step(
         >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
         0.714 s, STEPPED
     """
+    if isinstance(model, HybridSystem):
+        return model.step(params, x, options)
     params, section_state, model, options = _convert_single_step_arguments(
         params, x, model, options, engine
     )

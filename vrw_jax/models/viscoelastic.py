@@ -17,11 +17,11 @@ from vrw_jax.base.checks import check_bool
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
-from vrw_jax.flow.phase_integration import VectorField
 from vrw_jax.flow.scaled_integration import (
     integrate_phase_in_scaled_units,
     sample_phase_in_scaled_units,
 )
+from vrw_jax.flow.solver_steps import VectorField
 from vrw_jax.lanes.autodiff import ForwardFunction, enable_all_ad_modes
 from vrw_jax.models.batch_step import (
     build_step_finisher,

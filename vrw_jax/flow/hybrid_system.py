@@ -1,0 +1,399 @@
+"""Walkers and other hybrid systems of named modes, whose functions take parameters.
+
+A `HybridSystem` is compiled for one element and for batches of thousands, and is differentiable in
+every mode. Its functions are called with a state and with parameters, so that other values of the
+parameters compile nothing anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vrw_jax import lanes
+from vrw_jax.base.checks import (
+    check_callable,
+    check_int,
+    check_reals,
+    check_type,
+    require_known_name,
+)
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.status_codes import describe_step_ending
+from vrw_jax.base.types import Scalar
+from vrw_jax.flow.diffrax_minima import StateArray
+from vrw_jax.flow.hybrid_simulation import (
+    Event,
+    Guard,
+    HybridSolution,
+    Mode,
+    Termination,
+    run_events,
+    simulate_modes,
+)
+
+MAX_EVENTS_PER_STEP = 16
+"""Default limit of the events in one step, chosen above those of walkers with several legs."""
+
+
+class HybridStep(NamedTuple):
+    """One step of a hybrid system, from section to section.
+
+    - `section_state`: section coordinates at the end of the step; where the simulation ended early,
+      those of its last state;
+    - `duration`: duration of the step, s;
+    - `mode_durations`: time in each mode, s, in the order of the modes;
+    - `events`: number of the guard of each event, counted over the guards of all modes; -1 after
+      the last event;
+    - `n_events`, `solver_steps`: numbers of events and of solver steps;
+    - `termination`: a `Termination`; a complete step has `Termination.SECTION_REACHED`.
+    """
+
+    section_state: Float[Array, " n"]
+    duration: Scalar
+    mode_durations: Float[Array, " modes"]
+    events: Int[Array, " max_events"]
+    n_events: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+    termination: Int[Array, ""]
+
+    @property
+    def is_complete(self) -> Any:
+        """Return whether the step has reached the section."""
+        return self.termination == Termination.SECTION_REACHED
+
+    @property
+    def ending(self) -> Any:
+        """Return a sentence on how the step ended; for a batch, an array of sentences."""
+        return describe_step_ending(self.termination, Termination)
+
+
+class HybridSystem(eqx.Module):
+    """A walker, or another hybrid system, defined by its modes, guards and resets.
+
+    Use it for your own legs and walkers: one step in a batch of thousands takes microseconds, and
+    derivatives go through events. All functions take the state `y`, shape (dim,), and the
+    parameters, which are any tree of numbers and arrays: a field returns the time derivative of the
+    state, a guard one number, and a reset the next state.
+
+    - `modes`: a `Mode(field, guards)` for each name. The guards of a mode are a dictionary, and the
+      `target_mode` of a `Guard` is the name of a mode;
+    - `section`: name of the guard whose event ends a step, in any mode;
+    - `state`: names of the coordinates of the state;
+    - `project`, `embed`: functions from state and parameters to section coordinates and back,
+      `project(y, params)` after the reset of the section's event, and `embed(x, params)`. By
+      default, the section coordinates are the whole state;
+    - `invariants`: functions of state and parameters that a step conserves, such as the energy;
+    - `max_events`: largest number of events in one step.
+
+    Examples:
+        >>> fall = lambda y, p: jnp.stack([y[1], -p["gravity"] + 0.0 * y[1]])
+        >>> bounce = lambda y, p: jnp.stack([0.0 * y[0], -p["restitution"] * y[1]])
+        >>> impact = hybrid.Guard(lambda y, p: y[0], bounce)
+        >>> ball = hybrid.HybridSystem(
+        ...     modes={"flight": hybrid.Mode(fall, {"impact": impact})},
+        ...     section="impact",
+        ...     state=("height", "velocity"),
+        ...     project=lambda y, p: y[1:],
+        ...     embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
+        ... )
+        >>> params = {"gravity": 9.81, "restitution": 0.5}
+        >>> print(f"{ball.step(params, [2.0]).section_state[0]:.3f}")
+        1.000
+    """
+
+    modes: Mapping[str, Mode] = eqx.field(static=True)
+    section: str = eqx.field(static=True)
+    state: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    project: Callable[[StateArray, Any], Array] = eqx.field(
+        static=True, default=lambda y, params: y
+    )
+    embed: Callable[[Array, Any], StateArray] = eqx.field(static=True, default=lambda x, params: x)
+    invariants: Sequence[Callable[[StateArray, Any], Scalar]] = eqx.field(
+        static=True, converter=tuple, default=()
+    )
+    max_events: int = eqx.field(static=True, default=MAX_EVENTS_PER_STEP)
+
+    def __check_init__(self) -> None:
+        check_type("modes", self.modes, Mapping, "give a dictionary of Modes by name")
+        check_int("max_events", self.max_events)
+        if not self.state or not all(isinstance(name, str) for name in self.state):
+            raise ValueError(
+                f"state is {self.state}, but it names each coordinate: give a tuple of names."
+            )
+        for mode_name, mode in self.modes.items():
+            check_type(f"mode {mode_name!r}", mode, Mode, "give Mode(field, guards)")
+            check_callable(f"the field of {mode_name!r}", mode.field, "of state and parameters")
+            check_type(
+                f"guards of {mode_name!r}",
+                mode.guards,
+                Mapping,
+                "give a dictionary of Guards by name",
+            )
+            if not mode.guards:
+                raise ValueError(
+                    f"mode {mode_name!r} has no guard, but only a guard can end it: give one."
+                )
+            for guard_name, guard in mode.guards.items():
+                check_type(
+                    f"guard {guard_name!r}", guard, Guard, "give Guard(value, reset, target_mode)"
+                )
+                if guard.target_mode is not None:
+                    require_known_name(guard.target_mode, tuple(self.modes), "mode")
+        require_known_name(self.section, tuple(self.guard_names), "guard")
+        if len(self._start_modes) > 1:
+            raise ValueError(
+                f"{self.section!r} leads to the modes {sorted(self._start_modes)}, but each step "
+                "begins in one mode: give the other guards another name."
+            )
+
+    @property
+    def guard_names(self) -> tuple[str, ...]:
+        """Return the names of the guards of all modes, in the order of `HybridStep.events`."""
+        return tuple(name for mode in self.modes.values() for name in mode.guards)
+
+    @property
+    def _start_modes(self) -> set[str]:
+        return {
+            str(guard.target_mode or mode_name)
+            for mode_name, mode in self.modes.items()
+            for name, guard in mode.guards.items()
+            if name == self.section
+        }
+
+    def _find_mode(self, mode_name: str | None) -> int:
+        """Return the index of a mode, by default of that in which a step begins."""
+        names = tuple(self.modes)
+        if mode_name is None:
+            return names.index(next(iter(self._start_modes)))
+        require_known_name(mode_name, names, "mode")
+        return names.index(mode_name)
+
+    def _bind_modes(self, params: Any) -> tuple[Mode, ...]:
+        """Return the modes by index, with functions of the state alone."""
+        bind = lambda function: lambda y: function(y, params)
+        return tuple(
+            Mode(
+                bind(mode.field),
+                tuple(
+                    Guard(
+                        bind(guard.evaluate),
+                        bind(guard.reset),
+                        None if guard.target_mode is None else self._find_mode(guard.target_mode),
+                    )
+                    for guard in mode.guards.values()
+                ),
+            )
+            for mode in self.modes.values()
+        )
+
+    def _take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
+        """Return one step of one element; `lanes.jit` compiles this function."""
+        modes, n_modes = self._bind_modes(params), len(self.modes)
+        first_guards = np.cumsum([0, *(len(mode.guards) for mode in modes)])[:-1]
+        section_guards = [
+            (mode_index, guard_index)
+            for mode_index, mode in enumerate(self.modes.values())
+            for guard_index, name in enumerate(mode.guards)
+            if name == self.section
+        ]
+        is_section = lambda event: jnp.any(
+            jnp.stack([(event.mode == m) & (event.guard == g) for m, g in section_guards])
+        )
+
+        def log_event(log: Any, n_events: Array, has_event: Array, event: Event) -> tuple:
+            mode_durations, events = log
+            is_mode = has_event & (jnp.arange(n_modes) == event.mode)
+            guard = event.guard + sum(
+                jnp.where(event.mode == i, int(first), 0) for i, first in enumerate(first_guards)
+            )
+            is_entry = has_event & (jnp.arange(self.max_events) == n_events)
+            return (
+                mode_durations + jnp.where(is_mode, event.duration, 0.0),
+                jnp.where(is_entry, guard, events).astype(jnp.int32),
+            )
+
+        start = self.embed(x, params)
+        log = jnp.zeros(n_modes) + 0.0 * start[0], jnp.full(self.max_events, -1, jnp.int32)
+        run = run_events(
+            modes,
+            options,
+            start,
+            jnp.asarray(self._find_mode(None), jnp.int32),
+            self.max_events,
+            log,
+            log_event,
+            is_section,
+        )
+        mode_durations, events = run.log
+        return HybridStep(
+            self.project(run.state, params),
+            run.time,
+            mode_durations,
+            events,
+            run.n_events,
+            run.solver_steps,
+            run.termination,
+        )
+
+    def step(self, params: Any, x: Any, options: StepOptions | None = None) -> HybridStep:
+        """Return the step that begins at section coordinates `x`, shape (n,).
+
+        `jax.jit`, `vmap`, `grad`, `jacfwd`, `jacrev` and `hessian` apply to it.
+
+        Args:
+            params: parameters, a tree of numbers and arrays.
+            x: section coordinates at the start, shape (n,).
+            options: options of the integration.
+
+        Returns:
+            A `HybridStep`. A step that fails has a code of `Termination`.
+
+        Raises:
+            TypeError, ValueError: if an argument is invalid, or a function returns a wrong shape.
+        """
+        params, x, options = self._check_arguments(params, x, options, 1)
+        return lanes.jit(self._take_step)(params, x, options)
+
+    def step_batch(self, params: Any, x: Any, options: StepOptions | None = None) -> HybridStep:
+        """Return one step of each element of a batch, as NumPy arrays, computed on all cores.
+
+        The result of an element is bitwise the same in any batch.
+
+        Args:
+            params: parameters. A number is the same for all elements, and an array has the batch on
+                its first axis.
+            x: section coordinates, shape (batch, n), or (n,) for all elements.
+            options: options of the integration.
+
+        Returns:
+            A `HybridStep` whose arrays have the batch on their first axis.
+
+        Raises:
+            TypeError, ValueError: as for `step`, or if batches have different lengths.
+        """
+        params, x, options = self._check_arguments(params, x, options, 2)
+        return lanes.jit(self._take_step).batch(
+            params, x, options, in_axes=self._find_batch_axes(params, x)
+        )
+
+    def simulate(
+        self,
+        params: Any,
+        start: Any,
+        *,
+        events: int,
+        mode: str | None = None,
+        options: StepOptions | None = None,
+    ) -> HybridSolution:
+        """Return the simulation that passes through at most `events` events.
+
+        Args:
+            params: parameters, a tree of numbers and arrays.
+            start: state at the start, shape (dim,).
+            events: largest number of events.
+            mode: name of the first mode, by default that in which a step begins.
+            options: options of the integration.
+
+        Returns:
+            A `HybridSolution`. Its modes are counted in the order of `modes`, and the guards in the
+            order of those of their mode.
+
+        Raises:
+            TypeError, ValueError: if an argument is invalid, or a function returns a wrong shape.
+        """
+        params, start, options = self._check_arguments(params, start, options, 1, "start")
+        return lanes.jit(self._make_simulation(events, mode))(params, start, options)
+
+    def simulate_batch(
+        self,
+        params: Any,
+        start: Any,
+        *,
+        events: int,
+        mode: str | None = None,
+        options: StepOptions | None = None,
+    ) -> HybridSolution:
+        """Return the simulations of a batch, as NumPy arrays, computed on all cores.
+
+        The arguments are those of `simulate`. Parameters that are arrays have the batch on their
+        first axis, and `start` has the shape (batch, dim), or (dim,) for all elements.
+        """
+        params, start, options = self._check_arguments(params, start, options, 2, "start")
+        return lanes.jit(self._make_simulation(events, mode)).batch(
+            params, start, options, in_axes=self._find_batch_axes(params, start)
+        )
+
+    def _make_simulation(self, events: int, mode_name: str | None) -> Callable:
+        events, mode = check_int("events", events), self._find_mode(mode_name)
+
+        def simulate(params: Any, start: Array, options: StepOptions) -> HybridSolution:
+            first_mode = jnp.asarray(mode, jnp.int32)
+            return simulate_modes((self._bind_modes(params), events), options, start, first_mode)
+
+        return simulate
+
+    def _find_batch_axes(self, params: Any, x: Array) -> tuple:
+        axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, params)
+        return axes, 0 if x.ndim == 2 else None, None
+
+    def return_map(
+        self, params: Any, options: StepOptions | None = None
+    ) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
+        """Return the map from section coordinates to those after one step, for Newton's method.
+
+        The map returns NaN if the step fails, so that its last state is not taken for a return.
+        """
+
+        def map_section_state(x: Array) -> Array:
+            step = self.step(params, x, options)
+            factor = jnp.where(step.is_complete, 1.0, jnp.nan)
+            return step.section_state * factor
+
+        return map_section_state
+
+    def _check_arguments(
+        self, params: Any, x: Any, options: StepOptions | None, max_axes: int, name: str = "x"
+    ) -> tuple[Any, Array, StepOptions]:
+        """Return parameters, section coordinates or a start, and options, or raise an error."""
+        options = StepOptions() if options is None else options
+        check_type("options", options, StepOptions, "give vrw.StepOptions()")
+        params = jax.tree.map(lambda leaf: check_reals("a parameter", leaf), params)
+        x = check_reals(name, x)
+        if not 1 <= x.ndim <= max_axes:
+            shapes = "(n,)" if max_axes == 1 else "(n,) or (batch, n)"
+            raise ValueError(f"{name} has shape {x.shape}, but its shape must be {shapes}.")
+        one_x = jax.ShapeDtypeStruct(x.shape[-1:], x.dtype)
+        one_params = jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct(leaf.shape[max_axes - 1 :], leaf.dtype), params
+        )
+        start = jax.eval_shape(self.embed, one_x, one_params) if name == "x" else one_x
+        self._require_shape("embed" if name == "x" else name, start, (len(self.state),))
+        if name == "x":
+            end = jax.eval_shape(self.project, start, one_params)
+            self._require_shape("project", end, one_x.shape)
+        for mode_name, mode in self.modes.items():
+            field = jax.eval_shape(mode.field, start, one_params)
+            self._require_shape(f"the field of {mode_name!r}", field, start.shape)
+            for guard_name, guard in mode.guards.items():
+                place = f"{guard_name!r} in {mode_name!r}"
+                value, reset = (
+                    jax.eval_shape(f, start, one_params) for f in (guard.evaluate, guard.reset)
+                )
+                self._require_shape(f"the guard {place}", value, ())
+                self._require_shape(f"the reset of {place}", reset, start.shape)
+        options.check_tolerances(start.dtype)
+        return params, x, options
+
+    def _require_shape(self, function_name: str, result: Any, shape: tuple[int, ...]) -> None:
+        if getattr(result, "shape", None) != shape:
+            raise ValueError(
+                f"{function_name} gives {getattr(result, 'shape', type(result).__name__)}, but the "
+                f"coordinates of the state are {self.state}: give an array of shape {shape}."
+            )
