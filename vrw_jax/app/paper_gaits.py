@@ -25,7 +25,7 @@ from vrw_jax.models.measures import (
     make_measure_attributes,
 )
 from vrw_jax.models.provenance import collect_provenance_attributes
-from vrw_jax.models.step_inputs import SectionState
+from vrw_jax.models.step_results import SectionState
 from vrw_jax.models.stepping import step, walk
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.outcomes import Outcome

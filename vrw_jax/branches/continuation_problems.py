@@ -38,8 +38,7 @@ from vrw_jax.lanes.batching import unbatch
 from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
-from vrw_jax.models.step_inputs import AnySectionState
-from vrw_jax.models.step_results import AbstractStep
+from vrw_jax.models.step_results import AbstractStep, AnySectionState
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,

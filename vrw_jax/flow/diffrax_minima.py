@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.base.cubic_minima import find_cubic_minimum, refine_minimum_location
 from vrw_jax.base.types import Scalar
+from vrw_jax.flow.minima import find_cubic_minimum, refine_minimum_location
 from vrw_jax.lanes.batching import select_trees_by_condition
 
 StateArray = Float[Array, " dim"]

@@ -42,8 +42,7 @@ from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     MEASURES,
 )
-from vrw_jax.models.step_inputs import SectionState
-from vrw_jax.models.step_results import AbstractStep, StepResult
+from vrw_jax.models.step_results import AbstractStep, SectionState, StepResult
 from vrw_jax.models.stepping import convert_step_arguments
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions

@@ -36,8 +36,12 @@ from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unba
 from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models import unit_scaling as scales
-from vrw_jax.wheel.params import PARAMETER_DOMAINS, PARAMETER_NAMES, compute_symbols
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.params import (
+    PARAMETER_DOMAINS,
+    PARAMETER_NAMES,
+    compute_symbols,
+    compute_wheel_units,
+)
 
 
 def _compute_collocation_tangents(

@@ -11,8 +11,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.models.contact_walks import embed_section_states
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import WheelParams
-from vrw_jax.wheel.units import compute_wheel_units_of_rows
+from vrw_jax.wheel.params import WheelParams, compute_wheel_units_of_rows
 
 WALK_STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))
 """Starts of walks, each described by a contraction and a rate.

@@ -37,8 +37,7 @@ from vrw_jax.gaits.slope_response import (
 )
 from vrw_jax.lanes.batching import is_inside_jit
 from vrw_jax.lanes.saved_traces import evaluate_by_saved_trace
-from vrw_jax.models.step_inputs import SectionState
-from vrw_jax.models.step_results import DoubleSupportIndicators, Margins
+from vrw_jax.models.step_results import DoubleSupportIndicators, Margins, SectionState
 from vrw_jax.models.stepping import step
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions

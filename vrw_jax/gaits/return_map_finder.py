@@ -38,8 +38,7 @@ from vrw_jax.models.measures import (
 )
 from vrw_jax.models.stepping import convert_step_arguments, start_walk_toward_gait
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import WheelParams
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.params import WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12
 """Smallest tolerance for Newton's last correction.

@@ -26,8 +26,8 @@ from vrw_jax.models.registry import (
     list_model_config_names,
 )
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.step_inputs import PAPER_START_STATE
 from vrw_jax.models.step_results import (
+    PAPER_START_STATE,
     DoubleSupportIndicators,
     EnergyLoss,
     RequiredFriction,

@@ -46,9 +46,8 @@ from vrw_jax.models.phase_sequence import (
 from vrw_jax.models.step_results import AdvanceResult, Trajectory
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.geometry import Motion
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, compute_wheel_units
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant
-from vrw_jax.wheel.units import compute_wheel_units
 
 
 class _NextPhaseInputs(NamedTuple):

@@ -46,7 +46,7 @@ from vrw_jax.models.contact_state import (
     unpack_state,
 )
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.params import compute_wheel_units
 
 ROLLING_INDEX = 2
 """Index of the rolling rate dtheta among the rates of (hub x, hub z, theta, leg lengths)."""

@@ -55,8 +55,8 @@ from vrw_jax.models.contact_modes import (
     is_release_consistent,
 )
 from vrw_jax.models.contact_state import ContactState, GuardLayout
-from vrw_jax.wheel.foot_contact import ContactMode
 from vrw_jax.wheel.ground import GroundAhead
+from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols
 
 

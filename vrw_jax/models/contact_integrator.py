@@ -47,8 +47,7 @@ from vrw_jax.models.contact_state import (
     evaluate_guards,
 )
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import Symbols
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
 N_ACCUMULATOR_ROWS = 3
 """Number of accumulators: energy losses in dampers and by sliding, and slip length."""

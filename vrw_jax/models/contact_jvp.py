@@ -34,7 +34,7 @@ from vrw_jax.models.contact_mechanics import (
     sum_over_legs,
 )
 from vrw_jax.models.contact_modes import replace_infinite_friction, solve_combination
-from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols
 
 

@@ -73,7 +73,7 @@ from vrw_jax.models.contact_state import (
     make_contact_mode_dynamics,
     update_force_rate_signs,
 )
-from vrw_jax.models.step_inputs import find_stance_slope
+from vrw_jax.models.phase_sequence import find_stance_slope
 from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (

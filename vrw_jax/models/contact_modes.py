@@ -39,9 +39,8 @@ from vrw_jax.models.contact_mechanics import (
     make_opaque_one,
     prevent_fusion,
 )
-from vrw_jax.wheel.foot_contact import ContactMode
-from vrw_jax.wheel.params import Symbols
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.outcomes import ContactMode
+from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
 PAPER_RULE_SENTINEL = -np.inf
 """Friction coefficient that selects the rule (A1)-(A4) of the paper for infinite friction."""

@@ -36,10 +36,8 @@ from vrw_jax.models.contact_state import (
     split_normal_forces,
 )
 from vrw_jax.models.step_results import AbstractContactStep
-from vrw_jax.wheel.foot_contact import ContactMode
-from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.outcomes import ContactMode, Outcome, replace_rest_outcome
 from vrw_jax.wheel.params import Symbols
-from vrw_jax.wheel.rest import replace_rest_outcome
 
 # Smallest height of a resolved bounce, divided by absolute tolerance and leg length.
 MIN_BOUNCE_HEIGHT_PER_ATOL = 1e-2

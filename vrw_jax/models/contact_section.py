@@ -14,17 +14,16 @@ from vrw_jax.models.contact_mechanics import (
     compute_leg_directions,
 )
 from vrw_jax.models.contact_state import ContactState
-from vrw_jax.models.step_inputs import (
-    PAPER_START_STATE,
+from vrw_jax.models.phase_sequence import (
     is_slope_in_domain,
     is_valid_start_state,
     replace_invalid_inputs,
 )
-from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.models.step_results import PAPER_START_STATE
 from vrw_jax.wheel.geometry import compute_length_at_touchdown
 from vrw_jax.wheel.ground import GroundAhead, compute_line_slope
-from vrw_jax.wheel.params import MAX_SI_VALUE, Symbols, WheelParams
-from vrw_jax.wheel.units import WheelUnits
+from vrw_jax.wheel.outcomes import ContactMode
+from vrw_jax.wheel.params import MAX_SI_VALUE, Symbols, WheelParams, WheelUnits
 
 FullState = Float[Array, "n_full ..."]
 """State just before the foremost foot lands, as one vector of 4 + 3 n entries.

@@ -40,11 +40,9 @@ from vrw_jax.models.contact_mechanics import (
     sum_over_legs,
 )
 from vrw_jax.models.contact_modes import replace_infinite_friction
-from vrw_jax.wheel.foot_contact import ContactMode
 from vrw_jax.wheel.ground import GroundAhead
-from vrw_jax.wheel.params import Symbols
-from vrw_jax.wheel.rest import are_coordinates_at_rest, are_rates_negligible
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.outcomes import ContactMode, are_coordinates_at_rest, are_rates_negligible
+from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
 PackedState = Float[Array, "dim ..."]
 """Motion and loss accumulators as one vector of 10 + 2 n entries.

@@ -49,7 +49,7 @@ from vrw_jax.models.contact_state import (
     unpack_state,
 )
 from vrw_jax.models.contact_tangents import walk_with_tangents
-from vrw_jax.wheel.foot_contact import ContactMode
+from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import stack_parameters
 
 

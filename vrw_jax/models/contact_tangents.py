@@ -41,8 +41,8 @@ from vrw_jax.models.contact_kernel import (
     init_lane_states,
 )
 from vrw_jax.models.contact_state import compute_guard_scales
-from vrw_jax.wheel.foot_contact import ContactMode
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.outcomes import ContactMode
+from vrw_jax.wheel.params import compute_wheel_units
 
 
 class _IntervalTangent(NamedTuple):

@@ -27,9 +27,13 @@ from vrw_jax.models.contact_section import (
 )
 from vrw_jax.models.contact_tangents import walk_with_tangents
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
-from vrw_jax.wheel.foot_contact import ContactMode
-from vrw_jax.wheel.params import PARAMETER_NAMES, Symbols, compute_symbols
-from vrw_jax.wheel.units import compute_wheel_units_of_rows
+from vrw_jax.wheel.outcomes import ContactMode
+from vrw_jax.wheel.params import (
+    PARAMETER_NAMES,
+    Symbols,
+    compute_symbols,
+    compute_wheel_units_of_rows,
+)
 
 
 def walk_batch(

@@ -13,16 +13,15 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
 from vrw_jax.models.capabilities import ModelCapabilities
-from vrw_jax.models.step_inputs import SectionState, complete_ground_line_slopes, compute_rises
-from vrw_jax.models.step_results import AdvanceResult
+from vrw_jax.models.step_results import AdvanceResult, SectionState
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,
     WheelParams,
+    WheelUnits,
     make_wheel_from_parameters,
 )
-from vrw_jax.wheel.units import WheelUnits
 
 StepGroundValues = tuple[Array, ...]
 """Arrays that describe the ground under one step or under all steps: slopes, rises and, for some
@@ -265,3 +264,38 @@ class AbstractWheel(eqx.Module):
         `x` may be the paper's section state, which has three entries.
         """
         return x
+
+
+def complete_ground_line_slopes(slope: Array, n_steps: int) -> Array:
+    """Return the slopes of the n + 1 lines of the ground under a walk of n steps, rad.
+
+    If `slope` has n entries, the last slope is repeated.
+    """
+    require_stepwise_shape("slope", slope, n_steps)
+    return slope if len(slope) > n_steps else jnp.append(slope, slope[-1:])
+
+
+def compute_rises(heights: Array, n_steps: int) -> Array:
+    """Return the height of each of the n + 1 footholds of a walk minus that of the foothold before.
+
+    If `heights` has n + 1 entries, the foothold before the walk lies on the mean line.
+    """
+    if jnp.shape(heights) not in ((n_steps + 1,), (n_steps + 2,)):
+        raise ValueError(
+            f"heights has shape {jnp.shape(heights)}, but a walk of {n_steps} steps of one wheel "
+            f"takes {n_steps + 1} heights of footholds, or {n_steps + 2} with the foothold before "
+            "the walk: map over batches of wheels with jax.vmap."
+        )
+    return jnp.diff(heights, prepend=0.0)[-(n_steps + 1) :]
+
+
+def require_stepwise_shape(quantity_name: str, stepwise_values: Array, n_steps: int) -> None:
+    """Raise a `ValueError` unless an array has n or n + 1 entries for n steps."""
+    if jnp.shape(stepwise_values) not in ((n_steps,), (n_steps + 1,)):
+        n_steps_text = "a step" if n_steps == 1 else f"a walk of {n_steps} steps"
+        raise ValueError(
+            f"{quantity_name} has shape {jnp.shape(stepwise_values)}, but {n_steps_text} of one "
+            "wheel "
+            f"takes one number, or an array of {n_steps} or {n_steps + 1} over its steps: map "
+            "over batches of wheels with jax.vmap."
+        )

@@ -24,17 +24,21 @@ from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET, FullState, embed_section_state
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES, make_flag_attributes
+from vrw_jax.models.phase_sequence import replace_invalid_inputs
 from vrw_jax.models.rigid import RigidWheel
-from vrw_jax.models.step_inputs import PAPER_START_STATE, replace_invalid_inputs
-from vrw_jax.models.step_results import AbstractContactStep, AdvanceResult, StepResult
+from vrw_jax.models.step_results import (
+    PAPER_START_STATE,
+    AbstractContactStep,
+    AdvanceResult,
+    StepResult,
+)
 from vrw_jax.models.unilateral_wheel import (
     AbstractContactWheel,
     UnilateralTrajectory,
     UnilateralWheel,
 )
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.foot_contact import ContactMode
-from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.outcomes import ContactMode, Outcome
 from vrw_jax.wheel.params import WheelParams, convert_friction
 
 

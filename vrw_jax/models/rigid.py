@@ -16,19 +16,16 @@ from vrw_jax.lanes.autodiff import compute_square_root
 from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.step_inputs import (
-    AnySectionState,
-    SectionState,
-    SectionStateEntries,
-    replace_invalid_inputs,
-    select_stance_line,
-)
+from vrw_jax.models.phase_sequence import replace_invalid_inputs, select_stance_line
 from vrw_jax.models.step_results import (
     AdvanceResult,
+    AnySectionState,
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,
     RequiredFriction,
+    SectionState,
+    SectionStateEntries,
     StepResult,
     Trajectory,
 )

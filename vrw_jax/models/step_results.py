@@ -17,8 +17,28 @@ from vrw_jax.base.printing import (
 )
 from vrw_jax.base.status_codes import describe_step_ending
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES
-from vrw_jax.models.step_inputs import AnySectionState
 from vrw_jax.wheel.outcomes import Outcome
+
+SectionState = Float[Array, "3"]
+"""State (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s and m/s. The leg labels are
+those of the step that ends. The touchdown condition determines the length of Leg 1. Leg 2 is on its
+stopper.
+"""
+AnySectionState = Float[Array, "section ..."]
+"""Section state of any model: a `SectionState` or a longer vector. A batch has its elements on the
+last axis.
+"""
+PAPER_START_STATE = (0.1, 1.6, -0.1)
+"""Start near the gait of Table 1 of the paper, inside the gait's basin of attraction: rad, rad/s,
+m/s.
+"""
+
+
+SectionStateEntries = Float[Array, "section ..."] | tuple[Array, ...]
+"""Section state as one array, or as separate entries. Each entry may be an array with one value per
+batch element.
+"""
+
 
 MeasureValue = Float[Array, "..."]
 """Value of a measure for a step; a batch has one value per element."""

@@ -33,8 +33,7 @@ from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
 from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
 from vrw_jax.models.registry import describe_accepted_models
-from vrw_jax.models.step_inputs import SectionState
-from vrw_jax.models.step_results import AdvanceResult, StepResult
+from vrw_jax.models.step_results import AdvanceResult, SectionState, StepResult
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.outcomes import Outcome

@@ -29,14 +29,11 @@ from vrw_jax.models.contact_mechanics import (
     compute_potential_energy,
 )
 from vrw_jax.models.contact_state import PackedState, unpack_state
+from vrw_jax.models.interface import complete_ground_line_slopes, compute_rises
 from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.models.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
+from vrw_jax.models.phase_sequence import select_stance_line
 from vrw_jax.models.provenance import collect_provenance_attributes
-from vrw_jax.models.step_inputs import (
-    complete_ground_line_slopes,
-    compute_rises,
-    select_stance_line,
-)
 from vrw_jax.models.stepping import ModelLike, SectionStateLike, convert_walk_arguments
 from vrw_jax.models.unilateral_wheel import UnilateralTrajectory
 from vrw_jax.wheel.dynamics import compute_damping_power

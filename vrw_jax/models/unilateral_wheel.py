@@ -31,16 +31,21 @@ from vrw_jax.models.contact_step import (
     build_contact_step_jacobian,
     build_contact_step_sampler,
 )
-from vrw_jax.models.interface import AbstractWheel, StepGroundValues
-from vrw_jax.models.step_inputs import (
-    PAPER_START_STATE,
+from vrw_jax.models.interface import (
+    AbstractWheel,
+    StepGroundValues,
     complete_ground_line_slopes,
     compute_rises,
     require_stepwise_shape,
 )
-from vrw_jax.models.step_results import AdvanceResult
-from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, WheelParams, convert_friction
-from vrw_jax.wheel.units import WheelUnits
+from vrw_jax.models.step_results import PAPER_START_STATE, AdvanceResult
+from vrw_jax.wheel.params import (
+    FRICTION_NAME,
+    PARAMETER_NAMES,
+    WheelParams,
+    WheelUnits,
+    convert_friction,
+)
 
 STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
 """Kinds of stoppers for legs in the air: they hold the leg with any force, or they only push."""

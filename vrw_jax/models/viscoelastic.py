@@ -42,12 +42,21 @@ from vrw_jax.models.phase_sequence import (
     make_trajectory,
     run_step_phases,
 )
-from vrw_jax.models.step_inputs import PAPER_START_STATE, SectionState
-from vrw_jax.models.step_results import AdvanceResult, StepResult, Trajectory
+from vrw_jax.models.step_results import (
+    PAPER_START_STATE,
+    AdvanceResult,
+    SectionState,
+    StepResult,
+    Trajectory,
+)
 from vrw_jax.wheel.geometry import Motion
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, require_known_friction
+from vrw_jax.wheel.params import (
+    PARAMETER_NAMES,
+    WheelParams,
+    compute_wheel_units,
+    require_known_friction,
+)
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant
-from vrw_jax.wheel.units import compute_wheel_units
 
 
 class DiffraxPhaseFunctions(NamedTuple):

@@ -20,8 +20,7 @@ from vrw_jax.models.stepping import (
     require_single_wheel,
 )
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import WheelParams
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.params import WheelParams, compute_wheel_units
 
 # Largest distance between the section states of a walk and of the gait at which the walk has
 # arrived. Distances are in units of the wheel. The value is chosen far above the errors of a gait

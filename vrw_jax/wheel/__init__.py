@@ -1,17 +1,16 @@
 """The paper's equations for one wheel: parameters, geometry, dynamics, phases."""
 
-from vrw_jax.wheel.foot_contact import ContactMode
 from vrw_jax.wheel.geometry import Motion, compute_landing_foot_height, compute_rear_foot_height
 from vrw_jax.wheel.ground import GroundAhead
-from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.wheel.outcomes import ContactMode, Outcome
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     Symbols,
     WheelParams,
+    compute_wheel_units_of_rows,
     make_wheel_from_parameters,
     stack_parameters,
 )
 from vrw_jax.wheel.phases import PAPER_PHASES, PhaseInstant, PhaseMargins, make_paper_phases
-from vrw_jax.wheel.units import compute_wheel_units_of_rows

@@ -27,10 +27,8 @@ from vrw_jax.wheel.geometry import (
     compute_landing_foot_height,
     compute_rear_foot_height,
 )
-from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import Symbols
-from vrw_jax.wheel.rest import are_coordinates_at_rest
-from vrw_jax.wheel.units import compute_wheel_units
+from vrw_jax.wheel.outcomes import Outcome, are_coordinates_at_rest
+from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
 SHARED_FAILURE_OUTCOMES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
 """Outcomes with which any phase can end instead of the regular end."""
