@@ -21,8 +21,8 @@ from experiments.shared.tables import DOCS, describe_run, format_markdown, repla
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.engines_agree import draw_wheels
 from vrw_jax.flow import load_explicit_tableau
-from vrw_jax.models.batch_step import run_batch_phases
 from vrw_jax.models.step_batch import order_wheels_by_work
+from vrw_jax.models.viscoelastic import run_batch_phases
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
 
 GROUP, N_LEGS = 8, 8

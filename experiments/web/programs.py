@@ -26,7 +26,6 @@ from vrw_jax.models import (
     advance_gait_step,
     compute_jacobian_columns,
 )
-from vrw_jax.models.batch_step import make_batch_phase, run_batch_phases
 from vrw_jax.models.contact_integrator import (
     N_ACCUMULATOR_ROWS,
     ContactIntervalPoint,
@@ -39,6 +38,7 @@ from vrw_jax.models.contact_state import ContactState
 from vrw_jax.models.contact_step import sample_contact_interval
 from vrw_jax.models.phase_sequence import evaluate_phase_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
+from vrw_jax.models.viscoelastic import make_batch_phase, run_batch_phases
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, make_wheel_from_parameters
 
 LEGS = (6, 8, 10)
@@ -46,9 +46,9 @@ LEGS = (6, 8, 10)
 SAMPLES = 24
 """Times of each phase that the animation knows, ends included."""
 
-UNSPLIT_LIMITS = lanes.RegisterLimits(max_unrolled_entries=64)
-"""Limits with which small arrays stay whole in a walk with unilateral contact: for ten legs the
-code is five times as long otherwise."""
+MAX_ENTRIES_IN_WALKS = 64
+"""Largest unrolled array, with which small arrays stay whole in a walk with unilateral contact: for
+ten legs the code is five times as long otherwise."""
 
 SOLVER = StepOptions.__dataclass_fields__["solver"].default
 
@@ -58,13 +58,15 @@ class Program(NamedTuple):
 
     function: Callable[..., tuple]
     numbers: int
-    limits: lanes.RegisterLimits = lanes.DEFAULT_REGISTER_LIMITS
+    max_unrolled_entries: int = lanes.MAX_UNROLLED_ENTRIES
     section: int = 3
 
     def object(self, name: str) -> bytes:
         """Return the program as object code for WebAssembly."""
         rows = len(PARAMETER_NAMES), self.section
-        return lanes.compile_wasm_object(self.function, self.numbers, rows, name, self.limits)
+        return lanes.compile_wasm_object(
+            self.function, self.numbers, rows, name, self.max_unrolled_entries
+        )
 
 
 PAGE_MARGINS = {name: m for name, m in MARGIN_MEASURES.items() if name != "takeoff_acceleration"}
@@ -113,7 +115,7 @@ def make_shared_programs() -> dict[str, Program]:
         columns, numbers, codes = compute_jacobian_columns(shift, tuple(x), range(3))
         return jnp.stack(numbers), jnp.stack(codes), jnp.stack(columns, 1)
 
-    return {"linearised": Program(linearised, 2, lanes.RegisterLimits(N_STEP_INPUTS))}
+    return {"linearised": Program(linearised, 2, N_STEP_INPUTS)}
 
 
 def programs(n_legs: int) -> dict[str, Program]:
@@ -260,7 +262,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
     return {
         "ground_begun": Program(begun, 0),
         "ground_opened": Program(opened, 2, section=size),
-        "ground_onward": Program(onward, 2, UNSPLIT_LIMITS, _size(form)),
+        "ground_onward": Program(onward, 2, MAX_ENTRIES_IN_WALKS, _size(form)),
         "ground_between": Program(between, 2, section=2 * n + 2 * n_legs + 1),
     }
 
@@ -321,7 +323,7 @@ def _of_rigid_legs(wheel: Callable[[Array], WheelParams]) -> dict[str, Program]:
         return _numbers_of(step), codes, rows
 
     return {
-        "rigid_linearised": Program(linearised, 1, lanes.RegisterLimits(N_STEP_INPUTS)),
+        "rigid_linearised": Program(linearised, 1, N_STEP_INPUTS),
         "rigid_told": Program(told, 2),
     }
 

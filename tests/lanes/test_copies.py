@@ -10,7 +10,7 @@ from jax import lax
 
 from vrw_jax import lanes
 from vrw_jax.lanes import lowering
-from vrw_jax.lanes.array_emitter import LANE_AXIS_SENTINEL
+from vrw_jax.lanes.array_emitter import LANE_AXIS_SENTINEL, ArrayEmitter
 from vrw_jax.lanes.code_cache import trace_for_machine_code
 from vrw_jax.lanes.kernel import write_llvm_kernel
 
@@ -72,9 +72,15 @@ def make_program(operations, reads_again):
     return program
 
 
+def keep_arrays_in_memory(patch):
+    """Leave almost no room in registers."""
+    patch.setattr(ArrayEmitter, "MAX_UNROLLED_REDUCTION_TERMS", 1)
+    for limit in ("MAX_REGISTER_ENTRIES", "MAX_INNERMOST_REGISTER_ENTRIES"):
+        patch.setattr(ArrayEmitter, limit, 2)
+
+
 def run_as_machine_code(program, x, forces_copies):
     """Return the results; without room in registers, so that arrays are in memory."""
-    limits = lanes.RegisterLimits(1, 1, max_register_entries=2, max_innermost_register_entries=2)
     with pytest.MonkeyPatch.context() as patch:
         if forces_copies:
             find_last_uses = lowering._find_overwriting_equations
@@ -83,7 +89,8 @@ def run_as_machine_code(program, x, forces_copies):
                 "_find_overwriting_equations",
                 lambda jaxpr: dict.fromkeys(find_last_uses(jaxpr)),
             )
-        run = lanes.compile_batch_function(program, register_limits=limits)
+        keep_arrays_in_memory(patch)
+        run = lanes.compile_batch_function(program, max_unrolled_entries=1)
         return np.asarray(jax.jit(run)(x))
 
 
@@ -98,10 +105,10 @@ def test_loops_in_place_compute_what_loops_with_copies_compute(operations, reads
     np.testing.assert_allclose(in_place, jax.jit(program)(x), rtol=1e-12, atol=1e-12)
 
 
-def test_a_loop_that_updates_an_array_allocates_it_once():
+def test_a_loop_that_updates_an_array_allocates_it_once(monkeypatch):
     double_row = lambda i, y: lax.dynamic_update_index_in_dim(y, 2.0 * y[i], i, 0)
     program = lambda x: lax.fori_loop(0, N_ROWS, double_row, 3.0 * x)
-    limits = lanes.RegisterLimits(1, 1, max_register_entries=2, max_innermost_register_entries=2)
     shape = jax.ShapeDtypeStruct((N_ROWS, LANE_AXIS_SENTINEL), np.float64)
-    text = write_llvm_kernel(trace_for_machine_code(program, shape)[0], 4, limits)
+    keep_arrays_in_memory(monkeypatch)
+    text = write_llvm_kernel(trace_for_machine_code(program, shape)[0], 4, max_unrolled_entries=1)
     assert text.count(f"alloca <4 x double>, i64 {N_ROWS}") == 1

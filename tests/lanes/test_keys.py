@@ -19,11 +19,11 @@ from vrw_jax.branches.continuation_problems import make_trial_linearizer
 from vrw_jax.gaits.collocation_search import CollocationSystem, run_search_attempts
 from vrw_jax.gaits.limit_cycle_result import solve_limit_cycle
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
-from vrw_jax.models.batch_step import make_step_outputs_function
 from vrw_jax.models.contact_kernel import run_walks
-from vrw_jax.models.contact_step import ContactStepConfig, sample_contact_interval
+from vrw_jax.models.contact_step import prepare_walk, sample_contact_interval
 from vrw_jax.models.contact_walks import _make_static_walk_settings
 from vrw_jax.models.phase_sequence import make_step_result
+from vrw_jax.models.viscoelastic import take_steps_of_lanes
 
 GRAVITY = 9.81
 moon = types.ModuleType("moon")
@@ -305,12 +305,13 @@ def change_settings(value):
     [
         (run_search_attempts, CollocationSystem(8, 1, vrw.CycleOptions())),
         (make_trial_linearizer, (CollocationSystem(8, 1, vrw.CycleOptions()), (0, 1))),
-        (make_step_outputs_function, (jax.tree.structure(vrw.StepOptions()), True, 0.7)),
+        (lanes.make_leaf_function, (jax.tree.structure(vrw.StepOptions()), True, 0.7)),
+        (take_steps_of_lanes, (True, 0.7)),
         (
             run_walks,
             _make_static_walk_settings(vrw.UnilateralWheel(), vrw.StepOptions(), 8, True, 12),
         ),
-        (ContactStepConfig.compute_walk_outputs, ContactStepConfig(None, True)),
+        (prepare_walk, (True, "lanes", False, False)),
         (sample_contact_interval, (vrw.UnilateralWheel(restitution=0.5), 40)),
         (make_step_result, (vrw.ViscoelasticWheel(friction=0.4), 40)),
         (solve_limit_cycle, (vrw.LadderWheel(), vrw.RigidWheel(), "cycle")),

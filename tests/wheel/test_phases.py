@@ -10,7 +10,7 @@ from vrw_jax.flow import integrate_batch_phase, load_explicit_tableau
 from vrw_jax.gaits import PhasePoint
 from vrw_jax.gaits import phase_sequence as sequence
 from vrw_jax.hybrid import integrate_phase
-from vrw_jax.models import batch_step as lane_step
+from vrw_jax.models import viscoelastic as lane_step
 from vrw_jax.models.viscoelastic import make_diffrax_phase
 from vrw_jax.wheel import (
     PAPER_PHASES,

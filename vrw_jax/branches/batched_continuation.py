@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.progress import report_progress
 from vrw_jax.branches.arclength import (
     AbstractContinuationProblem,
@@ -31,7 +32,7 @@ from vrw_jax.branches.arclength import (
     iterate_branches,
     make_continuation_result,
 )
-from vrw_jax.lanes.batching import select_tree_rows, select_trees_by_condition
+from vrw_jax.lanes.batching import select_tree_rows
 
 
 class PlaneNewtonState(NamedTuple):

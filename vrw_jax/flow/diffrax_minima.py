@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.minima import find_cubic_minimum, refine_minimum_location
-from vrw_jax.lanes.batching import select_trees_by_condition
 
 StateArray = Float[Array, " dim"]
 EvaluateGuardsAndMargins = Callable[[StateArray], Float[Array, " n_guards_and_margins"]]

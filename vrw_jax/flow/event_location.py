@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.minima import MarginMinimaState
@@ -21,7 +22,6 @@ from vrw_jax.flow.tableaus import (
     take_rk_step,
 )
 from vrw_jax.flow.tangents import BatchPhase
-from vrw_jax.lanes.batching import select_trees_by_condition
 
 
 class IntegrationStatus(IntEnum):

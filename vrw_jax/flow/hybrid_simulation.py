@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
+from vrw_jax.base.elementwise import make_opaque_loop_condition
 from vrw_jax.base.forward_only import forbid_reverse_mode
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.progress import announce_wait
@@ -31,7 +32,6 @@ from vrw_jax.flow.diffrax_minima import (
 )
 from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
 from vrw_jax.flow.solver_steps import VectorField
-from vrw_jax.lanes.batching import make_opaque_loop_condition
 from vrw_jax.lanes.program_cache import call_compiled_program
 from vrw_jax.lanes.settings import with_default_jax_settings
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.event_location import (
@@ -46,7 +47,6 @@ from vrw_jax.flow.tangents import (
     stack_directions,
 )
 from vrw_jax.lanes.autodiff import make_zero_tangent
-from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.lanes.lowering import mark_noinline
 from vrw_jax.lanes.settings import with_default_jax_settings
 

@@ -15,10 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
 from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
-from vrw_jax.lanes.batching import select_trees_by_condition
 
 MINIMUM_LOCATION_TOLERANCE = 1e-6
 """Accuracy of the location of a minimum, as a fraction of the solver step. The value is chosen

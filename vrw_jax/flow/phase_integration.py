@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.base.elementwise import make_opaque_loop_condition, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.diffrax_minima import (
@@ -38,7 +39,6 @@ from vrw_jax.flow.diffrax_minima import (
 )
 from vrw_jax.flow.minima import evaluate_cubic, find_cubic_minimum
 from vrw_jax.flow.solver_steps import AbstractStepper, VectorField, make_stepper
-from vrw_jax.lanes.batching import make_opaque_loop_condition, select_trees_by_condition
 
 if TYPE_CHECKING:
     pass

@@ -21,8 +21,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import run_if_any_element_active
 from vrw_jax.base.types import Vector
-from vrw_jax.lanes.batching import run_if_any_element_active
 
 
 class ButcherTableau(NamedTuple):

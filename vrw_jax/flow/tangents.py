@@ -23,6 +23,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import run_if_any_element_active
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
@@ -32,7 +33,6 @@ from vrw_jax.flow.tableaus import (
     evaluate_stage,
 )
 from vrw_jax.lanes.autodiff import make_zero_tangent
-from vrw_jax.lanes.batching import run_if_any_element_active
 from vrw_jax.lanes.settings import with_default_jax_settings
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.batch_algebra import LaneArray
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.types import Vector
 from vrw_jax.gaits.gait_surface import predict_gait
 from vrw_jax.gaits.gauss import N_GAUSS_NODES, PhaseMesh
@@ -42,7 +43,7 @@ from vrw_jax.gaits.phase_sequence import (
     compute_phase_constants,
     make_post_impact_sequence,
 )
-from vrw_jax.lanes.batching import BatchFunction, select_trees_by_condition
+from vrw_jax.lanes.batching import BatchFunction
 from vrw_jax.wheel.params import WheelParams, make_wheel_from_parameters, stack_parameters
 
 LaneParameters = Float[Array, "n_parameters lanes"]

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.gaits.phase_collocation import (
     CollocationPhase,

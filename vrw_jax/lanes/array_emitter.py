@@ -14,7 +14,7 @@ may combine lanes, except the test whether any or all lanes continue.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -35,27 +35,11 @@ LANE_AXIS_SENTINEL = 1021
 length identifies the axis. The machine code accepts any number of lanes."""
 
 
-@dataclass(frozen=True)
-class RegisterLimits:
-    """Largest sizes of arrays whose entries the machine code computes in registers.
+MAX_UNROLLED_ENTRIES = 8
+"""Largest number of entries of a lazy array for which each entry has its own instructions.
 
-    Larger limits give longer code, which takes longer to compile.
-    """
-
-    max_unrolled_entries: int = 8
-    """Largest number of entries of a lazy array for which each entry has its own instructions."""
-    max_unrolled_reduction_terms: int = 8
-    """Largest number of terms of a sum or another reduction for which no loop is emitted."""
-    max_register_entries: int = 32
-    """Largest number of entries of an array that a loop carries in registers.
-
-    The limit also applies to constants; a larger constant is a table in memory.
-    """
-    max_innermost_register_entries: int = 64
-    """Largest number of entries of an array that an innermost loop carries in registers."""
-
-
-DEFAULT_REGISTER_LIMITS = RegisterLimits()
+With a larger number, the code is longer and takes longer to compile.
+"""
 
 
 class PrimitiveCall(NamedTuple):
@@ -83,11 +67,20 @@ class ArrayEmitter:
     """
 
     value_emitter: ValueEmitter
-    register_limits: RegisterLimits
+    max_unrolled_entries: int = MAX_UNROLLED_ENTRIES
     is_in_innermost_loop: bool = False
     """Whether the code is in an innermost loop, where constants need no table."""
     objects_kept_alive: list[Any] = field(default_factory=list)
     """Objects that are identified by `id`."""
+    MAX_REGISTER_ENTRIES: ClassVar[int] = 32
+    """Largest number of entries of an array that a loop carries in registers.
+
+    The limit also applies to constants; a larger constant is a table in memory.
+    """
+    MAX_INNERMOST_REGISTER_ENTRIES: ClassVar[int] = 64
+    """Largest number of entries of an array that an innermost loop carries in registers."""
+    MAX_UNROLLED_REDUCTION_TERMS: ClassVar[int] = 8
+    """Largest number of terms of a sum or another reduction for which no loop is emitted."""
 
     def __post_init__(self) -> None:
         self.llvm_builder = self.value_emitter.llvm_builder
@@ -119,8 +112,7 @@ class ArrayEmitter:
             ],
         )
         fits_registers = (
-            self.is_in_innermost_loop
-            or constant_array.size <= self.register_limits.max_register_entries
+            self.is_in_innermost_loop or constant_array.size <= self.MAX_REGISTER_ENTRIES
         )
         return constant_entries if fits_registers else self.make_memory_table(constant_entries)
 

@@ -8,7 +8,8 @@ rule, so Hessians work in every combination of modes.
 """
 
 import functools
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -110,6 +111,115 @@ def enable_all_ad_modes(
         )
 
     return call_differentiable_function
+
+
+def differentiate(
+    function: Callable,
+    reference: Callable,
+    make_column_function: Callable[[Any, tuple[int, ...]], Callable] | None = None,
+) -> Callable:
+    """Return a function of trees of arrays with derivatives in every mode, to any order.
+
+    - `reference`: function with the same result, from which derivatives are computed;
+    - `make_column_function`: function of the structure of the arguments and of `argnums`, numbers
+      of leaves. It returns a function of all leaves, whose results are those of
+      `compute_jacobian_columns`. It replaces `reference` for first derivatives.
+    """
+
+    @functools.cache
+    def differentiate_leaf_function(structure: Any) -> ForwardFunction:
+        def make_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
+            assert make_column_function is not None
+            compute_columns = make_column_function(structure, argnums)
+
+            def compute_jacobian(*leaves: Array) -> tuple:
+                columns, float_outputs, nonfloat_outputs = compute_columns(*leaves)
+                jacobian = _split_jacobian_by_leaf(columns, leaves, argnums)
+                return (jacobian, float_outputs), nonfloat_outputs
+
+            return compute_jacobian
+
+        return enable_all_ad_modes(
+            make_leaf_function(function, structure),
+            make_leaf_function(reference, structure),
+            make_column_function and make_jacobian,
+        )
+
+    def call_differentiable_function(*arguments: PyTree) -> PyTree:
+        leaves, structure = jax.tree.flatten(arguments)
+        return eqx.combine(*differentiate_leaf_function(structure)(*leaves))
+
+    return call_differentiable_function
+
+
+def make_leaf_function(function: Callable, structure: Any) -> ForwardFunction:
+    """Return a function of the leaves of arguments with a tree structure.
+
+    Its results are divided into floating-point arrays and other arrays.
+    """
+    return lambda *leaves: eqx.partition(
+        function(*jax.tree.unflatten(structure, leaves)), eqx.is_inexact_array
+    )
+
+
+def _split_jacobian_by_leaf(
+    jacobian_columns: Any, argument_leaves: Sequence[Array], input_indices: Sequence[int]
+) -> tuple:
+    """Split a Jacobian into one tree per selected leaf.
+
+    - `jacobian_columns`: Jacobian, whose leading axis runs over all entries of the selected leaves;
+    - `input_indices`: indices of the selected leaves in `argument_leaves`.
+    """
+    jacobian_by_leaf, first_column = [], 0
+    for i in input_indices:
+        leaf_shape = jnp.shape(argument_leaves[i])
+        end_column = first_column + math.prod(leaf_shape)
+        columns_of_leaf = slice(first_column, end_column)
+        select_leaf_columns = lambda x, columns=columns_of_leaf, leaf_shape=leaf_shape: (
+            jnp.moveaxis(x[columns], 0, -1).reshape(*x.shape[1:], *leaf_shape)
+        )
+        jacobian_by_leaf.append(jax.tree.map(select_leaf_columns, jacobian_columns))
+        first_column = end_column
+    return tuple(jacobian_by_leaf)
+
+
+def compute_jacobian_columns(
+    batch_function: BatchFunction, argument_leaves: Sequence[Array], input_indices: Sequence[int]
+) -> tuple:
+    """Return the Jacobian columns, the float results and all other results of a batched function.
+
+    The columns are derivatives with respect to the leaves at `input_indices`. The leading axis of
+    the columns runs over the entries of the leaves. `batch_function` returns float arrays with the
+    batch on the last axis, and auxiliary results.
+    """
+
+    def evaluate_at_selected_leaves(*selected_leaf_values: Array) -> tuple:
+        all_leaves = list(argument_leaves)
+        for i, selected_leaf_value in zip(input_indices, selected_leaf_values, strict=True):
+            all_leaves[i] = selected_leaf_value
+        return batch_function(*all_leaves)
+
+    selected_leaves = [argument_leaves[i] for i in input_indices]
+    n_entries_by_leaf = [math.prod(leaf.shape[:-1]) for leaf in selected_leaves]
+    n_vectors = sum(n_entries_by_leaf)
+    # Each entry of a unit vector is a separate constant 0 or 1, so that machine code omits products
+    # with 0.
+    unit_vectors, unit_tangents = iter(np.eye(n_vectors)), []
+    for leaf, n_entries in zip(selected_leaves, n_entries_by_leaf, strict=True):
+        lane_tangents = [
+            jnp.broadcast_to(
+                jnp.asarray(next(unit_vectors), leaf.dtype)[:, None], (n_vectors, leaf.shape[-1])
+            )
+            for _ in range(n_entries)
+        ]
+        unit_tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
+    directional_derivative_function = lambda tangents: jax.jvp(
+        evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
+    )
+    float_outputs, jacobian_columns, nonfloat_outputs = jax.vmap(
+        directional_derivative_function, out_axes=(None, 0, None)
+    )(unit_tangents)
+    return jacobian_columns, float_outputs, nonfloat_outputs
 
 
 def _differentiate_float_outputs(

@@ -115,41 +115,6 @@ def is_inside_jit() -> bool:
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
-def run_if_any_element_active(
-    is_any_element_active: Array, function: Callable[[PyTree], PyTree], initial_value: PyTree
-) -> PyTree:
-    """Return `function(initial_value)` if `is_any_element_active` is true, and else
-    `initial_value`.
-
-    `is_any_element_active` is one flag for the whole batch. The call is a loop with at most one
-    iteration, which machine code skips if the flag is false.
-    """
-    call_function_once = lambda loop_carry: (jnp.zeros((), bool), function(loop_carry[1]))
-    return lax.while_loop(
-        lambda loop_carry: loop_carry[0],
-        call_function_once,
-        (is_any_element_active, initial_value),
-    )[1]
-
-
-def make_opaque_loop_condition(loop_condition: Array, nonnegative_count: Array) -> Array:
-    """Return a loop condition that equals `loop_condition` but also reads a nonnegative count.
-
-    If a loop condition reads only one value, XLA looks for an iteration counter in a copy of the
-    loop's body. This search takes a fifth of the compile time of a step with unilateral contact.
-    """
-    return loop_condition & (nonnegative_count >= 0)
-
-
-def select_trees_by_condition(
-    condition: Array, tree_if_true: PyTree, tree_if_false: PyTree
-) -> PyTree:
-    """Select each entry from `tree_if_true` where `condition` is true, and else from
-    `tree_if_false`.
-    """
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), tree_if_true, tree_if_false)
-
-
 def make_zeros_like_output(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     """Return zeros with the structure and shapes of the output of `function`, without calling
     it.

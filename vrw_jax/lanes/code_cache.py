@@ -24,7 +24,6 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.lanes import disk_cache
-from vrw_jax.lanes.array_emitter import RegisterLimits
 from vrw_jax.lanes.kernel import LANE_KERNEL_NAME, write_llvm_kernel
 from vrw_jax.lanes.machine import (
     compile_llvm_for_processor,
@@ -57,7 +56,7 @@ def get_lane_program(
     argument_shapes: Any,
     function_key: str | None,
     lanes_per_group: int,
-    register_limits: RegisterLimits,
+    max_unrolled_entries: int,
 ) -> LaneProgram:
     """Return machine code for a function of arrays with lanes on the last axis.
 
@@ -71,13 +70,13 @@ def get_lane_program(
     """
     if function_key is None:
         return _compile_lane_program(
-            lane_function, argument_shapes, None, lanes_per_group, register_limits
+            lane_function, argument_shapes, None, lanes_per_group, max_unrolled_entries
         )
     index_key = (
         function_key,
         [(x.shape, x.dtype.name, bool(getattr(x, "weak_type", False))) for x in argument_shapes],
         lanes_per_group,
-        register_limits,
+        max_unrolled_entries,
         disk_cache.describe_trace_environment(),
         describe_compiler_settings(),
     )
@@ -86,7 +85,7 @@ def get_lane_program(
         _lane_program_by_index_name[index_name] = _load_lane_program(
             index_name
         ) or _compile_lane_program(
-            lane_function, argument_shapes, index_name, lanes_per_group, register_limits
+            lane_function, argument_shapes, index_name, lanes_per_group, max_unrolled_entries
         )
     return _lane_program_by_index_name[index_name]
 
@@ -113,12 +112,12 @@ def _compile_lane_program(
     argument_shapes: Any,
     index_name: str | None,
     lanes_per_group: int,
-    register_limits: RegisterLimits,
+    max_unrolled_entries: int,
 ) -> LaneProgram:
     """Trace a function, and compile it in the background unless its LLVM text is known."""
     with _jax_tracing_lock, _pause_garbage_collection():
         closed_jaxpr, result_structure = trace_for_machine_code(lane_function, *argument_shapes)
-        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, register_limits)
+        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, max_unrolled_entries)
     encoded_result_types = json.dumps(
         [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
     )

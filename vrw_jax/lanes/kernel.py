@@ -7,11 +7,10 @@ from typing import Any
 from jax.extend.core import ClosedJaxpr
 
 from vrw_jax.lanes.array_emitter import (
-    DEFAULT_REGISTER_LIMITS,
     LANE_AXIS_SENTINEL,
+    MAX_UNROLLED_ENTRIES,
     ArrayEmitter,
     LaneAxisError,
-    RegisterLimits,
     has_lane_axis,
     make_lane_axis_error,
 )
@@ -28,7 +27,7 @@ LANE_KERNEL_NAME = "lanes"
 def write_llvm_kernel(
     closed_jaxpr: ClosedJaxpr,
     lanes_per_group: int,
-    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
+    max_unrolled_entries: int = MAX_UNROLLED_ENTRIES,
 ) -> str:
     """Return the LLVM text of a function that computes the jaxpr for a range of groups of lanes.
 
@@ -48,7 +47,7 @@ def write_llvm_kernel(
     llvm_kernel.attributes.add("nounwind")
     llvm_builder = ir.IRBuilder(llvm_kernel.append_basic_block("entry"))
     array_emitter = ArrayEmitter(
-        ValueEmitter(llvm_builder, max(lanes_per_group, 2)), register_limits
+        ValueEmitter(llvm_builder, max(lanes_per_group, 2)), max_unrolled_entries
     )
     input_pointer_table, output_pointer_table, n_lanes, first_lane_group, end_lane_group = (
         llvm_kernel.args
@@ -143,10 +142,7 @@ class _LaneGroupAccess:
         argument_array = LazyArray(
             aval.shape[:-1], self.array_emitter.get_entry_type(aval), emit_entry_load
         )
-        fits_registers = (
-            math.prod(argument_array.shape)
-            <= self.array_emitter.register_limits.max_register_entries
-        )
+        fits_registers = math.prod(argument_array.shape) <= self.array_emitter.MAX_REGISTER_ENTRIES
         return (
             self.array_emitter.get_array_entries(argument_array)
             if fits_registers

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from vrw_jax.lanes import disk_cache, fallback
-from vrw_jax.lanes.array_emitter import DEFAULT_REGISTER_LIMITS, LaneAxisError, RegisterLimits
+from vrw_jax.lanes.array_emitter import MAX_UNROLLED_ENTRIES, LaneAxisError
 from vrw_jax.lanes.autodiff import enable_all_ad_modes
 from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
 from vrw_jax.lanes.code_cache import LaneProgram, get_lane_program, targets_machine_code
@@ -66,13 +66,13 @@ class CompiledBatchFunction:
         self,
         function: BatchFunction,
         xla_block_size: int,
-        register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
+        max_unrolled_entries: int = MAX_UNROLLED_ENTRIES,
         marks_unfinished_lanes: bool = False,
         key: str | Literal["by content"] | None = "by content",
     ) -> None:
         self._function = function
         self._xla_block_size = xla_block_size
-        self._register_limits = register_limits
+        self._max_unrolled_entries = max_unrolled_entries
         self._marks_unfinished_lanes = marks_unfinished_lanes
         self._lasting_key = key
         self._programs: dict[Any, LaneProgram] = {}
@@ -132,7 +132,7 @@ class CompiledBatchFunction:
                 make_argument_shapes(argument_types),
                 self._find_key(structure),
                 lanes_per_group,
-                self._register_limits,
+                self._max_unrolled_entries,
             )
         except Exception as compilation_error:
             self._use_xla_after(compilation_error)
@@ -187,7 +187,7 @@ _xla_programs: dict[str | None, Callable] = {}
 def compile_batch_function(
     function: BatchFunction,
     xla_block_size: int = 1,
-    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
+    max_unrolled_entries: int = MAX_UNROLLED_ENTRIES,
     marks_unfinished_lanes: bool = False,
 ) -> CompiledBatchFunction:
     """Compile a function of trees of arrays with lanes on the last axis, at its first call.
@@ -196,12 +196,24 @@ def compile_batch_function(
     The disk cache keeps the code under a key of the function's own code and closure.
 
     - `xla_block_size`: number of lanes that one call of an XLA program computes;
-    - `register_limits`: limits that decide which arrays are in registers;
+    - `max_unrolled_entries`: largest array whose entries each have instructions of their own;
     - `marks_unfinished_lanes`: whether an XLA program of `run` may stop while a few lanes are
       unfinished. The function then takes the number of these lanes as a further argument, and its
       first result is a boolean array that marks them.
     """
-    return CompiledBatchFunction(function, xla_block_size, register_limits, marks_unfinished_lanes)
+    return CompiledBatchFunction(
+        function, xla_block_size, max_unrolled_entries, marks_unfinished_lanes
+    )
+
+
+def jit_batch(
+    function: BatchFunction, max_unrolled_entries: int = MAX_UNROLLED_ENTRIES
+) -> BatchFunction:
+    """Compile a function of trees of arrays with lanes on the last axis, as a function of one lane.
+
+    `jax.vmap` of the result calls the compiled function once. The result has no derivatives.
+    """
+    return unbatch(compile_batch_function(function, max_unrolled_entries=max_unrolled_entries))
 
 
 def _call_with_leaves(function: Callable, structure: Any, *leaves: Any) -> Any:

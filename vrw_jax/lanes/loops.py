@@ -120,7 +120,7 @@ def emit_scan_loop(
         scanned_slice = scanned_array.get_subarray(iteration_index)
         fits_registers = (
             array_emitter.is_in_innermost_loop
-            or math.prod(scanned_slice.shape) <= array_emitter.register_limits.max_register_entries
+            or math.prod(scanned_slice.shape) <= array_emitter.MAX_REGISTER_ENTRIES
         )
         return array_emitter.get_array_entries(scanned_slice) if fits_registers else scanned_slice
 
@@ -170,11 +170,10 @@ class _LoopCarry:
         initial_loop_carry_arrays: Sequence[LlvmArray],
     ) -> None:
         self.array_emitter, self.loop_carry_avals = array_emitter, loop_carry_avals
-        register_limits = array_emitter.register_limits
         max_register_entries = (
-            register_limits.max_innermost_register_entries
+            array_emitter.MAX_INNERMOST_REGISTER_ENTRIES
             if array_emitter.is_in_innermost_loop
-            else register_limits.max_register_entries
+            else array_emitter.MAX_REGISTER_ENTRIES
         )
         self.loop_carry_memory = [
             self.choose_loop_carry_memory(aval, initial_loop_carry_array)

@@ -172,7 +172,7 @@ class JaxprLowering:
         array_emitter_of_caller = self.array_emitter
         array_emitter_of_function = ArrayEmitter(
             ValueEmitter(llvm_builder, array_emitter_of_caller.value_emitter.n_vector_lanes),
-            array_emitter_of_caller.register_limits,
+            array_emitter_of_caller.max_unrolled_entries,
             array_emitter_of_caller.is_in_innermost_loop,
         )
         result_arrays = JaxprLowering(

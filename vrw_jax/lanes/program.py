@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.lanes import fallback
-from vrw_jax.lanes.array_emitter import DEFAULT_REGISTER_LIMITS, LANE_AXIS_SENTINEL, RegisterLimits
+from vrw_jax.lanes.array_emitter import LANE_AXIS_SENTINEL, MAX_UNROLLED_ENTRIES
 from vrw_jax.lanes.code_cache import (
     LaneProgram,
     MachineCode,
@@ -74,7 +74,7 @@ def _can_xla_call_machine_code() -> bool:
         make_argument_shapes(argument_types),
         None,
         lanes_per_group,
-        DEFAULT_REGISTER_LIMITS,
+        MAX_UNROLLED_ENTRIES,
     )
     increment = lambda x: call_machine_code(get_program, [x])
     with jax.ensure_compile_time_eval():
@@ -217,7 +217,7 @@ def compile_wasm_object(
     n_scalars: int,
     n_rows_by_array: Sequence[int],
     exported_function_name: str,
-    register_limits: RegisterLimits = DEFAULT_REGISTER_LIMITS,
+    max_unrolled_entries: int = MAX_UNROLLED_ENTRIES,
 ) -> bytes:
     """Return object code for WebAssembly that computes `lane_function(*scalars, *arrays)` for two
     lanes at a time.
@@ -234,7 +234,7 @@ def compile_wasm_object(
     argument_shapes = [jax.ShapeDtypeStruct((), np.float64)] * n_scalars + lane_array_shapes
     closed_jaxpr, _ = trace_for_machine_code(lane_function, *argument_shapes)
     return compile_llvm_for_webassembly(
-        write_llvm_kernel(closed_jaxpr, 2, register_limits),
+        write_llvm_kernel(closed_jaxpr, 2, max_unrolled_entries),
         LANE_KERNEL_NAME,
         exported_function_name,
     )

@@ -69,10 +69,7 @@ def emit_array_product(
 
     product_shape = primitive_call.result_shape
     entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
-    if (
-        n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
-        or array_emitter.is_in_innermost_loop
-    ):
+    if n_terms <= array_emitter.MAX_UNROLLED_REDUCTION_TERMS or array_emitter.is_in_innermost_loop:
         emit_product_entry = lambda entry_index: functools.reduce(
             emit_sum, [emit_product_term(entry_index, k) for k in range(n_terms)]
         )
@@ -145,10 +142,7 @@ def emit_reduced_array(
             return array_emitter.get_array_entry(array, entry_index)
 
         n_terms = math.prod(reduced_axis_lengths)
-        if (
-            isinstance(array, np.ndarray)
-            or n_terms <= array_emitter.register_limits.max_unrolled_reduction_terms
-        ):
+        if isinstance(array, np.ndarray) or n_terms <= array_emitter.MAX_UNROLLED_REDUCTION_TERMS:
             return functools.reduce(
                 emit_combination, map(get_entry_to_reduce, np.ndindex(*reduced_axis_lengths))
             )

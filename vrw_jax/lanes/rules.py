@@ -62,7 +62,7 @@ def _emit_single_result(
     )
     if (
         isinstance(result_array, LazyArray)
-        and math.prod(result_array.shape) <= array_emitter.register_limits.max_unrolled_entries
+        and math.prod(result_array.shape) <= array_emitter.max_unrolled_entries
     ):
         result_array = array_emitter.get_array_entries(result_array)
     return [result_array]

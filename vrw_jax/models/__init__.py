@@ -1,6 +1,6 @@
 """Models of the wheel: what one step is."""
 
-from vrw_jax.models.batch_step import N_STEP_INPUTS, advance_gait_step, compute_jacobian_columns
+from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_mechanics import compute_foot_heights, compute_leg_directions
 from vrw_jax.models.contact_state import unpack_state
@@ -35,3 +35,4 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.models.stepping import walk
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
+from vrw_jax.models.viscoelastic import N_STEP_INPUTS, advance_gait_step

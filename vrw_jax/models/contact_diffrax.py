@@ -14,13 +14,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins
 from vrw_jax.flow.scaled_integration import (
     integrate_phase_in_scaled_units,
     sample_phase_in_scaled_units,
 )
-from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.contact_integrator import (
     N_ACCUMULATOR_ROWS,
     ContactIntervalPoint,

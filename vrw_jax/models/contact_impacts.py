@@ -13,8 +13,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
+from vrw_jax.base.elementwise import run_if_any_element_active, select_trees_by_condition
 from vrw_jax.base.types import Elementwise
-from vrw_jax.lanes.batching import run_if_any_element_active, select_trees_by_condition
 from vrw_jax.models.contact_jvp import (
     ContactConfiguration,
     WheelForceSolution,

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.diffrax_minima import GUARD_ROUNDOFF_IN_EPS
 from vrw_jax.flow.tableaus import (
@@ -32,7 +33,6 @@ from vrw_jax.flow.tableaus import (
     find_guard_minimum,
     fit_guard_parabola,
 )
-from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.contact_mechanics import WheelMotion, make_opaque_one, prevent_fusion
 from vrw_jax.models.contact_state import (
     ContactModeDynamics,

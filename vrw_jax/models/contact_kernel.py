@@ -16,13 +16,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import make_opaque_loop_condition, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.tableaus import ButcherTableau
-from vrw_jax.lanes.batching import (
-    make_opaque_loop_condition,
-    make_zeros_like_output,
-    select_trees_by_condition,
-)
+from vrw_jax.lanes.batching import make_zeros_like_output
 from vrw_jax.models.contact_diffrax import init_diffrax_contact_interval, integrate_by_diffrax
 from vrw_jax.models.contact_impacts import ContactLaw
 from vrw_jax.models.contact_integrator import (

@@ -22,7 +22,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Shaped
 
-from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Scalar
 from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.params import Symbols

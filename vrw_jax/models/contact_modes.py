@@ -28,8 +28,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax import lanes
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.types import Elementwise
-from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.contact_mechanics import (
     ContactInverseInertia,
     FreeMotion,

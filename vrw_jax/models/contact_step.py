@@ -1,9 +1,9 @@
 """Compute steps of one wheel with unilateral contact, by machine code or by diffrax.
 
-`build_contact_step_function` returns a function of one wheel, which `jax.vmap` maps to batch
-elements of the kernel. For derivatives, each tangent has its own batch element in addition to that
-of the motion. To sample a step, a JAX program advances from event to event and records the start of
-each interval. Every interval is then integrated again, from sample to sample.
+`jax.vmap` maps the compiled functions of one wheel to batch elements. For derivatives, each tangent
+has its own batch element in addition to that of the motion. To sample a step, a JAX program
+advances from event to event and records the start of each interval. Every interval is then
+integrated again, from sample to sample.
 """
 
 import functools
@@ -17,13 +17,11 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from vrw_jax import lanes
+from vrw_jax.base.elementwise import make_opaque_loop_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.integrate import sample_at_equal_times
 from vrw_jax.flow.tableaus import ButcherTableau, load_explicit_tableau
-from vrw_jax.lanes.autodiff import ForwardFunction
-from vrw_jax.lanes.batching import make_opaque_loop_condition, unbatch
-from vrw_jax.lanes.lane_function import compile_batch_function
-from vrw_jax.models.batch_step import split_jacobian_by_leaf
 from vrw_jax.models.contact_diffrax import sample_by_diffrax
 from vrw_jax.models.contact_integrator import (
     ContactIntervalPoint,
@@ -50,82 +48,100 @@ from vrw_jax.models.contact_state import (
 )
 from vrw_jax.models.contact_tangents import walk_with_tangents
 from vrw_jax.wheel.outcomes import ContactMode
-from vrw_jax.wheel.params import stack_parameters
+from vrw_jax.wheel.params import WheelParams, stack_parameters
 
 
-class ContactStepConfig(NamedTuple):
-    """Static configuration of a step, and functions of the leaves of its arguments."""
+def prepare_walk(
+    is_detailed: bool,
+    engine: str,
+    measures_force_peaks: bool,
+    uses_diffrax: bool,
+    wheel: Any,
+    params: WheelParams,
+    x: Array,
+    options: StepOptions,
+) -> tuple[BatchWalkSettings, Array, Array]:
+    """Return the settings of walks of one step, and input columns and section states.
 
-    argument_tree_structure: Any  # tree structure of (wheel, params, x, options)
-    is_detailed: bool
-    uses_diffrax: bool = False  # whether diffrax replaces the batch kernel
-    engine_name: str = "lanes"  # name of the engine in the results
-    measures_force_peaks: bool = False
+    - `engine`: name of the engine in the results;
+    - `uses_diffrax`: whether diffrax replaces the batch kernel.
+    """
+    uneven_ground_columns = jax.tree.leaves(wheel.uneven)
+    restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
+    input_columns = jnp.stack(
+        [*stack_parameters(params), wheel.friction, *uneven_ground_columns, *restitution]
+    )
+    tableau = None if uses_diffrax else load_explicit_tableau(options.solver)
+    assert uses_diffrax or tableau is not None  # The caller has checked the solver.
+    walk_settings = BatchWalkSettings(
+        params.n_legs,
+        1,
+        wheel.max_events,
+        wheel.has_one_sided_stoppers,
+        wheel.uses_paper_rule,
+        is_detailed,
+        options,
+        tableau,
+        len(uneven_ground_columns),
+        wheel.restitution is not None,
+        engine,
+        measures_force_peaks,
+    )
+    return walk_settings, input_columns, x
 
-    def tighten_tolerances(self, leaves: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Return the argument leaves with the tighter solver tolerances for derivatives."""
-        *traced_settings, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
-        return tuple(jax.tree.leaves((*traced_settings, options.with_derivative_tolerances())))
 
-    def compile_lane_function(self, lane_function: Callable) -> Callable:
-        """Return a compiled function of one wheel from a function of a batch.
+WalkPreparation = Callable[..., tuple[BatchWalkSettings, Array, Array]]
+"""`prepare_walk` as a function of (wheel, params, x, options)."""
 
-        The batch is on the last axis of the arrays of `lane_function`.
-        """
 
-        def evaluate_one_wheel(*arrays: Any) -> Any:
-            lane_outputs = lane_function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arrays))
-            return jax.tree.map(lambda x: x[..., 0], lane_outputs)
+def take_contact_steps(prepare: WalkPreparation, *arguments: Any) -> Any:
+    """Return the results of one step of all batch elements, which are on the last axis.
 
-        if self.uses_diffrax:
-            return evaluate_one_wheel
-        return unbatch(compile_batch_function(lane_function))
+    If details are requested, the results are those in `UnilateralStep`. Otherwise they are section
+    state, durations, outcome and number of solver steps.
+    """
+    return _select_step_results(run_walks(*prepare(*arguments)))
 
-    def unpack_argument_leaves(
-        self, leaves: tuple[Array, ...]
-    ) -> tuple[BatchWalkSettings, Array, Array]:
-        """Return the settings of walks of one step, and input columns and section states."""
-        wheel, params, x, options = jax.tree.unflatten(self.argument_tree_structure, leaves)
-        uneven_ground_columns = jax.tree.leaves(wheel.uneven)
-        restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
-        input_columns = jnp.stack(
-            [*stack_parameters(params), wheel.friction, *uneven_ground_columns, *restitution]
+
+def _select_step_results(walk_result: BatchWalkResult) -> Any:
+    step_result = walk_result.step_result
+    if not isinstance(step_result, GaitStepSummary):
+        return step_result
+    return (
+        step_result.section_state,
+        step_result.durations,
+        walk_result.outcome,
+        walk_result.n_solver_steps,
+    )
+
+
+def call_with_one_lane(function: Callable) -> Callable:
+    """Return a function of one wheel from a function of a batch, without machine code."""
+
+    def call_function(*arguments: Any) -> Any:
+        lane_outputs = function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arguments))
+        return jax.tree.map(lambda x: x[..., 0], lane_outputs)
+
+    return call_function
+
+
+def make_column_function(
+    prepare: WalkPreparation, structure: Any, argnums: tuple[int, ...]
+) -> Callable:
+    """Return a function of the leaves of (wheel, params, x, options) for Jacobian columns.
+
+    Its results are those of `lanes.compute_jacobian_columns`, with the tolerances for derivatives.
+    Each column is the tangent of a batch element of its own.
+    """
+    divide_results = lambda walk_result: eqx.partition(
+        _select_step_results(walk_result), eqx.is_inexact_array
+    )
+
+    def compute_walk_tangents(leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
+        walk_settings, input_columns, x = prepare(*jax.tree.unflatten(structure, leaves))
+        _, input_column_tangents, section_state_tangents = prepare(
+            *jax.tree.unflatten(structure, tangents)
         )
-        tableau = None if self.uses_diffrax else load_explicit_tableau(options.solver)
-        assert self.uses_diffrax or tableau is not None  # The caller has checked the solver.
-        walk_settings = BatchWalkSettings(
-            params.n_legs,
-            1,
-            wheel.max_events,
-            wheel.has_one_sided_stoppers,
-            wheel.uses_paper_rule,
-            self.is_detailed,
-            options,
-            tableau,
-            len(uneven_ground_columns),
-            wheel.restitution is not None,
-            self.engine_name,
-            self.measures_force_peaks,
-        )
-        return walk_settings, input_columns, x
-
-    def compute_walk_outputs(self, *leaves: Array) -> tuple:
-        """Return the results of one step of all batch elements, divided by
-        `_partition_walk_result`.
-
-        The argument leaves have the batch on their last axis.
-        """
-        return _partition_walk_result(run_walks(*self.unpack_argument_leaves(leaves)))
-
-    def compute_walk_tangents(
-        self, leaves: tuple[Array, ...], tangents: tuple[Array, ...]
-    ) -> tuple:
-        """Return the tangents of a step's floating-point results, these results, and other results.
-
-        Each batch element has one tangent of its argument leaves.
-        """
-        walk_settings, input_columns, x = self.unpack_argument_leaves(leaves)
-        _, input_column_tangents, section_state_tangents = self.unpack_argument_leaves(tangents)
         walk_result, result_tangents = walk_with_tangents(
             walk_settings,
             input_columns,
@@ -135,68 +151,26 @@ class ContactStepConfig(NamedTuple):
             n_tangents=jnp.ones_like(input_columns[0], jnp.int32),
         )
         result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
-        return _partition_walk_result(walk_result._replace(step_result=result_tangents))[
-            0
-        ], *_partition_walk_result(walk_result)
+        float_tangents, _ = divide_results(walk_result._replace(step_result=result_tangents))
+        return float_tangents, *divide_results(walk_result)
 
+    compute_compiled_tangents = lanes.jit_batch(compute_walk_tangents)
 
-def _partition_walk_result(walk_result: BatchWalkResult) -> tuple[Any, Any]:
-    """Return the results of a step, divided into floating-point arrays and other arrays.
-
-    If details are requested, the results are those in `UnilateralStep`. Otherwise they are section
-    state, durations, outcome and number of solver steps.
-    """
-    step_result = walk_result.step_result
-    if isinstance(step_result, GaitStepSummary):
-        step_result = (
-            step_result.section_state,
-            step_result.durations,
-            walk_result.outcome,
-            walk_result.n_solver_steps,
-        )
-    return eqx.partition(step_result, eqx.is_inexact_array)
-
-
-def build_contact_step_function(step_config: ContactStepConfig) -> ForwardFunction:
-    """Return a function from the leaves of (wheel, params, x, options) to the results of a step.
-
-    The results are divided into floating-point arrays and other arrays. All AD modes are built from
-    this function.
-    """
-    return step_config.compile_lane_function(step_config.compute_walk_outputs)
-
-
-def build_contact_step_jacobian(
-    step_config: ContactStepConfig, input_indices: tuple[int, ...]
-) -> ForwardFunction:
-    """Return a function from the leaves of a step's arguments to its Jacobian and results.
-
-    The function returns (Jacobian with respect to the leaves at `input_indices`, floating-point
-    results), and the other results of `build_contact_step_function`.
-    """
-
-    compute_walk_tangents = unbatch(compile_batch_function(step_config.compute_walk_tangents))
-
-    def evaluate_jacobian(*leaves: Array) -> tuple:
-        leaves = step_config.tighten_tolerances(leaves)
-        selected_entries, unravel = ravel_pytree([leaves[i] for i in input_indices])
+    def compute_columns(*leaves: Array) -> tuple:
+        *settings, options = jax.tree.unflatten(structure, leaves)
+        leaves = tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
+        selected_entries, unravel = ravel_pytree([leaves[i] for i in argnums])
         unit_vectors = jnp.eye(selected_entries.size, dtype=selected_entries.dtype)
         tangents = [jnp.zeros_like(leaf) for leaf in leaves]
-        for i, leaf_tangents in zip(input_indices, jax.vmap(unravel)(unit_vectors), strict=True):
+        for i, leaf_tangents in zip(argnums, jax.vmap(unravel)(unit_vectors), strict=True):
             tangents[i] = leaf_tangents
-        batch_axes = tuple(0 if i in input_indices else None for i in range(len(leaves)))
-        jacobian_columns, float_outputs, nonfloat_outputs = jax.vmap(
-            compute_walk_tangents, (None, batch_axes)
-        )(leaves, tuple(tangents))
-        float_outputs, nonfloat_outputs = jax.tree.map(
-            lambda x: x[0], (float_outputs, nonfloat_outputs)
+        batch_axes = tuple(0 if i in argnums else None for i in range(len(leaves)))
+        columns, *results = jax.vmap(compute_compiled_tangents, (None, batch_axes))(
+            leaves, tuple(tangents)
         )
-        return (
-            split_jacobian_by_leaf(jacobian_columns, leaves, input_indices),
-            float_outputs,
-        ), nonfloat_outputs
+        return columns, *jax.tree.map(lambda x: x[0], results)
 
-    return evaluate_jacobian
+    return compute_columns
 
 
 class ContactIntervalLog(NamedTuple):
@@ -260,10 +234,8 @@ def sample_contact_interval(
 
 
 @functools.cache
-def build_contact_step_sampler(
-    step_config: ContactStepConfig, n_samples: int
-) -> Callable[..., tuple]:
-    """Return a function that samples a step from the leaves of (wheel, params, x, options).
+def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[..., tuple]:
+    """Return a function that samples a step from (wheel, params, x, options).
 
     The function returns (log, summary and outcome of the step, states, tangential forces, normal
     forces). The states are packed, (intervals, samples, entries), and the forces on all feet are in
@@ -271,16 +243,16 @@ def build_contact_step_sampler(
     of each interval. The function has no derivatives.
     """
 
-    def unpack_resolved_leaves(leaves: tuple[Array, ...]) -> tuple:
-        walk_settings, input_columns, x = step_config.unpack_argument_leaves(leaves)
+    prepare = functools.partial(prepare_walk, True, "lanes", False, uses_diffrax)
+
+    def prepare_resolved(arguments: tuple) -> tuple:
+        walk_settings, input_columns, x = prepare(*arguments)
         return walk_settings, walk_settings.resolve_heights(input_columns, x), x
 
-    init_lane_state = lambda *leaves: init_lane_states(*unpack_resolved_leaves(leaves))[1]
+    init_lane_state = lambda *arguments: init_lane_states(*prepare_resolved(arguments))[1]
 
-    def advance_to_event(
-        leaves: tuple[Array, ...], lane_state: Any
-    ) -> tuple[Any, ContactIntervalLog]:
-        walk_settings, input_columns, x = unpack_resolved_leaves(leaves)
+    def advance_to_event(arguments: tuple, lane_state: Any) -> tuple[Any, ContactIntervalLog]:
+        walk_settings, input_columns, x = prepare_resolved(arguments)
         state_after_event, lane_state = process_and_integrate(
             walk_settings,
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
@@ -303,10 +275,8 @@ def build_contact_step_sampler(
             duration,
         )
 
-    def sample_logged_interval(
-        leaves: tuple[Array, ...], contact_interval_log: ContactIntervalLog
-    ) -> Any:
-        walk_settings, input_columns, x = unpack_resolved_leaves(leaves)
+    def sample_logged_interval(arguments: tuple, contact_interval_log: ContactIntervalLog) -> Any:
+        walk_settings, input_columns, x = prepare_resolved(arguments)
         start_states, contact_modes, is_leg_locked, durations = contact_interval_log
         contact_mode_dynamics = walk_settings.make_lane_contact_dynamics(
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
@@ -328,16 +298,16 @@ def build_contact_step_sampler(
             tableau,
         )
 
-    def sample_whole_step(*leaves: Array) -> tuple:
-        walk_settings, input_columns, _ = unpack_resolved_leaves(leaves)
+    def sample_whole_step(*arguments: Any) -> tuple:
+        walk_settings, input_columns, _ = prepare_resolved(arguments)
         max_events = walk_settings.max_events
-        initial_state = begin_compiled_walk(*leaves)
-        log_template = jax.eval_shape(advance_compiled_walk, leaves, initial_state)[1]
+        initial_state = begin_compiled_walk(*arguments)
+        log_template = jax.eval_shape(advance_compiled_walk, arguments, initial_state)[1]
         allocate_log_array = lambda leaf: jnp.zeros((max_events, *leaf.shape), leaf.dtype)
 
         def record_interval_end(loop_state: tuple) -> tuple:
             previous_state, contact_interval_log = loop_state
-            lane_state, interval_entry = advance_compiled_walk(leaves, previous_state)
+            lane_state, interval_entry = advance_compiled_walk(arguments, previous_state)
             entry_index = previous_state.step_counters.n_events
             entry_index = jnp.where(
                 lane_state.step_counters.n_events > entry_index, entry_index, max_events
@@ -356,12 +326,12 @@ def build_contact_step_sampler(
             (initial_state, jax.tree.map(allocate_log_array, log_template)),
         )
         step_summary = walk_settings.summarize_step(lane_state, input_columns)
-        if step_config.uses_diffrax:
+        if uses_diffrax:
             interval_samples = lax.map(
-                functools.partial(sample_logged_interval, leaves), contact_interval_log
+                functools.partial(sample_logged_interval, arguments), contact_interval_log
             )
         else:
-            sample_rows = jax.vmap(functools.partial(sample_compiled_intervals, leaves))(
+            sample_rows = jax.vmap(functools.partial(sample_compiled_intervals, arguments))(
                 contact_interval_log
             )
             interval_samples = _unpack_sample_rows(
@@ -369,9 +339,10 @@ def build_contact_step_sampler(
             )
         return contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
 
-    begin_compiled_walk = step_config.compile_lane_function(init_lane_state)
-    advance_compiled_walk = step_config.compile_lane_function(advance_to_event)
-    sample_compiled_intervals = unbatch(compile_batch_function(sample_logged_interval))
+    compile_lanes = call_with_one_lane if uses_diffrax else lanes.jit_batch
+    begin_compiled_walk = compile_lanes(init_lane_state)
+    advance_compiled_walk = compile_lanes(advance_to_event)
+    sample_compiled_intervals = lanes.jit_batch(sample_logged_interval)
     return jax.jit(sample_whole_step)
 
 

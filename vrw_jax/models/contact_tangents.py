@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.elementwise import run_if_any_element_active, select_trees_by_condition
 from vrw_jax.flow.event_location import compute_event_time_tangent
 from vrw_jax.flow.tableaus import ButcherTableau, compute_real_stability_limit
-from vrw_jax.lanes.batching import run_if_any_element_active, select_trees_by_condition
 from vrw_jax.models.contact_integrator import (
     N_ACCUMULATOR_ROWS,
     ContactIntervalState,

@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from vrw_jax.base.elementwise import compute_sine_cosine, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.trigonometry import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
-from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
     AdvanceResult,

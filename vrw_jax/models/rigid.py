@@ -10,10 +10,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vrw_jax.base.checks import check_bool
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Elementwise
 from vrw_jax.lanes.autodiff import compute_square_root
-from vrw_jax.lanes.batching import select_trees_by_condition
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_sequence import replace_invalid_inputs, select_stance_line

@@ -31,10 +31,10 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.flow.tableaus import load_explicit_tableau
+from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.lanes.batching import map_in_batches
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
 from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.models.batch_step import N_STEP_INPUTS, advance_gait_step, compute_jacobian_columns
 from vrw_jax.models.batch_stiffness import (
     IMPLICIT_SOLVER_NAME,
     STABLE_SOLVER_NAME,
@@ -51,6 +51,7 @@ from vrw_jax.models.stepping import (
     convert_step_options,
 )
 from vrw_jax.models.unit_scaling import complete_jacobian_columns
+from vrw_jax.models.viscoelastic import N_STEP_INPUTS, advance_gait_step
 from vrw_jax.models.walk_batch import (
     START_INPUT_NAME,
     StepBatchResult,
@@ -478,7 +479,7 @@ def _compile_lane_step(
     return compile_batch_function(
         step_lanes,
         batch_sizes.XLA_LANE_BATCH_SIZE,
-        lanes.RegisterLimits(n_kernel_inputs) if input_indices else lanes.DEFAULT_REGISTER_LIMITS,
+        n_kernel_inputs if input_indices else lanes.MAX_UNROLLED_ENTRIES,
         marks_unfinished_lanes=True,
     )
 

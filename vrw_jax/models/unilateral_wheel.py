@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -11,11 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax import lanes
 from vrw_jax.base.checks import check_choice, check_int, check_reals, check_type
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
-from vrw_jax.lanes.autodiff import ForwardFunction, enable_all_ad_modes
-from vrw_jax.models.batch_step import can_use_batch_kernel
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.contact_section import (
@@ -26,10 +26,11 @@ from vrw_jax.models.contact_section import (
     embed_section_state,
 )
 from vrw_jax.models.contact_step import (
-    ContactStepConfig,
-    build_contact_step_function,
-    build_contact_step_jacobian,
     build_contact_step_sampler,
+    call_with_one_lane,
+    make_column_function,
+    prepare_walk,
+    take_contact_steps,
 )
 from vrw_jax.models.interface import (
     AbstractWheel,
@@ -39,6 +40,7 @@ from vrw_jax.models.interface import (
     require_stepwise_shape,
 )
 from vrw_jax.models.step_results import PAPER_START_STATE, AdvanceResult
+from vrw_jax.models.viscoelastic import can_use_batch_kernel
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,
@@ -298,28 +300,20 @@ class UnilateralWheel(AbstractContactWheel):
         measures_force_peaks: bool = False,
     ) -> tuple[Any, str]:
         """Return the results of one step, and the name of the engine that computed them."""
-        leaves, argument_structure = self._flatten_arguments(params, x, options)
         engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
-        compute_compiled_step = _compile_step(
-            argument_structure, is_detailed, engine, measures_force_peaks
-        )
-        return eqx.combine(*compute_compiled_step(*leaves)), engine
+        take_step = _compile_step(is_detailed, engine, measures_force_peaks)
+        return take_step(self._with_friction_of_type(x), params, x, options), engine
 
-    def _flatten_arguments(
-        self, params: WheelParams, x: FullState, options: StepOptions
-    ) -> tuple[list, Any]:
-        """Return the leaves and the tree structure of (wheel, params, x, options)."""
+    def _with_friction_of_type(self, x: FullState) -> "UnilateralWheel":
         # `dataclasses.replace` would validate friction again, which may be traced.
-        model = eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
-        return jax.tree.flatten((model, params, x, options))
+        return eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
 
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
-        leaves, argument_structure = self._flatten_arguments(params, x, options)
-        config = ContactStepConfig(argument_structure, True, not can_use_batch_kernel(options))
+        sample_step = build_contact_step_sampler(not can_use_batch_kernel(options), n_samples)
         contact_interval_log, step_summary, outcome, states, tangential_forces, normal_forces = (
-            build_contact_step_sampler(config, n_samples)(*leaves)
+            sample_step(self._with_friction_of_type(x), params, x, options)
         )
         durations = contact_interval_log.durations
         start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(durations)[:-1]])
@@ -342,26 +336,20 @@ _embed_section_compiled = jax.jit(lambda params, x: embed_section_state(params.s
 
 
 @functools.cache
-def _compile_step(
-    argument_structure: Any, is_detailed: bool, engine: str, measures_force_peaks: bool
-) -> ForwardFunction:
-    """Return the function that computes a step from the leaves of (wheel, params, x, options).
-
-    The function is differentiable in every AD mode.
-    """
-
-    diffrax_config = ContactStepConfig(
-        argument_structure, is_detailed, True, engine, measures_force_peaks
+def _compile_step(is_detailed: bool, engine: str, measures_force_peaks: bool) -> Callable:
+    """Return a compiled function of (wheel, params, x, options), differentiable in any mode."""
+    settings = is_detailed, engine, measures_force_peaks
+    take_diffrax_step = call_with_one_lane(
+        partial(take_contact_steps, partial(prepare_walk, *settings, True))
     )
-    compute_step_by_diffrax = build_contact_step_function(diffrax_config)
-    step_with_tight_tolerances = lambda *leaves: compute_step_by_diffrax(
-        *diffrax_config.tighten_tolerances(leaves)
+    take_tight_step = lambda *arguments: take_diffrax_step(
+        *arguments[:-1], arguments[-1].with_derivative_tolerances()
     )
     if engine == "diffrax":
-        return enable_all_ad_modes(compute_step_by_diffrax, step_with_tight_tolerances)
-    config = diffrax_config._replace(uses_diffrax=False)
-    return enable_all_ad_modes(
-        build_contact_step_function(config),
-        step_with_tight_tolerances,
-        partial(build_contact_step_jacobian, config),
+        return lanes.differentiate(take_diffrax_step, take_tight_step)
+    prepare = partial(prepare_walk, *settings, False)
+    return lanes.differentiate(
+        lanes.jit_batch(partial(take_contact_steps, prepare)),
+        take_tight_step,
+        partial(make_column_function, prepare),
     )

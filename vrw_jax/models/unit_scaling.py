@@ -15,8 +15,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.lanes.batching import BatchFunction
-from vrw_jax.models.batch_step import compute_jacobian_columns
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, PARAMETER_NAMES, UNIT_POWERS
 
 _SECTION_STATE_UNITS = ("rad", "rad/s", "m/s")

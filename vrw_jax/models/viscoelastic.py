@@ -1,35 +1,42 @@
 """The paper's viscoelastic model.
 
 Its step consists of a landing, double support, single support I, a stopper collision and single
-support II.
+support II. Machine code computes the step for batches, and on other devices the same source runs by
+XLA. In this source, each array holds one quantity for all wheels. diffrax computes steps with
+implicit solvers, and second and higher derivatives.
 """
 
+import dataclasses
 import functools
+import math
+import operator
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
+from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
+from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
+from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
 from vrw_jax.flow.scaled_integration import (
     integrate_phase_in_scaled_units,
     sample_phase_in_scaled_units,
 )
 from vrw_jax.flow.solver_steps import VectorField
-from vrw_jax.lanes.autodiff import ForwardFunction, enable_all_ad_modes
-from vrw_jax.models.batch_step import (
-    build_step_finisher,
-    build_step_function,
-    build_step_jacobian,
-    build_step_sampler,
-    can_use_batch_kernel,
+from vrw_jax.flow.tableaus import (
+    ButcherTableau,
+    StageAccelerations,
+    StageState,
+    load_explicit_tableau,
 )
+from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_sequence import (
@@ -49,6 +56,7 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
+from vrw_jax.wheel import transitions
 from vrw_jax.wheel.geometry import Motion
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
@@ -58,38 +66,12 @@ from vrw_jax.wheel.params import (
 )
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant
 
+N_STEP_INPUTS = len(PARAMETER_NAMES) + 3
+"""Number of inputs of a step on flat ground: the parameters and the section state.
 
-class DiffraxPhaseFunctions(NamedTuple):
-    """Functions that the diffrax integrator calls for a phase. The state y = (q, v) is one
-    vector.
-    """
-
-    motion_unpacker: Callable[[StateArray], Motion]
-    vector_field: VectorField
-    guards: GuardsAndMargins
-
-
-def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhaseFunctions:
-    """Return the functions of a phase that the diffrax integrator calls.
-
-    - `records_margins`: whether the integrator also evaluates margins.
-    """
-
-    def evaluate_vector_field(y: StateArray) -> StateArray:
-        accelerations = phase.solve_acceleration(phase.unpack_motion(y))
-        return jnp.stack([*y[phase.n_dof :], *accelerations[: phase.n_dof]])
-
-    def evaluate_guards_and_margins(y: StateArray) -> Array:
-        phase_instant = PhaseInstant(phase, phase.unpack_motion(y), None)
-        margins = phase.compute_margins(phase_instant) if records_margins else ()
-        return jnp.stack([*phase.compute_guards(phase_instant), *margins])
-
-    guards_and_margins = GuardsAndMargins(
-        evaluate_guards_and_margins,
-        len(phase.all_guard_outcomes),
-        phase.are_margins_counted_at_start if records_margins else (),
-    )
-    return DiffraxPhaseFunctions(phase.unpack_motion, evaluate_vector_field, guards_and_margins)
+Uneven ground adds the slope of the next line of the ground. Machine code keeps one number per
+derivative in registers.
+"""
 
 
 class ViscoelasticWheel(AbstractWheel):
@@ -144,18 +126,17 @@ class ViscoelasticWheel(AbstractWheel):
 
         - `records_margins`: whether the results include indicators, margins and energies.
         """
-        argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
-        return eqx.combine(
-            *_compile_step_function(self, argument_structure, records_margins)(*argument_leaves)
-        )
+        engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
+        return _compile_step(self, engine, records_margins)(params, x, options)
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
         if can_use_batch_kernel(options):
-            argument_leaves, argument_structure = jax.tree.flatten((params, x, options))
-            sample_step = build_step_sampler(argument_structure, self.stop_at_lift_off, n_samples)
-            return sample_step(*argument_leaves)
+            sample_lane_steps = functools.partial(
+                _sample_lane_steps, self.stop_at_lift_off, n_samples
+            )
+            return lanes.jit_batch(sample_lane_steps)(params, x, options)
         phase_sequence = self._run_phases(params, x, options, records_margins=False)
         phase_samples = []
         for phase, phase_start, phase_end in zip(
@@ -193,13 +174,12 @@ class ViscoelasticWheel(AbstractWheel):
         options: StepOptions,
     ) -> AdvanceResult:
         if can_use_batch_kernel(options):
-            argument_leaves, argument_structure = jax.tree.flatten(
-                (params, jnp.asarray(foot_distance), phase_state, options)
+            finish_lane_steps = functools.partial(
+                _finish_lane_steps, self.stop_at_lift_off, phase_index
             )
-            step_finisher = build_step_finisher(
-                argument_structure, self.stop_at_lift_off, phase_index
+            return lanes.jit_batch(finish_lane_steps)(
+                params, jnp.asarray(foot_distance), phase_state, options
             )
-            return eqx.combine(*step_finisher(*argument_leaves))
         return finish_gait_step(
             _make_diffrax_phase_runner(options, records_margins=False),
             params,
@@ -210,6 +190,406 @@ class ViscoelasticWheel(AbstractWheel):
             self.stop_at_lift_off,
             "diffrax",
         )
+
+
+@functools.cache
+def _compile_step(model: ViscoelasticWheel, engine: str, records_margins: bool) -> Callable:
+    """Return a compiled function of (params, x, options), differentiable in any mode."""
+
+    def take_diffrax_step(params: WheelParams, x: SectionState, options: StepOptions) -> Any:
+        """Compute a step with diffrax.
+
+        If the batch kernel is the engine, this function is used only for second and higher
+        derivatives. The results still report the name of the batch kernel's engine.
+        """
+        phase_sequence = model._run_phases(params, x, options, records_margins)
+        return (
+            make_step_result(phase_sequence, model.friction, engine)
+            if records_margins
+            else make_advance_result(phase_sequence, engine)
+        )
+
+    take_tight_step = lambda params, x, options: take_diffrax_step(
+        params, x, options.with_derivative_tolerances()
+    )
+    if engine == "diffrax":
+        return lanes.differentiate(take_diffrax_step, take_tight_step)
+    take_lane_steps = functools.partial(
+        take_steps_of_lanes, model.stop_at_lift_off, model.friction if records_margins else None
+    )
+    return lanes.differentiate(
+        lanes.jit_batch(take_lane_steps),
+        take_tight_step,
+        functools.partial(_make_column_function, take_lane_steps),
+    )
+
+
+def take_steps_of_lanes(
+    stop_at_lift_off: bool,
+    friction: float | None,
+    params: WheelParams,
+    x: Array,
+    options: StepOptions,
+) -> AdvanceResult | StepResult:
+    """Return the results of a batch of walking steps.
+
+    - `friction`: friction coefficient of the margins; None for the minimal results.
+    """
+    phase_sequence, _ = _run_lane_phases(stop_at_lift_off, friction is not None, params, x, options)
+    if friction is None:
+        return make_advance_result(phase_sequence, "lanes")
+    phase_end_results = tuple(
+        phase_end._replace(next_phase_inputs=None) for phase_end in phase_sequence.phase_end_results
+    )
+    float_phase_sequence = phase_sequence._replace(
+        phases=(), phase_start_states=(), phase_end_results=phase_end_results
+    )  # only floats
+    return with_batched_jvp(
+        lambda phase_sequence: make_step_result(phase_sequence, friction, "lanes")
+    )(float_phase_sequence)
+
+
+def _make_column_function(
+    take_lane_steps: Callable, structure: Any, argnums: tuple[int, ...]
+) -> Callable:
+    """Return a function of the leaves of (params, x, options) that computes Jacobian columns.
+
+    Its results are those of `compute_jacobian_columns`, with the tolerances for derivatives.
+    """
+
+    def compute_lane_columns(*leaves: Array) -> tuple:
+        return lanes.compute_jacobian_columns(
+            lanes.make_leaf_function(take_lane_steps, structure), leaves, argnums
+        )
+
+    def compute_columns(*leaves: Array) -> tuple:
+        params, x, options = jax.tree.unflatten(structure, leaves)
+        n_columns = sum(math.prod(jnp.shape(leaves[i])) for i in argnums)
+        compute_compiled_columns = lanes.jit_batch(
+            compute_lane_columns, N_STEP_INPUTS + (n_columns > N_STEP_INPUTS)
+        )
+        return compute_compiled_columns(
+            *jax.tree.leaves((params, x, options.with_derivative_tolerances()))
+        )
+
+    return compute_columns
+
+
+def _finish_lane_steps(
+    stop_at_lift_off: bool,
+    phase_index: int,
+    params: WheelParams,
+    foot_distance: Array,
+    phase_state: Array,
+    options: StepOptions,
+) -> AdvanceResult:
+    """Return the results of `finish_gait_step` for a batch."""
+    tableau = load_explicit_tableau(options.solver)
+    assert tableau is not None  # checked by `can_use_batch_kernel`
+    return finish_gait_step(
+        _make_phase_runner(options, tableau, False, None, is_compiled_separately=True),
+        params,
+        phase_index,
+        foot_distance,
+        tuple(phase_state),
+        options,
+        stop_at_lift_off,
+        "lanes",
+    )
+
+
+def _sample_lane_steps(
+    stop_at_lift_off: bool, n_samples: int, params: WheelParams, x: Array, options: StepOptions
+) -> Trajectory:
+    """Return samples of a batch of walking steps at equidistant times of each phase."""
+    phase_sequence, tableau = _run_lane_phases(stop_at_lift_off, False, params, x, options)
+    phase_samples = [
+        sample_batch_phase(
+            make_batch_phase(phase, False),
+            tableau,
+            *phase_start,
+            phase_end.duration,
+            n_samples,
+            compute_wheel_units(phase.s).scale_times_to_seconds(options),
+        )
+        for phase, phase_start, phase_end in zip(
+            phase_sequence.phases,
+            phase_sequence.phase_start_states,
+            phase_sequence.phase_end_results,
+            strict=True,
+        )
+    ]
+    return make_trajectory(phase_sequence, phase_samples)
+
+
+class _NextPhaseInputs(NamedTuple):
+    """Data that the integration of a phase passes to the integration of the next phase."""
+
+    next_solver_dt: Array  # step size that the controller proposes next, s
+    has_phase_occurred: Bool[Array, " lanes"]  # whether the phase took place
+    is_unfinished: Bool[Array, " lanes"]
+
+
+def make_batch_phase(
+    phase: AbstractPhase, records_margins: bool, is_compiled_separately: bool = False
+) -> BatchPhase:
+    """Return the functions that the batched integrator needs to integrate a phase.
+
+    - `records_margins`: whether the integrator also evaluates margins;
+    - `is_compiled_separately`: whether machine code calls the phase's functions instead of inlining
+      them.
+    """
+
+    def evaluate_acceleration(q: Vector, v: Vector) -> StageAccelerations:
+        sin_theta, cos_theta = compute_sine_cosine(q[0])
+        return StageAccelerations(
+            sin_theta,
+            cos_theta,
+            phase.solve_acceleration(phase.complete_wheel_motion(sin_theta, cos_theta, q, v))[
+                : phase.n_dof
+            ],
+        )
+
+    def complete_motion_at_stage(stage_state: StageState) -> Motion:
+        return phase.complete_wheel_motion(
+            stage_state.acceleration.sin, stage_state.acceleration.cos, stage_state.q, stage_state.v
+        )
+
+    def make_phase_instant(stage_state: StageState) -> PhaseInstant:
+        return PhaseInstant(
+            phase, complete_motion_at_stage(stage_state), stage_state.acceleration.acceleration
+        )
+
+    implicit_dynamics = ImplicitDynamics(
+        lambda stage: phase.compute_dynamics_residual(
+            complete_motion_at_stage(stage), stage.acceleration.acceleration
+        ),
+        lambda stage, right_hand_side: phase.solve_dynamics(
+            complete_motion_at_stage(stage), right_hand_side
+        ),
+    )
+    return BatchPhase(
+        evaluate_acceleration,
+        lambda stage: phase.compute_guards(make_phase_instant(stage)),
+        lambda stage: phase.compute_margins(make_phase_instant(stage)),
+        phase.are_margins_counted_at_start if records_margins else (),
+        implicit_dynamics,
+        is_compiled_separately,
+        phase.coordinate_units,
+    )
+
+
+def advance_gait_step(
+    params: WheelParams,
+    x: Vector,
+    options: StepOptions,
+    tableau: ButcherTableau,
+    stop_at_lift_off: bool,
+    straggler_count: Array | None = None,
+) -> tuple[AdvanceResult, Array]:
+    """Compute one walking step per batch element, without indicators, margins and energies.
+
+    Return the results, and flags of the elements that were stopped as stragglers. No result of
+    these elements is valid.
+
+    - `x`: section state of each batch element just before touchdown;
+    - `tableau`: Butcher tableau of the explicit solver;
+    - `stop_at_lift_off`: see `ViscoelasticWheel`;
+    - `straggler_count`: largest number of batch elements that may remain unfinished, see
+      `integrate_batch_phase`.
+    """
+    phase_sequence = run_batch_phases(
+        params,
+        x,
+        options,
+        tableau,
+        stop_at_lift_off,
+        records_margins=False,
+        straggler_count=straggler_count,
+    )
+    is_phase_unfinished = [
+        phase_end.next_phase_inputs.is_unfinished for phase_end in phase_sequence.phase_end_results
+    ]
+    return make_advance_result(phase_sequence, "lanes"), functools.reduce(
+        operator.or_, is_phase_unfinished
+    )
+
+
+def run_batch_phases(
+    params: WheelParams,
+    x: Vector,
+    options: StepOptions,
+    tableau: ButcherTableau,
+    stop_at_lift_off: bool,
+    records_margins: bool,
+    straggler_count: Array | None = None,
+    is_compiled_separately: bool = False,
+) -> PhaseSequenceResult:
+    """Integrate all phases of one walking step per batch element and return their starts and ends.
+
+    - `tableau`: Butcher tableau of the explicit solver;
+    - `stop_at_lift_off`: see `ViscoelasticWheel`;
+    - `records_margins`: whether the minima of the margins are computed;
+    - `straggler_count`: largest number of batch elements that may remain unfinished, see
+      `integrate_batch_phase`;
+    - `is_compiled_separately`: see `BatchPhase`.
+    """
+    phase_runner = _make_phase_runner(
+        options, tableau, records_margins, straggler_count, is_compiled_separately
+    )
+    landing_function = with_batched_jvp(transitions.resolve_landing)
+    return run_step_phases(phase_runner, params, x, options, stop_at_lift_off, landing_function)
+
+
+# Upper bound on the first solver step in SLS-I, as a fraction of the step size that the controller
+# proposes at the end of DLS. At lift-off the rear foot loses its force. This excites the fast mode
+# of the airborne leg, which decays within 0.05 s. A first solver step above this bound and the next
+# would be rejected and repeated.
+MAX_FIRST_STEP_RATIO = 0.3
+# Upper bound on that step as a multiple of (m/c) rtol^(1/p), where p is the order of the solver.
+# The value is chosen because the step-size controller settles at 7.2 to 9.5. This holds for solvers
+# of orders 5 to 8 and tolerances of 1e-4 to 1e-10.
+MAX_FIRST_STEP_IN_TRANSIENT_TIMES = 7.0
+
+
+def _make_phase_runner(
+    options: StepOptions,
+    tableau: ButcherTableau,
+    records_margins: bool,
+    straggler_count: Array | None,
+    is_compiled_separately: bool,
+) -> PhaseRunner:
+    """Return a function that integrates one phase to its end, for all batch elements.
+
+    The arguments are those of `run_batch_phases`.
+    """
+
+    def run_phase(
+        phase: AbstractPhase,
+        q: Vector,
+        v: Vector,
+        is_active_lane: Array,
+        previous_phase_end: PhaseResult | None,
+    ) -> PhaseResult:
+        scaled_options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
+        dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
+        if previous_phase_end is not None:
+            next_phase_inputs = previous_phase_end.next_phase_inputs
+            dt0 = next_phase_inputs.next_solver_dt
+            if phase.has_stiff_start:
+                tolerance_root = jnp.exp(
+                    jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
+                ).astype(dt0.dtype)
+                max_transient_dt = (
+                    MAX_FIRST_STEP_IN_TRANSIENT_TIMES * tolerance_root * phase.s.m / phase.s.c
+                )
+                stiff_dt0 = jnp.minimum(MAX_FIRST_STEP_RATIO * dt0, max_transient_dt)
+                dt0 = jnp.where(next_phase_inputs.has_phase_occurred, stiff_dt0, dt0)
+        float_leaves, nonarray_leaves = eqx.partition((phase.s, phase.ground_ahead), eqx.is_array)
+
+        def make_phase(float_leaves: Any, phase_constants: Vector) -> BatchPhase:
+            s, ground_ahead = eqx.combine(float_leaves, nonarray_leaves)
+            phase_with_traced_inputs = dataclasses.replace(
+                phase, s=s, phase_constants=phase_constants, ground_ahead=ground_ahead
+            )
+            return make_batch_phase(
+                phase_with_traced_inputs, records_margins, is_compiled_separately
+            )
+
+        phase_end = integrate_batch_phase(
+            make_phase,
+            float_leaves,
+            phase.phase_constants,
+            tableau,
+            q,
+            v,
+            is_active_lane,
+            dt0,
+            scaled_options,
+            straggler_count,
+        )
+        return PhaseResult(
+            *phase_end.state[:2],
+            duration=phase_end.duration,
+            end_guard_index=phase_end.end_guard_index,
+            is_timed_out=phase_end.is_timed_out,
+            n_solver_steps=phase_end.n_tried_steps,
+            margin_minima=phase_end.margin_minima,
+            next_phase_inputs=_NextPhaseInputs(
+                phase_end.next_solver_dt, is_active_lane, phase_end.is_unfinished
+            ),
+        )
+
+    return run_phase
+
+
+def can_use_batch_kernel(options: StepOptions) -> bool:
+    """Return whether the batch kernel can compute the step.
+
+    The kernel requires machine code and an explicit solver. Raise a `ValueError` if the options
+    require the batch kernel and it is not available.
+    """
+    is_solver_explicit = load_explicit_tableau(options.solver) is not None
+    if options.engine == "lanes" and not (is_solver_explicit and lanes.is_machine_code_available()):
+        raise ValueError(
+            "engine is 'lanes', which needs a CPU, llvmlite and an explicit solver, but the solver "
+            f"is {options.solver} on a {jax.default_backend()}: take engine='diffrax'."
+        )
+    return is_solver_explicit and lanes.is_machine_code_available() and options.engine != "diffrax"
+
+
+def _run_lane_phases(
+    stop_at_lift_off: bool,
+    records_margins: bool,
+    params: WheelParams,
+    x: Array,
+    options: StepOptions,
+) -> tuple[PhaseSequenceResult, ButcherTableau]:
+    """Return the starts and ends of the phases of a batch of walking steps, and the tableau."""
+    tableau = load_explicit_tableau(options.solver)
+    assert tableau is not None  # `can_use_batch_kernel` has checked the solver.
+    return run_batch_phases(
+        params,
+        tuple(x),
+        options,
+        tableau,
+        stop_at_lift_off,
+        records_margins,
+        is_compiled_separately=True,
+    ), tableau
+
+
+class DiffraxPhaseFunctions(NamedTuple):
+    """Functions that the diffrax integrator calls for a phase. The state y = (q, v) is one
+    vector.
+    """
+
+    motion_unpacker: Callable[[StateArray], Motion]
+    vector_field: VectorField
+    guards: GuardsAndMargins
+
+
+def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhaseFunctions:
+    """Return the functions of a phase that the diffrax integrator calls.
+
+    - `records_margins`: whether the integrator also evaluates margins.
+    """
+
+    def evaluate_vector_field(y: StateArray) -> StateArray:
+        accelerations = phase.solve_acceleration(phase.unpack_motion(y))
+        return jnp.stack([*y[phase.n_dof :], *accelerations[: phase.n_dof]])
+
+    def evaluate_guards_and_margins(y: StateArray) -> Array:
+        phase_instant = PhaseInstant(phase, phase.unpack_motion(y), None)
+        margins = phase.compute_margins(phase_instant) if records_margins else ()
+        return jnp.stack([*phase.compute_guards(phase_instant), *margins])
+
+    guards_and_margins = GuardsAndMargins(
+        evaluate_guards_and_margins,
+        len(phase.all_guard_outcomes),
+        phase.are_margins_counted_at_start if records_margins else (),
+    )
+    return DiffraxPhaseFunctions(phase.unpack_motion, evaluate_vector_field, guards_and_margins)
 
 
 def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
@@ -240,53 +620,3 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
         )
 
     return run_phase
-
-
-@functools.cache
-def _compile_step_function(
-    model: ViscoelasticWheel, argument_structure: Any, records_margins: bool
-) -> ForwardFunction:
-    """Return a function that computes a step from the leaves of (params, x, options).
-
-    The function is differentiable in any mode. The pytree structure of (params, x, options) is
-    `argument_structure`.
-    """
-
-    options_without_numbers = jax.tree.unflatten(
-        argument_structure, [0.0] * argument_structure.num_leaves
-    )[2]
-    engine_name = "lanes" if can_use_batch_kernel(options_without_numbers) else "diffrax"
-
-    def compute_step_with_diffrax(has_tight_tolerances: bool, *argument_leaves: Array) -> tuple:
-        """Compute a step with diffrax and return its results, split into float arrays and other
-        arrays.
-
-        If the batch kernel is the engine, this function is used only for second and higher
-        derivatives. The results still report the name of the batch kernel's engine.
-        """
-        params, x, options = jax.tree.unflatten(argument_structure, argument_leaves)
-        options = options.with_derivative_tolerances() if has_tight_tolerances else options
-        phase_sequence = model._run_phases(params, x, options, records_margins=records_margins)
-        step_result: AdvanceResult | StepResult = (
-            make_step_result(phase_sequence, model.friction, engine_name)
-            if records_margins
-            else make_advance_result(phase_sequence, engine_name)
-        )
-        return eqx.partition(step_result, eqx.is_inexact_array)
-
-    diffrax_step_function, tight_diffrax_step_function = (
-        functools.partial(compute_step_with_diffrax, has_tight_tolerances)
-        for has_tight_tolerances in (False, True)
-    )
-    if engine_name == "diffrax":
-        return enable_all_ad_modes(diffrax_step_function, tight_diffrax_step_function)
-    settings = (
-        argument_structure,
-        model.stop_at_lift_off,
-        model.friction if records_margins else None,
-    )
-    return enable_all_ad_modes(
-        build_step_function(*settings),
-        tight_diffrax_step_function,
-        functools.partial(build_step_jacobian, *settings),
-    )

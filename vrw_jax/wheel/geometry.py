@@ -9,7 +9,7 @@ through sin(theta) and cos(theta).
 
 from typing import NamedTuple
 
-from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel.params import Symbols
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from vrw_jax.base.trigonometry import compute_arcsine, compute_sine_cosine
+from vrw_jax.base.elementwise import compute_arcsine, compute_sine_cosine
 from vrw_jax.base.types import Elementwise
 from vrw_jax.wheel.params import Symbols
 

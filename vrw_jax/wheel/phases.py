@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.trigonometry import compute_sine_cosine
+from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Acceleration, FootForce
