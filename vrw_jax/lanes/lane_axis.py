@@ -38,6 +38,10 @@ PRIMITIVES_WITH_LEADING_AXES = frozenset(
 """Primitives whose parameters name axes, so that another axis at the end changes nothing."""
 
 
+CALLING_PRIMITIVES = frozenset(["cond", "scan", "while", *CALLED_JAXPR_PARAMETERS])
+"""Primitives that contain traces, in which further primitives may need a rule."""
+
+
 class LaneValue(NamedTuple):
     """An array of a trace, and whether its last axis is that of the lanes."""
 
@@ -102,7 +106,7 @@ def _evaluate(
     for equation in jaxpr.eqns:
         operands = [read(atom) for atom in equation.invars]
         name = equation.primitive.name
-        if any(x.has_lanes for x in operands) or name in RULES or name in CALLED_JAXPR_PARAMETERS:
+        if any(x.has_lanes for x in operands) or name in CALLING_PRIMITIVES:
             results = _evaluate_with_lanes(n_lanes, equation, operands)
         else:
             results = _bind(equation, [x.array for x in operands], False)
@@ -140,66 +144,52 @@ def _evaluate_with_lanes(
 
 def _call(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
     closed_jaxpr = equation.params[CALLED_JAXPR_PARAMETERS[equation.primitive.name]]
-    flags = [x.has_lanes for x in operands]
+    flags = tuple(x.has_lanes for x in operands)
     if equation.params.get("name") != NOINLINE_FUNCTION_NAME or not any(flags):
         return _evaluate(n_lanes, closed_jaxpr, operands)
-    result_flags = _find_lanes(closed_jaxpr.jaxpr, flags)
     evaluate_arrays = lambda *arrays: [
-        _with_lanes(n_lanes, value) if flag else value.array
-        for value, flag in zip(
-            _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, flags))),
-            result_flags,
-            strict=True,
-        )
+        x.array for x in _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, flags)))
     ]
     results = mark_noinline(evaluate_arrays)(*(x.array for x in operands))
-    return list(map(LaneValue, results, result_flags))
+    return list(map(LaneValue, results, _find_lanes(n_lanes, closed_jaxpr, flags)))
 
 
 def _broadcast(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    (array, has_lanes), *_ = operands
-    if not has_lanes:
-        return _bind(equation, [array], False)
     shape, axes = (equation.params[x] for x in ("shape", "broadcast_dimensions"))
     return _bind(
-        equation, [array], True, shape=(*shape, n_lanes), broadcast_dimensions=(*axes, len(shape))
+        equation,
+        [operands[0].array],
+        True,
+        shape=(*shape, n_lanes),
+        broadcast_dimensions=(*axes, len(shape)),
     )
 
 
 def _reshape(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    array, has_lanes = operands[0]
-    if not has_lanes:
-        return _bind(equation, [array], False)
-    return [LaneValue(lax.reshape(array, (*equation.params["new_sizes"], n_lanes)), True)]
+    new_sizes = (*equation.params["new_sizes"], n_lanes)
+    return [LaneValue(lax.reshape(operands[0].array, new_sizes), True)]
 
 
 def _transpose(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    array, has_lanes = operands[0]
     order = equation.params["permutation"]
-    return [
-        LaneValue(lax.transpose(array, (*order, len(order)) if has_lanes else order), has_lanes)
-    ]
+    return _bind(equation, [operands[0].array], True, permutation=(*order, len(order)))
 
 
 def _pad(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    (array, has_lanes), (padding, varies) = operands
-    widths = equation.params["padding_config"]
-    if varies:
+    array, padding = operands
+    if padding.has_lanes:
         raise NotImplementedError("pad by a value that differs between lanes has no rule")
-    return [
-        LaneValue(lax.pad(array, padding, (*widths, (0, 0, 0)) if has_lanes else widths), has_lanes)
-    ]
+    widths = (*equation.params["padding_config"], (0, 0, 0))
+    return [LaneValue(lax.pad(array.array, padding.array, widths), True)]
 
 
 def _slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    array, has_lanes = operands[0]
     starts, limits, strides = (
         equation.params[x] for x in ("start_indices", "limit_indices", "strides")
     )
-    if has_lanes:
-        starts, limits = (*starts, 0), (*limits, n_lanes)
-        strides = None if strides is None else (*strides, 1)
-    return [LaneValue(lax.slice(array, starts, limits, strides), has_lanes)]
+    strides = None if strides is None else (*strides, 1)
+    array = lax.slice(operands[0].array, (*starts, 0), (*limits, n_lanes), strides)
+    return [LaneValue(array, True)]
 
 
 def _dynamic_slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
@@ -226,8 +216,6 @@ def _dynamic_slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -
 def _update_slice(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
     """Return an array with a part replaced, at an index that may differ between lanes."""
     array, part, *indices = operands
-    if not array.has_lanes and not part.has_lanes and not any(x.has_lanes for x in indices):
-        return _bind(equation, [x.array for x in operands], False)
     lane_array, lane_part = (_with_lanes(n_lanes, x) for x in (array, part))
     varying_axes = [axis for axis, index in enumerate(indices) if index.has_lanes]
     indices = [LaneValue(jnp.asarray(x, jnp.int32), flag) for x, flag in indices]
@@ -265,8 +253,6 @@ def _require_short(length: int) -> int:
 def _multiply(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
     """Return a product of arrays as a sum of elementwise products."""
     (summed_left, summed_right), (batch_left, batch_right) = equation.params["dimension_numbers"]
-    if not any(x.has_lanes for x in operands):
-        return _bind(equation, [x.array for x in operands], False)
     left, right = (_with_lanes(n_lanes, x) for x in operands)
     free_left, free_right = (
         [i for i in range(x.ndim - 1) if i not in summed and i not in batch]
@@ -287,59 +273,50 @@ def _multiply(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> lis
     return [LaneValue(jnp.sum(products, axis=summed), True)]
 
 
+@functools.lru_cache(maxsize=1024)
+def _find_lanes(
+    n_lanes: int, closed_jaxpr: ClosedJaxpr, argument_flags: tuple[bool, ...]
+) -> tuple[bool, ...]:
+    """Return which results of a trace have lanes."""
+    result_flags: list[bool] = []
+
+    def evaluate_arrays(arrays: Sequence[Any]) -> list[Any]:
+        results = _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, argument_flags)))
+        result_flags.extend(x.has_lanes for x in results)
+        return [x.array for x in results]
+
+    arguments = [
+        jax.ShapeDtypeStruct((*aval.shape, *(n_lanes,) * flag), aval.dtype)
+        for aval, flag in zip(closed_jaxpr.in_avals, argument_flags, strict=True)
+    ]
+    jax.eval_shape(evaluate_arrays, arguments)
+    return tuple(result_flags)
+
+
 def _spread_lanes(
+    n_lanes: int,
     closed_jaxpr: ClosedJaxpr,
     constants: Sequence[LaneValue],
     carry: Sequence[LaneValue],
-    others: Any = (),
-) -> list[bool]:
-    """Return which carried arrays of a loop have lanes in some iteration."""
-    has_lanes = [x.has_lanes for x in carry]
-    fixed = [x.has_lanes for x in constants]
+    others: Sequence[LaneValue] = (),
+) -> tuple[bool, ...]:
+    """Return which results of a loop's body have lanes, if carried arrays do in any iteration."""
+    fixed, last = ([x.has_lanes for x in values] for values in (constants, others))
+    flags = [x.has_lanes for x in carry]
     while True:
-        result_flags = _find_lanes(closed_jaxpr.jaxpr, [*fixed, *has_lanes, *others])
-        spread = [a or b for a, b in zip(has_lanes, result_flags, strict=False)]
-        if spread == has_lanes:
-            return has_lanes
-        has_lanes = spread
+        result_flags = _find_lanes(n_lanes, closed_jaxpr, (*fixed, *flags, *last))
+        spread = [a or b for a, b in zip(flags, result_flags, strict=False)]
+        if spread == flags:
+            return (*flags, *result_flags[len(flags) :])
+        flags = spread
 
 
-def _find_lanes(jaxpr: Any, argument_flags: Sequence[bool]) -> list[bool]:
-    """Return which results of a trace have lanes."""
-    flags = dict(zip(jaxpr.invars, argument_flags, strict=True))
-    read = lambda atom: not isinstance(atom, Literal) and flags.get(atom, False)
-    for equation in jaxpr.eqns:
-        operands = list(map(read, equation.invars))
-        name, params = equation.primitive.name, equation.params
-        if name in CALLED_JAXPR_PARAMETERS:
-            results = _find_lanes(params[CALLED_JAXPR_PARAMETERS[name]].jaxpr, operands)
-        elif name == "while":
-            n_condition, n_body = params["cond_nconsts"], params["body_nconsts"]
-            constants = operands[n_condition : n_condition + n_body]
-            as_values = lambda some_flags: [LaneValue(None, flag) for flag in some_flags]
-            results = _spread_lanes(
-                params["body_jaxpr"],
-                as_values(constants),
-                as_values(operands[n_condition + n_body :]),
-            )
-            if any(_find_lanes(params["cond_jaxpr"].jaxpr, [*operands[:n_condition], *results])):
-                results = [True] * len(results)
-        elif name == "scan":
-            n_constants, n_carry = _count_scan_arguments(params)
-            as_values = lambda some_flags: [LaneValue(None, flag) for flag in some_flags]
-            others = operands[n_constants + n_carry :]
-            carry = _spread_lanes(
-                params["jaxpr"],
-                as_values(operands[:n_constants]),
-                as_values(operands[n_constants : n_constants + n_carry]),
-                others,
-            )
-            results = _find_lanes(params["jaxpr"].jaxpr, [*operands[:n_constants], *carry, *others])
-            results = [*carry, *results[n_carry:]]
-        else:
-            results = [any(operands)] * len(equation.outvars)
-        flags |= zip(equation.outvars, results, strict=True)
-    return list(map(read, jaxpr.outvars))
+def _make_arrays(n_lanes: int, values: Sequence[LaneValue], flags: Sequence[bool]) -> list[Any]:
+    """Return the arrays of values, with a lane axis where the flag of a value is true."""
+    return [
+        _with_lanes(n_lanes, value) if flag else value.array
+        for value, flag in zip(values, flags, strict=False)
+    ]
 
 
 def _count_scan_arguments(params: Any) -> tuple[int, int]:
@@ -356,16 +333,11 @@ def _while(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[L
     condition_constants = operands[:n_condition]
     body_constants = operands[n_condition : n_condition + n_body]
     carry = operands[n_condition + n_body :]
-    flags = _spread_lanes(params["body_jaxpr"], body_constants, carry)
-    condition_flags = _find_lanes(
-        params["cond_jaxpr"].jaxpr, [*(x.has_lanes for x in condition_constants), *flags]
-    )
-    varies = any(condition_flags)
-    flags = [True] * len(flags) if varies else flags
-    make_arrays = lambda values: [
-        _with_lanes(n_lanes, value) if flag else value.array
-        for value, flag in zip(values, flags, strict=True)
-    ]
+    flags = _spread_lanes(n_lanes, params["body_jaxpr"], body_constants, carry)
+    condition_flags = *(x.has_lanes for x in condition_constants), *flags
+    (varies,) = _find_lanes(n_lanes, params["cond_jaxpr"], condition_flags)
+    flags = (True,) * len(flags) if varies else flags
+    make_arrays = lambda values: _make_arrays(n_lanes, values, flags)
     make_values = lambda arrays: list(map(LaneValue, arrays, flags))
 
     def find_condition(arrays: Sequence[Any]) -> Any:
@@ -399,15 +371,7 @@ def _scan(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[La
     constants, carry = operands[:n_constants], operands[n_constants : n_constants + n_carry]
     scanned = operands[n_constants + n_carry :]
     scanned_flags = [x.has_lanes for x in scanned]
-    flags = _spread_lanes(params["jaxpr"], constants, carry, scanned_flags)
-    result_flags = _find_lanes(
-        params["jaxpr"].jaxpr, [*(x.has_lanes for x in constants), *flags, *scanned_flags]
-    )
-    result_flags[:n_carry] = flags
-    make_arrays = lambda values: [
-        _with_lanes(n_lanes, value) if flag else value.array
-        for value, flag in zip(values, result_flags, strict=False)
-    ]
+    flags = _spread_lanes(n_lanes, params["jaxpr"], constants, carry, scanned)
 
     def advance(arrays: list[Any], slices: list[Any]) -> tuple[list[Any], list[Any]]:
         values = [
@@ -415,17 +379,17 @@ def _scan(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[La
             *map(LaneValue, arrays, flags),
             *map(LaneValue, slices, scanned_flags),
         ]
-        results = make_arrays(_evaluate(n_lanes, params["jaxpr"], values))
+        results = _make_arrays(n_lanes, _evaluate(n_lanes, params["jaxpr"], values), flags)
         return results[:n_carry], results[n_carry:]
 
     final, stacked = lax.scan(
         advance,
-        make_arrays(carry),
+        _make_arrays(n_lanes, carry, flags),
         [x.array for x in scanned],
         params["length"],
         params["reverse"],
     )
-    return list(map(LaneValue, [*final, *stacked], result_flags))
+    return list(map(LaneValue, [*final, *stacked], flags))
 
 
 def _choose_branch(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
