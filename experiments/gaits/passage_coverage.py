@@ -22,7 +22,7 @@ from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.failure_counts import NORMAL_QUANTILE, count_failures
 from vrw_jax.studies.first_passage import PassageStatus
-from vrw_jax.studies.sampled_passage import PassageSamplingOptions, WalkerGroups, sample_passage
+from vrw_jax.studies.sampled_passage import WalkerGroups, sample_passage
 
 PAGE = tables.DOCS / "benchmarks" / "first_passage.md"
 DATA = tables.FIGURES / "passage_coverage.csv"
@@ -43,10 +43,11 @@ MAX_COUNTED_STEPS = 6_000_000
 """Largest number of counted steps, chosen because a count then takes half a minute."""
 MAX_REFERENCE_STEPS = 20_000_000
 """Largest number of steps of the second sampling."""
-REFERENCE_OPTIONS = PassageSamplingOptions(
-    negligible_ground_line_effect=1e-3, min_forgetting_steps=12
-)
-"""Options of the second sampling, chosen so that more lines are biased and more steps forgotten."""
+REFERENCE_GROUND_LINE_EFFECT = 1e-3
+"""Negligible effect of a line's slope in the second sampling, chosen so that more lines are biased.
+"""
+REFERENCE_FORGETTING_STEPS = 12
+"""Smallest number of forgotten steps in the second sampling, twice the usual number."""
 REFERENCE_STEP_TOLERANCE = 1e-6
 """Relative and absolute tolerance of gait steps in references, chosen because it is a tenth of the
 tolerance of `first_passage`."""
@@ -83,7 +84,8 @@ def sample_reference(
         vrw.StepOptions(rtol=REFERENCE_STEP_TOLERANCE, atol=REFERENCE_STEP_TOLERANCE),
         16384,
         np.random.default_rng(seed),
-        REFERENCE_OPTIONS,
+        negligible_ground_line_effect=REFERENCE_GROUND_LINE_EFFECT,
+        min_forgetting_steps=REFERENCE_FORGETTING_STEPS,
     )
     sample = sample_passage(
         walkers,

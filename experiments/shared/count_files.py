@@ -2,11 +2,12 @@
 
     python -m experiments.shared.count_files [CALL]
 
-A file counts if at least one of its functions runs. Of `lanes`, which compiles, only those files
-count that another package calls; the others are listed apart. Without CALL, each call runs in a
+A file counts if at least one of its functions runs. Files of `lanes`, which compiles, are listed
+apart, because a reader stops at a public name of that package. Without CALL, each call runs in a
 process of its own without a cache on disk, because a trace from a cache runs no functions.
 """
 
+import itertools
 import os
 import subprocess
 import sys
@@ -50,40 +51,25 @@ CALLS: dict[str, Callable[[], object]] = {
 }
 
 
-def find_library_file(frame: FrameType | None) -> str:
-    """Return the file of the innermost function of the library in a stack, or ""."""
-    while frame is not None:
-        path = Path(frame.f_code.co_filename)
-        if path.is_relative_to(LIBRARY_FOLDER):
-            return path.relative_to(LIBRARY_FOLDER).as_posix()
-        frame = frame.f_back
-    return ""
-
-
 def list_files(call: Callable[[], object]) -> tuple[list[str], list[str]]:
     """Return the files of which a function runs in a call, in the order of their first calls.
 
-    The second list contains the files that only other files of `lanes` call.
+    The second list contains the files of `lanes`.
     """
     files: dict[str, None] = {}
-    inner_files: dict[str, None] = {}
 
     def record(frame: FrameType, event: str, _: object) -> None:
-        """Add the file of a called function of the library to one of the lists."""
-        if event != "call" or not frame.f_code.co_filename.startswith(f"{LIBRARY_FOLDER}/"):
-            return
-        file = find_library_file(frame)
-        if file in files or frame.f_code.co_name == "<module>":
-            return
-        is_inner = file.startswith("lanes/") and find_library_file(frame.f_back).startswith(
-            "lanes/"
-        )
-        (inner_files if is_inner else files)[file] = None
+        """Add the file of a called function of the library."""
+        path = Path(frame.f_code.co_filename)
+        is_counted = event == "call" and frame.f_code.co_name != "<module>"
+        if is_counted and path.is_relative_to(LIBRARY_FOLDER):
+            files[path.relative_to(LIBRARY_FOLDER).as_posix()] = None
 
     sys.setprofile(record)
     call()
     sys.setprofile(None)
-    return list(files), [file for file in inner_files if file not in files]
+    is_compiler = lambda file: file.startswith("lanes/")
+    return list(itertools.filterfalse(is_compiler, files)), list(filter(is_compiler, files))
 
 
 if __name__ == "__main__":
@@ -93,8 +79,8 @@ if __name__ == "__main__":
     if call_name:
         if call_name == "gradient":
             run_limit_cycle()  # The gradient's count then holds only the files that it adds.
-        files, inner_files = list_files(CALLS[call_name])
-        print(f"{call_name}: {len(files)} files, and {len(inner_files)} inside lanes")
+        files, lane_files = list_files(CALLS[call_name])
+        print(f"{call_name}: {len(files)} files, and {len(lane_files)} of lanes")
         print("  " + "\n  ".join(files))
     else:
         for name in CALLS:

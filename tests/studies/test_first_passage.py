@@ -11,8 +11,7 @@ import vrw_jax as vrw
 from vrw_jax.studies.first_passage import PassageStatus
 from vrw_jax.studies.passage_gradient import differentiate_log_mean_steps
 from vrw_jax.studies.sampled_passage import (
-    PASSAGE_SAMPLING_OPTIONS,
-    PassageSamplingOptions,
+    MIN_SAMPLING_ROUNDS,
     WalkerGroups,
     _estimate_failure_probability,
     _estimate_kappa_2,
@@ -275,11 +274,17 @@ def test_a_life_of_millions_of_steps_depends_on_no_choice_of_the_sampling():
     passage = vrw.first_passage(params, slope_sd)
     gait = vrw.limit_cycle(params)
     start, random = np.asarray(gait.section_state), np.random.default_rng(11)
-    options = PassageSamplingOptions(
-        negligible_ground_line_effect=3e-4, min_forgetting_steps=14, n_walker_groups=64
-    )
     groups = WalkerGroups(
-        params, start, slope_sd, vrw.ViscoelasticWheel(), vrw.StepOptions(), 8192, random, options
+        params,
+        start,
+        slope_sd,
+        vrw.ViscoelasticWheel(),
+        vrw.StepOptions(),
+        8192,
+        random,
+        n_groups=64,
+        negligible_ground_line_effect=3e-4,
+        min_forgetting_steps=14,
     )
     sample = sample_passage(groups, float(gait.spectral_radius), 0.03, 2_000_000)
     error = sample.relative_error + float(passage.error / passage.mean_steps)
@@ -322,8 +327,9 @@ def test_sampling_ends_if_the_effect_of_the_start_exceeds_the_tolerance():
     """More walks from the same walkers cannot reduce this effect."""
     random, tol, decay_factor, n_steps = np.random.default_rng(0), 0.02, 0.9, 20
     # Each of 32 weights per round is one failure.
-    options = PassageSamplingOptions(min_effective_failures=1.0)
-    groups = WalkerGroups(BYL, np.zeros(1), 0.01, RIGID, vrw.StepOptions(), 32, random, options)
+    groups = WalkerGroups(
+        BYL, np.zeros(1), 0.01, RIGID, vrw.StepOptions(), 32, random, min_effective_failures=1.0
+    )
     start_effect = decay_factor ** (n_steps + 1)  # 0.11
 
     def run_rounds(are_walkers_advanced):
@@ -347,7 +353,7 @@ def test_sampling_ends_if_the_effect_of_the_start_exceeds_the_tolerance():
     error, remaining_effect, n_rounds = run_rounds(are_walkers_advanced=False)
     assert remaining_effect == pytest.approx(start_effect)
     assert start_effect < error < start_effect + tol
-    assert n_rounds == PASSAGE_SAMPLING_OPTIONS.min_sampling_rounds
+    assert n_rounds == MIN_SAMPLING_ROUNDS
     # If each round advances the walkers, the mean effect over the rounds decays.
     error, remaining_effect, n_rounds = run_rounds(are_walkers_advanced=True)
     mean_effect = start_effect * (1.0 - decay_factor**n_rounds) / (1.0 - decay_factor) / n_rounds

@@ -14,7 +14,7 @@ from vrw_jax.app.reports import format_tuning_summary
 from vrw_jax.gaits import make_finder
 from vrw_jax.gaits.margin_defaults import DEFAULT_MARGIN_NAMES, default_margins
 from vrw_jax.models.measures import MARGIN_MEASURES
-from vrw_jax.studies.tune_maximization import MAXIMIZATION_OPTIONS, TrialKind, TuneStatus
+from vrw_jax.studies.tune_maximization import ACTIVE_BOUND_TOLERANCE, TrialKind, TuneStatus
 from vrw_jax.studies.tune_objective import (
     compute_max_violation,
     compute_slack_scales,
@@ -82,7 +82,7 @@ def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_re
             retained.constraint_slacks,
             compute_slack_scales(retained.constraint_slacks, retained.slack_jacobian),
         )
-        <= 1.01 * MAXIMIZATION_OPTIONS.active_bound_tolerance
+        <= 1.01 * ACTIVE_BOUND_TOLERANCE
     )
 
 

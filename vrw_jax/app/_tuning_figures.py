@@ -26,7 +26,7 @@ from vrw_jax.app.figure_style import (
 )
 from vrw_jax.base.checks import check_type
 from vrw_jax.models.measures import MEASURES
-from vrw_jax.studies.tune_maximization import MAXIMIZATION_OPTIONS, TrialKind
+from vrw_jax.studies.tune_maximization import ACTIVE_BOUND_TOLERANCE, TrialKind
 from vrw_jax.studies.tune_result import TuneResult
 
 
@@ -97,9 +97,7 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
     evaluation_numbers = path_dataset.evaluation.values
     objective_values = path_dataset.objective.values
     is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
-    are_constraints_satisfied = (
-        path_dataset.breach.values <= MAXIMIZATION_OPTIONS.active_bound_tolerance
-    )
+    are_constraints_satisfied = path_dataset.breach.values <= ACTIVE_BOUND_TOLERANCE
     axes.plot(
         evaluation_numbers[~is_gait_lost],
         objective_values[~is_gait_lost],

@@ -14,6 +14,8 @@ import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from vrw_jax.lanes.settings import with_default_jax_settings
+
 PROGRESS_VARIABLE = "VRW_PROGRESS"
 """Environment variable that switches notices off if it is "0"."""
 
@@ -66,7 +68,7 @@ def announce_wait(
 ) -> Callable[[FunctionType], FunctionType]:
     """Return a decorator for public functions that may last more than some seconds.
 
-    Calls within another decorated call print nothing.
+    They run with the default settings of JAX. Calls within another decorated call print nothing.
 
     - `compiled_programs`: programs that the first call of a process compiles;
     - `compile_time`: duration of that compilation without a cache, in CPU time, as text.
@@ -100,7 +102,7 @@ def announce_wait(
                     public_call.erase_progress()
 
         call_with_notice.announces_wait = True  # type: ignore[attr-defined]
-        return call_with_notice  # type: ignore[return-value]
+        return with_default_jax_settings(call_with_notice)  # type: ignore[return-value]
 
     return decorate
 

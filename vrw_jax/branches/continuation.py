@@ -67,7 +67,6 @@ from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import (
     FORCE_PEAK_MEASURES,
@@ -170,7 +169,6 @@ class GaitContinuation(AbstractContinuation):
         )
 
 
-@with_default_jax_settings
 @announce_wait("gaits, their derivatives and special points", "30 s")
 def continue_branch(
     params: Any,
@@ -264,7 +262,6 @@ def continue_branch(
     return branch
 
 
-@with_default_jax_settings
 @announce_wait("gaits, their derivatives and special points", "30 s")
 def continue_branches(
     params: WheelParams,
@@ -643,7 +640,6 @@ class MapContinuation(AbstractContinuation):
         return jax.device_put(select_tree_rows((points.z, points.p), np.flatnonzero(is_usable)[:1]))
 
 
-@with_default_jax_settings
 @announce_wait("the map and its derivatives", "10 s")
 def continue_map(
     function: Callable[[Any, Array, Array], Array],

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.floquet import (
     MAX_CLOSED_FORM_SIZE,
-    MULTIPLIER_TOLERANCES,
+    UNIT_CIRCLE_DISTANCE,
     compute_bifurcation_margins,
     floquet_multipliers,
 )
@@ -48,7 +48,7 @@ def is_multiplier_change_explained(
         unit circle.
         """
         multiplier_moduli = jnp.abs(floquet_multipliers(return_map_jacobian))
-        tolerance = MULTIPLIER_TOLERANCES.unit_circle_distance
+        tolerance = UNIT_CIRCLE_DISTANCE
         return jnp.sum(multiplier_moduli > 1.0 + tolerance), jnp.sum(
             multiplier_moduli > 1.0 - tolerance
         )

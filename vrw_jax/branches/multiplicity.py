@@ -17,7 +17,7 @@ from vrw_jax.branches.branch_points import (
     LocatedRoot,
     RootRequest,
 )
-from vrw_jax.gaits.floquet import MULTIPLIER_TOLERANCES
+from vrw_jax.gaits.floquet import EQUAL_MODULI_DISTANCE, MIN_IMAGINARY_PART, UNIT_CIRCLE_DISTANCE
 
 
 def sort_multiplier_moduli(return_map_jacobians: np.ndarray) -> np.ndarray:
@@ -49,9 +49,7 @@ def are_multipliers_off_circle(multiplier_moduli: np.ndarray) -> np.ndarray:
     """Return for each point whether all multipliers are off the unit circle by more than the
     tolerance.
     """
-    return np.asarray(
-        (np.abs(multiplier_moduli - 1.0) > MULTIPLIER_TOLERANCES.unit_circle_distance).all(-1)
-    )
+    return np.asarray((np.abs(multiplier_moduli - 1.0) > UNIT_CIRCLE_DISTANCE).all(-1))
 
 
 def classify_crossing_ranks(
@@ -69,7 +67,7 @@ def classify_crossing_ranks(
     multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")][
         list(crossing_multiplier_ranks)
     ]
-    is_multiplier_complex = np.abs(multipliers.imag) > MULTIPLIER_TOLERANCES.min_imaginary_part
+    is_multiplier_complex = np.abs(multipliers.imag) > MIN_IMAGINARY_PART
     bifurcation_at_multiplier_one = "fold" if has_parameter_turned else BRANCH_POINT_KIND
     n_multipliers_by_name = {
         bifurcation_at_multiplier_one: int(
@@ -152,8 +150,7 @@ def add_multiple_bifurcations(
             moduli_beside_root[list(mean_root.request.multiplier_ranks)] - 1.0
         )
         do_ranks_cross_together = (
-            len(root_group) == 1
-            or np.max(unit_circle_distances) <= MULTIPLIER_TOLERANCES.equal_moduli_distance
+            len(root_group) == 1 or np.max(unit_circle_distances) <= EQUAL_MODULI_DISTANCE
         )
         for root in [mean_root] if do_ranks_cross_together else root_group:
             left_fraction_rate, right_fraction_rate = point_table.points.fraction_rate[

@@ -4,14 +4,14 @@ All brackets are searched in one batch. Each round evaluates the quantities once
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.gaits.floquet import (
-    MULTIPLIER_TOLERANCES,
+    LOCATED_PAIR_CIRCLE_DISTANCE,
+    MIN_IMAGINARY_PART,
     compute_bifurcation_margins,
     floquet_multipliers,
 )
@@ -22,22 +22,10 @@ multipliers has modulus 1 at a Neimark-Sacker bifurcation.
 """
 
 
-@dataclass(frozen=True)
-class RootSearchOptions:
-    """Numerical options of `locate_function_roots`.
-
-    - `max_search_rounds_per_smooth_bracket`: number of rounds after which an unresolved bracket is
-      treated as a jump;
-    - `n_parts_per_jump_bracket`: number of equal sections into which each round divides a
-      bracket that contains a jump.
-    """
-
-    max_search_rounds_per_smooth_bracket: int = 12
-    n_parts_per_jump_bracket: int = 9
-
-
-ROOT_SEARCH_OPTIONS = RootSearchOptions()
-"""Options of `locate_function_roots`."""
+MAX_ROUNDS_PER_SMOOTH_BRACKET = 12
+"""Number of rounds after which an unresolved bracket is treated as a jump."""
+N_PARTS_PER_JUMP_BRACKET = 9
+"""Number of equal sections into which each round divides a bracket that contains a jump."""
 
 
 def evaluate_bifurcation_functions(return_map_jacobians: np.ndarray) -> np.ndarray:
@@ -63,10 +51,8 @@ def has_unit_circle_pair(return_map_jacobian: np.ndarray) -> bool:
     multipliers. Such multipliers are no bifurcation.
     """
     multipliers = np.asarray(floquet_multipliers(jnp.asarray(return_map_jacobian)))
-    is_complex_pair = np.abs(multipliers.imag) > MULTIPLIER_TOLERANCES.min_imaginary_part
-    is_on_circle = (
-        np.abs(np.abs(multipliers) - 1.0) < MULTIPLIER_TOLERANCES.located_pair_circle_distance
-    )
+    is_complex_pair = np.abs(multipliers.imag) > MIN_IMAGINARY_PART
+    is_on_circle = np.abs(np.abs(multipliers) - 1.0) < LOCATED_PAIR_CIRCLE_DISTANCE
     return bool(np.any(is_on_circle & is_complex_pair))
 
 
@@ -117,7 +103,7 @@ def locate_function_roots(
     bracket_locations = np.outer((0.0, 1.0, 1.0), np.ones_like(max_bracket_width))
     function_values = np.stack([values_at_location_0, values_at_location_1, values_at_location_1])
     is_sign_jump, n_search_rounds = np.zeros(len(max_bracket_width), bool), 0
-    n_bracket_parts = ROOT_SEARCH_OPTIONS.n_parts_per_jump_bracket
+    n_bracket_parts = N_PARTS_PER_JUMP_BRACKET
     while len(
         unresolved_indices := np.flatnonzero(
             np.abs(bracket_locations[0] - bracket_locations[1]) > max_bracket_width
@@ -177,7 +163,7 @@ def locate_function_roots(
         is_sign_jump[smooth_bracket_indices] = (
             is_function_undefined[: len(smooth_bracket_indices)]
             | (values_at_proposals == function_values[2, smooth_bracket_indices])
-            | (n_search_rounds >= ROOT_SEARCH_OPTIONS.max_search_rounds_per_smooth_bracket)
+            | (n_search_rounds >= MAX_ROUNDS_PER_SMOOTH_BRACKET)
         )
     is_newest_end_better = np.abs(function_values[0]) < np.abs(function_values[1])
     best_locations = np.where(

@@ -33,7 +33,6 @@ from vrw_jax.flow.diffrax_minima import (
 from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
 from vrw_jax.flow.solver_steps import VectorField
 from vrw_jax.lanes.program_cache import call_compiled_program
-from vrw_jax.lanes.settings import with_default_jax_settings
 
 MAX_STORED_NUMBERS = 100_000_000
 """Largest product of the number of events and the dimension of the state.
@@ -131,7 +130,6 @@ class HybridSolution(NamedTuple):
         return describe_step_ending(self.termination, Termination)
 
 
-@with_default_jax_settings
 @announce_wait("the system's equations and guards", "10 s")
 def simulate_hybrid(
     modes: Sequence[Mode] | Mode,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax import lanes
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
@@ -46,9 +47,6 @@ from vrw_jax.flow.tangents import (
     apply_batched_jvp_rule,
     stack_directions,
 )
-from vrw_jax.lanes.autodiff import make_zero_tangent
-from vrw_jax.lanes.lowering import mark_noinline
-from vrw_jax.lanes.settings import with_default_jax_settings
 
 
 class BatchPhaseEnd(NamedTuple):
@@ -108,7 +106,7 @@ def integrate_batch_phase(
     )
 
     @integrate_with_rule.defjvp
-    @with_default_jax_settings
+    @lanes.with_default_jax_settings
     def compute_integration_jvp(
         primals: tuple, state_tangents: tuple
     ) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
@@ -123,7 +121,7 @@ def integrate_batch_phase(
         phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
             integrate_with_tangents, primals, state_tangents[:4]
         )
-        zero_phase_end = make_zero_tangent(phase_end)
+        zero_phase_end = lanes.make_zero_tangent(phase_end)
         state_tangent = zero_phase_end.state._replace(q=q, v=v)
         return phase_end, zero_phase_end._replace(
             state=state_tangent, duration=event_time_tangent, margin_minima=minima_tangents
@@ -211,7 +209,7 @@ def _integrate_to_event(
     """
     phase = make_phase(phase_constants, held_constants)
     phase = _wrap_each_phase_function(
-        phase, mark_noinline if phase.is_compiled_separately else jax.jit
+        phase, lanes.mark_noinline if phase.is_compiled_separately else jax.jit
     )
     solver_step_function = _make_solver_step_function(phase, tableau)
     start_state = phase.make_state(q, v)
@@ -241,7 +239,7 @@ def _integrate_to_event(
     has_guard_crossed = integrator_state.has_guard_crossed
     if phase.margins_include_start or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
-        phase = _wrap_each_phase_function(phase, mark_noinline)
+        phase = _wrap_each_phase_function(phase, lanes.mark_noinline)
         solver_step_function = _make_solver_step_function(phase, tableau)
     event_search = locate_event(phase, solver_step_function, tableau, integrator_state, options)
     is_crossing_event_unresolved = has_guard_crossed & event_search.is_event_unresolved

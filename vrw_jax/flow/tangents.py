@@ -23,6 +23,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching
 from jaxtyping import Array
 
+from vrw_jax import lanes
 from vrw_jax.base.elementwise import run_if_any_element_active
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.tableaus import (
@@ -32,8 +33,6 @@ from vrw_jax.flow.tableaus import (
     StageState,
     evaluate_stage,
 )
-from vrw_jax.lanes.autodiff import make_zero_tangent
-from vrw_jax.lanes.settings import with_default_jax_settings
 
 
 class ImplicitDynamics(NamedTuple):
@@ -157,7 +156,7 @@ def _count_vmapped_directions(_: Any) -> Array:
 
 
 @_count_vmapped_directions.def_vmap
-@with_default_jax_settings
+@lanes.with_default_jax_settings
 def _count_vmapped_directions_rule(n_directions: int, _: list, _tangent: Any) -> tuple[Array, bool]:
     return jnp.zeros(n_directions), False
 
@@ -361,7 +360,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
         differentiable_function = jax.custom_jvp(evaluate_with_float_arguments)
 
         @differentiable_function.defjvp
-        @with_default_jax_settings
+        @lanes.with_default_jax_settings
         def evaluate_float_jvp(primals: tuple, tangent: tuple) -> tuple:
             evaluate_with_tangents = lambda primals, directions: (
                 evaluate_with_float_arguments(*primals),
@@ -371,7 +370,7 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
                 evaluate_with_tangents, primals, tangent
             )
             return function_outputs, eqx.combine(
-                float_tangents, make_zero_tangent(function_outputs)
+                float_tangents, lanes.make_zero_tangent(function_outputs)
             )
 
         return differentiable_function(*float_arguments)

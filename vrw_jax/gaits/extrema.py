@@ -11,7 +11,6 @@ accurate as the cycle.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -32,38 +31,26 @@ from vrw_jax.gaits.gauss import (
     compute_integration_weights,
 )
 
-
-@dataclass(frozen=True)
-class ExtremumSearchOptions:
-    """Numerical options of the search for extrema of a quantity F in a phase.
-
-    R denotes the time derivative of F.
-    """
-
-    n_samples_per_interval: int = 8
-    """Number of samples of F per mesh interval. The value is chosen because the polynomial through
-    the samples is then more accurate than the motion between two nodes.
-    """
-    max_rate_extrema_per_phase: int = 6
-    """Largest number of extrema of R per phase. The value is chosen because R has at most five
-    extrema if the legs are stiff and lightly damped.
-    """
-    n_bisections: int = 24
-    """Number of bisections on the polynomials. The value is chosen because the error of a root in a
-    phase of 20 mesh intervals is then 1e-6 mesh intervals, less than that of the polynomials.
-    """
-    n_time_corrections: int = 3
-    """Number of corrections of the time of an extremum. The value is chosen because each correction
-    reduces the initial error, 1e-4 mesh intervals, at least a hundredfold.
-    """
-    n_state_newton_iterations: int = 3
-    """Number of Newton iterations for the state at an extremum. The value is chosen because the
-    initial error is 1e-5 and Newton's method converges quadratically.
-    """
-
-
-EXTREMUM_SEARCH_OPTIONS = ExtremumSearchOptions()
-"""Options of `find_quantity_extrema`."""
+N_SAMPLES_PER_INTERVAL = 8
+"""Number of samples of a quantity F per mesh interval. The value is chosen because the polynomial
+through the samples is then more accurate than the motion between two nodes.
+"""
+MAX_RATE_EXTREMA_PER_PHASE = 6
+"""Largest number of extrema of the rate of F per phase. The value is chosen because the rate has at
+most five extrema if the legs are stiff and lightly damped.
+"""
+N_BISECTIONS = 24
+"""Number of bisections on the polynomials. The value is chosen because the error of a root in a
+phase of 20 mesh intervals is then 1e-6 mesh intervals, less than that of the polynomials.
+"""
+N_TIME_CORRECTIONS = 3
+"""Number of corrections of the time of an extremum. The value is chosen because each correction
+reduces the initial error, 1e-4 mesh intervals, at least a hundredfold.
+"""
+N_STATE_NEWTON_ITERATIONS = 3
+"""Number of Newton iterations for the state at an extremum. The value is chosen because the initial
+error is 1e-5 and Newton's method converges quadratically.
+"""
 
 
 class QuantityTimeDerivatives(NamedTuple):
@@ -217,7 +204,7 @@ class CollocatedPhaseMotion(NamedTuple):
         node_accelerations = lax.scan(
             refine_node_accelerations,
             lax.stop_gradient(self.node_accelerations[interval_index].ravel()),
-            length=EXTREMUM_SEARCH_OPTIONS.n_state_newton_iterations,
+            length=N_STATE_NEWTON_ITERATIONS,
         )[0].reshape(N_GAUSS_NODES, -1)
         return interval_start_q + partial_interval_length * (
             interval_start_v + partial_interval_length * (DOUBLE_END_WEIGHTS @ node_accelerations)
@@ -240,7 +227,7 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
         compute_quantity: FunctionOfCoordinatesAndRates,
     ) -> "_PiecewiseQuantityPolynomial":
         """Interpolate samples of the quantity in each mesh interval."""
-        n_samples_per_interval = EXTREMUM_SEARCH_OPTIONS.n_samples_per_interval
+        n_samples_per_interval = N_SAMPLES_PER_INTERVAL
         chebyshev_angles = (
             np.pi * (np.arange(n_samples_per_interval) + 0.5) / n_samples_per_interval
         )
@@ -321,7 +308,7 @@ def find_quantity_extrema(
     # An unused bracket has zero length and lies at the end of the phase.
     bracket_start_indices = jnp.nonzero(
         sampled_second_rates[:-1] * sampled_second_rates[1:] < 0.0,
-        size=EXTREMUM_SEARCH_OPTIONS.max_rate_extrema_per_phase,
+        size=MAX_RATE_EXTREMA_PER_PHASE,
         fill_value=last_sample_index,
     )[0]
     is_rate_extremum = bracket_start_indices < last_sample_index
@@ -380,7 +367,7 @@ def find_quantity_extrema(
         return lax.scan(
             correct_extremum_times_once,
             (extremum_times, QuantityTimeDerivatives(*jnp.zeros((3, *extremum_times.shape)))),
-            length=EXTREMUM_SEARCH_OPTIONS.n_time_corrections,
+            length=N_TIME_CORRECTIONS,
         )[0]
 
     rate_extremum_times, derivatives_at_rate_extrema = correct_extremum_times(
@@ -464,6 +451,6 @@ def _bisect_zeros(
     final_end_points, _ = lax.scan(
         halve_brackets,
         lax.stop_gradient(bracket_end_points),
-        length=EXTREMUM_SEARCH_OPTIONS.n_bisections,
+        length=N_BISECTIONS,
     )
     return jnp.mean(final_end_points, axis=0)

@@ -21,7 +21,7 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.hybrid_simulation import Termination
 from vrw_jax.flow.return_map import ReturnMap
-from vrw_jax.gaits.floquet import MULTIPLIER_TOLERANCES, floquet_multipliers
+from vrw_jax.gaits.floquet import UNIT_CIRCLE_DISTANCE, floquet_multipliers
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian, make_zero_tangent
 from vrw_jax.lanes.program_cache import get_compiled_program
 from vrw_jax.lanes.settings import with_default_jax_settings
@@ -36,7 +36,7 @@ UNIT_MULTIPLIER_ADVICE = (
 def has_unit_multiplier(jacobian: Float[np.ndarray, "... n n"]) -> Bool[np.ndarray, "..."]:
     """Return whether a multiplier is 1, up to the round-off of two equal multipliers."""
     multipliers = np.linalg.eigvals(np.where(np.isfinite(jacobian), jacobian, 0.0))
-    is_unit_multiplier = np.abs(multipliers - 1.0) < MULTIPLIER_TOLERANCES.unit_circle_distance
+    is_unit_multiplier = np.abs(multipliers - 1.0) < UNIT_CIRCLE_DISTANCE
     return np.asarray(is_unit_multiplier.any(-1))
 
 

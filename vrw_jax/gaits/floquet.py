@@ -9,7 +9,6 @@ of the matrix entries and always differentiable.
 import functools
 import itertools
 import operator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -31,30 +30,21 @@ result is then at most log(4)/50 below the exact minimum.
 """
 
 
-@dataclass(frozen=True)
-class MultiplierTolerances:
-    """Tolerances within which multipliers are treated as equal, as real, or as on the unit circle.
-
-    - `unit_circle_distance`: largest distance from modulus 1 at which a multiplier may lie on
-      either side of the circle. The value is chosen because area-preserving maps have multipliers
-      on the circle up to round-off, which is 1e-8 for two equal multipliers;
-    - `located_pair_circle_distance`: largest distance from modulus 1 of the pair at a located
-      Neimark-Sacker bifurcation;
-    - `min_imaginary_part`: imaginary part below which a multiplier on the unit circle is treated as
-      real. The value is chosen because three equal real multipliers are computed with imaginary
-      parts of 1e-5;
-    - `equal_moduli_distance`: largest difference of two moduli that are treated as equal. The value
-      is that of `unit_circle_distance`.
-    """
-
-    unit_circle_distance: float = 1e-6
-    located_pair_circle_distance: float = 1e-4
-    min_imaginary_part: float = 1e-3
-    equal_moduli_distance: float = 1e-6
-
-
-MULTIPLIER_TOLERANCES = MultiplierTolerances()
-"""Tolerances for multipliers in all continuations."""
+UNIT_CIRCLE_DISTANCE = 1e-6
+"""Largest distance from modulus 1 at which a multiplier may lie on either side of the circle. The
+value is chosen because area-preserving maps have multipliers on the circle up to round-off,
+which is 1e-8 for two equal multipliers.
+"""
+LOCATED_PAIR_CIRCLE_DISTANCE = 1e-4
+"""Largest distance from modulus 1 of the pair at a located Neimark-Sacker bifurcation."""
+MIN_IMAGINARY_PART = 1e-3
+"""Imaginary part below which a multiplier on the unit circle is treated as real. The value is
+chosen because three equal real multipliers are computed with imaginary parts of 1e-5.
+"""
+EQUAL_MODULI_DISTANCE = 1e-6
+"""Largest difference of two moduli that are treated as equal. The value is that of
+`UNIT_CIRCLE_DISTANCE`.
+"""
 
 
 def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, ...]:

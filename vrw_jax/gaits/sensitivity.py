@@ -17,14 +17,12 @@ from vrw_jax.gaits.finder_selection import (
     resolve_model,
 )
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.stepping import ModelLike
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 
-@with_default_jax_settings
 @announce_wait("the gait with its derivatives", "15 s")
 def sensitivities(
     params: WheelParams,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,23 +11,16 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES, make_measure_attributes
 
+SPLINE_DEGREE = 7
+"""Degree of the spline through the samples of an interval. The value is chosen because the spline's
+error with the default number of samples is that of the solver.
+"""
+MIN_EXTREMUM_HEIGHT_FRACTION = 1e-7
+"""Smallest height of an extremum above or below its neighborhood, as a fraction of the largest
+force. The value is chosen because errors of the solver would otherwise be extrema of a constant
+force.
+"""
 
-@dataclass(frozen=True)
-class ForcePeakOptions:
-    """Options of the search for force peaks in a sampled walk."""
-
-    spline_degree: int = 7
-    """Degree of the spline through the samples of an interval. The value is chosen because the
-    spline's error with the default number of samples is that of the solver.
-    """
-    min_extremum_height_fraction: float = 1e-7
-    """Smallest height of an extremum above or below its neighborhood, as a fraction of the largest
-    force. The value is chosen because errors of the solver would otherwise be extrema of a constant
-    force.
-    """
-
-
-FORCE_PEAK_OPTIONS = ForcePeakOptions()
 
 SAMPLED_FORCE_PEAK_MEASURES = tuple(
     name for name in FORCE_PEAK_MEASURES if name != "landing_impulse"
@@ -85,7 +77,7 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
     is_interval_end = (np.diff(sample_times) <= time_roundoff) | (np.diff(sample_steps) != 0)
     interval_starts = np.flatnonzero(is_interval_end) + 1
     sampled_intervals = np.split(np.arange(len(sample_times)), interval_starts)
-    min_samples_per_phase = FORCE_PEAK_OPTIONS.spline_degree + 2
+    min_samples_per_phase = SPLINE_DEGREE + 2
     n_samples = max(map(len, sampled_intervals))
     if n_samples < min_samples_per_phase:
         raise ValueError(
@@ -161,9 +153,7 @@ def _find_force_extrema(
         roots = PPoly.from_spline(polynomial).roots()
         return roots[(roots > 0.0) & (roots < 1.0)]
 
-    min_extremum_height = FORCE_PEAK_OPTIONS.min_extremum_height_fraction * np.max(
-        np.abs(sampled_forces)
-    )
+    min_extremum_height = MIN_EXTREMUM_HEIGHT_FRACTION * np.max(np.abs(sampled_forces))
     for sample_indices in sample_indices_by_interval:
         if np.ptp(sampled_forces[sample_indices]) < min_extremum_height:
             continue
@@ -171,7 +161,7 @@ def _find_force_extrema(
         interval_start, interval_duration = interval_sample_times[0], np.ptp(interval_sample_times)
         time_fractions = (interval_sample_times - interval_start) / interval_duration
         force_spline = make_interp_spline(
-            time_fractions, sampled_forces[sample_indices], FORCE_PEAK_OPTIONS.spline_degree
+            time_fractions, sampled_forces[sample_indices], SPLINE_DEGREE
         )
         extremum_fractions = find_interior_roots(force_spline.derivative(1))
         forces_at_extrema_and_ends = force_spline(

@@ -5,7 +5,12 @@ The code computes a group of a few lanes (elements of a batch) at a time, in vec
 
 from vrw_jax.lanes import code_cache, disk_cache, ffi_primitive, kernel, machine, program
 from vrw_jax.lanes.array_emitter import MAX_UNROLLED_ENTRIES
-from vrw_jax.lanes.autodiff import compute_jacobian_columns, differentiate, make_leaf_function
+from vrw_jax.lanes.autodiff import (
+    compute_jacobian_columns,
+    differentiate,
+    make_leaf_function,
+    make_zero_tangent,
+)
 from vrw_jax.lanes.batching import apply_function_in_blocks, map_in_batches, select_tree_rows
 from vrw_jax.lanes.code_cache import targets_machine_code
 from vrw_jax.lanes.lane_function import compile_batch_function, jit, jit_batch

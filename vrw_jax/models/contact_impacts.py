@@ -4,7 +4,6 @@ All functions work elementwise, for one wheel or a batch.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -122,22 +121,12 @@ class ContactLaw(NamedTuple):
         return self.rest_speed * (1 + self.n_late_events)
 
 
-@dataclass(frozen=True)
-class StopperPivotOptions:
-    """Options of the search for the stoppers that hold legs in the air.
-
-    Few pivots suffice unless friction couples legs.
-    """
-
-    max_block_pivots: int = 8
-    """Number of pivots that switch all legs with a wrong sign."""
-    max_single_pivots: int = 16
-    """Number of later pivots that switch one leg each."""
-    max_enumerated_legs: int = 8
-    """Largest number of legs whose combinations are enumerated if pivoting fails."""
-
-
-STOPPER_PIVOT_OPTIONS = StopperPivotOptions()
+MAX_BLOCK_PIVOTS = 8
+"""Number of pivots that switch all legs with a wrong sign."""
+MAX_SINGLE_PIVOTS = 16
+"""Number of later pivots that switch one leg each."""
+MAX_ENUMERATED_LEGS = 8
+"""Largest number of legs whose combinations are enumerated if pivoting fails."""
 
 
 class _KinematicLevelSolution(NamedTuple):
@@ -183,7 +172,7 @@ def _solve_stopper_lcp(
     tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
     n_combinations = 1 << jnp.minimum(
         jnp.sum(is_stopper_tested, axis=0, dtype=jnp.int32),
-        STOPPER_PIVOT_OPTIONS.max_enumerated_legs,
+        MAX_ENUMERATED_LEGS,
     )
     leg_index = align_with_batch(np.arange(len(is_at_stopper), dtype=np.int32), n_combinations)
 
@@ -213,15 +202,12 @@ def _solve_stopper_lcp(
         )
         is_last_wrong_leg = leg_index == jnp.max(jnp.where(has_wrong_sign, leg_index, -1), axis=0)
         switched_legs = is_stopper_holding ^ jnp.where(
-            n_attempts < STOPPER_PIVOT_OPTIONS.max_block_pivots, has_wrong_sign, is_last_wrong_leg
+            n_attempts < MAX_BLOCK_PIVOTS, has_wrong_sign, is_last_wrong_leg
         )
         is_pivoting = (
             (combination_code < 0)
             & jnp.any(has_wrong_sign, axis=0)
-            & (
-                n_attempts
-                < STOPPER_PIVOT_OPTIONS.max_block_pivots + STOPPER_PIVOT_OPTIONS.max_single_pivots
-            )
+            & (n_attempts < MAX_BLOCK_PIVOTS + MAX_SINGLE_PIVOTS)
         )
         combination_code = jnp.where(is_pivoting, combination_code, combination_code + 1)
         enumerated_legs = jnp.where(

@@ -34,7 +34,6 @@ from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.lanes.batching import map_in_batches
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.batch_stiffness import (
     IMPLICIT_SOLVER_NAME,
     STABLE_SOLVER_NAME,
@@ -86,7 +85,6 @@ GROUND_INPUT_INDEX = len(PARAMETER_NAMES) + 3
 """Index, among the inputs of a gait step, of the first value of uneven ground."""
 
 
-@with_default_jax_settings
 @announce_wait("batches of gait steps", "10 s")
 def step_batch(
     params: WheelParams,

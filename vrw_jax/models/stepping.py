@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Int
 
+from vrw_jax import lanes
 from vrw_jax.base.checks import check_int, check_reals, check_type, format_value
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.printing import (
@@ -28,7 +29,6 @@ from vrw_jax.base.printing import (
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.status_codes import describe_step_ending
 from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
 from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
@@ -50,7 +50,7 @@ valid model.
 """
 
 
-@with_default_jax_settings
+@lanes.with_default_jax_settings
 def paper_start() -> SectionState:
     """Return a section state in the basin of attraction of the gait of Table 1 of the paper.
 
@@ -245,7 +245,6 @@ def step(
 ) -> HybridStep: ...
 
 
-@with_default_jax_settings
 @announce_wait("a gait step", "5 s")
 def step(
     params: Any,
@@ -289,7 +288,6 @@ def step(
     return model.take_step(params, section_state, options)
 
 
-@with_default_jax_settings
 @announce_wait("a gait step", "5 s")
 def return_map(
     params: WheelParams,
@@ -422,7 +420,6 @@ def _simulate_walk_by_scan(
     return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
 
 
-@with_default_jax_settings
 @announce_wait("a gait step", "5 s")
 def walk(
     params: WheelParams,
@@ -572,7 +569,6 @@ def start_walk_toward_gait(
     return walk(params, model.compute_default_start(params), n_steps, model=model, options=options)
 
 
-@with_default_jax_settings
 @announce_wait("a gait step of each model", "20 s")
 def choose_model(
     params: WheelParams,

@@ -20,7 +20,6 @@ from vrw_jax.base.checks import check_int, require_untraced_arguments
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.contact_mechanics import (
     compute_foot_heights,
     compute_foot_positions,
@@ -43,7 +42,6 @@ from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 
-@with_default_jax_settings
 @announce_wait("gait steps and their samples", "5 s")
 def simulate(
     params: WheelParams,

@@ -12,7 +12,6 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.cycle import AbstractCycle
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.stepping import ModelLike
 from vrw_jax.studies.basins import compute_section_states_of_starts, select_start_components
 from vrw_jax.studies.gait_arrival import StableGait, walk_until_on_gait
@@ -76,7 +75,6 @@ class BasinShare(AbstractPrintable):
         ]
 
 
-@with_default_jax_settings
 @announce_wait("gaits and walks", "20 s")
 def basin_share(
     params: WheelParams,

@@ -15,7 +15,6 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.attractors import find_distinct_orbits, measure_orbit_steps, walk_until_periodic
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
@@ -39,7 +38,6 @@ an axis.
 """
 
 
-@with_default_jax_settings
 @announce_wait("batches of gait steps", "10 s")
 def basin(
     params: WheelParams,

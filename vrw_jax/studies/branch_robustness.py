@@ -16,7 +16,6 @@ from vrw_jax.branches.branch import Branch
 from vrw_jax.gaits.finder_selection import resolve_finder
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MEASURES, make_measure_attributes
 from vrw_jax.models.step_batch import step_batch
@@ -37,7 +36,6 @@ BASIN_VARIABLE_ATTRS = {
 """Unit and meaning of each variable in the dataset that `measure_basins` returns."""
 
 
-@with_default_jax_settings
 @announce_wait("gaits and walks", "20 s")
 def measure_basins(
     branch: Branch,
@@ -117,7 +115,6 @@ def measure_basins(
     )
 
 
-@with_default_jax_settings
 @announce_wait("gaits and their response to slopes", "20 s")
 def measure_gait_sensitivity(
     branch: Branch,

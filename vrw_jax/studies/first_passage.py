@@ -26,7 +26,6 @@ from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.finder_selection import resolve_model
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.lanes.autodiff import make_zero_tangent
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.capabilities import PassageMethod
 from vrw_jax.models.stepping import (
     ModelLike,
@@ -176,7 +175,6 @@ class FirstPassage(AbstractPrintable):
         ]
 
 
-@with_default_jax_settings
 @announce_wait("gaits and random walks", "10 s")
 def first_passage(
     params: WheelParams,

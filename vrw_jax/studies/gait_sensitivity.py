@@ -18,7 +18,6 @@ from vrw_jax.gaits.finder_selection import UserCycleGuess, resolve_finder, resol
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.slope_response import compute_sensitivity_norms
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     MEASURES,
@@ -100,7 +99,6 @@ class GaitSensitivity(AbstractPrintable):
         ]
 
 
-@with_default_jax_settings
 @announce_wait("the gait and its response to slopes", "15 s")
 def gait_sensitivity(
     params: WheelParams,

@@ -29,7 +29,6 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.studies.lower_fidelity import ModelIndex, find_paper_gaits, select_wheels
 from vrw_jax.studies.measure_result import MeasureResult
@@ -129,7 +128,6 @@ GAIT_ERROR_FRACTION = 0.1
 MIN_PILOT_GAITS = 8
 
 
-@with_default_jax_settings
 @announce_wait("gaits of each model", "30 s")
 def multifidelity_mean(
     measure: str,

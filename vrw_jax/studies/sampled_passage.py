@@ -26,118 +26,88 @@ from vrw_jax.studies.failure_density import GaussianMixture, fit_failure_density
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
+MAX_BIASED_GROUND_LINES = 12
+"""Largest number of lines of the ground whose slopes are drawn with a bias.
 
-@dataclass(frozen=True)
-class PassageSamplingOptions:
-    """Numerical options for estimating first-passage times by sampled walks."""
+The value is chosen because fits in more dimensions need more samples.
+"""
+MIN_FAILURES_FOR_COUNTING = 0.35
+"""Expected number of failures over the lines that affect a state, above which failures are counted
+without bias.
 
-    n_walker_groups: int = 32
-    """Number of independent groups of walkers.
+The value is chosen because counting and importance sampling then need equally many steps.
+"""
+MAX_FORGETTING_STEPS = 100
+"""Largest number of gait steps after which walks from the gait begin to be sampled.
 
-    The value is chosen because the quantile for 99 % of Student's distribution is then within 7 %
-    of that of the normal distribution.
-    """
-    negligible_ground_line_effect: float = 0.01
-    """Relative effect of a line's slope below which the slope is drawn without bias.
+The value is chosen because gaits with slower decay are almost unstable.
+"""
+MAX_ROUNDS_FROM_GAIT = 40
+"""Largest number of rounds in which all walkers start on the gait.
 
-    A line joins two footholds. The effect is that on a later state, divided by that on the next
-    state. The result has no bias for any value. The value is chosen because likelihood ratios are
-    then similar.
-    """
-    max_biased_ground_lines: int = 12
-    """Largest number of lines of the ground whose slopes are drawn with a bias.
+The value is chosen because more rounds are needed only if most walks fail within three steps.
+"""
+N_KAPPA_2_STEPS = 4
+"""Smallest number of gait steps whose states before and after the step are used to estimate
+kappa_2.
 
-    The value is chosen because fits in more dimensions need more samples.
-    """
-    min_failures_for_counting: float = 0.35
-    """Expected number of failures over the lines that affect a state, above which failures are
-    counted without bias.
+If the effect of the start decays slowly, the second half of all steps is used.
+"""
+MIN_TRANSITIONS_PER_REGRESSOR = 25.0
+"""Smallest number of transitions per regressor in a regression on quadratic functions.
 
-    The value is chosen because counting and importance sampling then need equally many steps.
-    """
-    min_forgetting_steps: int = 6
-    """Smallest number of gait steps after which the effect of the start is considered to have
-    decayed.
-    """
-    max_forgetting_steps: int = 100
-    """Largest number of gait steps after which walks from the gait begin to be sampled.
+The value is chosen because the eigenvalues of a wheel with unilateral contact, which has 250
+quadratic regressors, then vary by a few hundredths. With 8 transitions per regressor, many
+eigenvalues exceed 1.
+"""
+MIN_SAMPLING_ROUNDS = 2
+"""Smallest number of rounds, each with one walk per walker.
 
-    The value is chosen because gaits with slower decay are almost unstable.
-    """
-    max_rounds_from_gait: int = 40
-    """Largest number of rounds in which all walkers start on the gait.
+The value is chosen because most wheels then pass the first error test.
+"""
+N_ROUNDS_SAFETY_FACTOR = 1.2
+"""Ratio of the number of rounds before the next error test to the number that is expected to
+suffice.
 
-    The value is chosen because more rounds are needed only if most walks fail within three steps.
-    """
-    n_kappa_2_steps: int = 4
-    """Smallest number of gait steps whose states before and after the step are used to estimate
-    kappa_2.
+The value is chosen because three of four wheels then pass the next error test.
+"""
+MIN_ROUND_COUNT_RATIO = 1.25
+"""Smallest ratio of the numbers of rounds at two successive error tests.
 
-    If the effect of the start decays slowly, the second half of all steps is used.
-    """
-    min_transitions_per_regressor: float = 25.0
-    """Smallest number of transitions per regressor in a regression on quadratic functions.
+The value is chosen because later error tests need wider confidence intervals.
+"""
+MAX_START_EFFECT_PER_TOL = 0.1
+"""Largest remaining fraction of the effect of the start, divided by the tolerance."""
+MIN_EFFECTIVE_FAILURE_FRACTION = 0.02
+"""Smallest accepted ratio of the effective number of failures to the number of failing walks.
 
-    The value is chosen because the eigenvalues of a wheel with unilateral contact, which has 250
-    quadratic regressors, then vary by a few hundredths. With 8 transitions per regressor, many
-    eigenvalues exceed 1.
-    """
-    min_sampling_rounds: int = 2
-    """Smallest number of rounds, each with one walk per walker.
+The value is chosen because it is a tenth of the usual ratio. A lower ratio means that the fit
+misses a part of the failures. Failures are then counted if they are frequent enough.
+"""
+N_FAILURE_CHECK_STEPS = 12
+"""Number of gait steps per walker whose failures are counted to check importance sampling.
 
-    The value is chosen because most wheels then pass the first error test.
-    """
-    n_rounds_safety_factor: float = 1.2
-    """Ratio of the number of rounds before the next error test to the number that is expected to
-    suffice.
+The value is chosen because these steps take a sixth of the computing time for a usual wheel.
+"""
+MIN_FAILURE_CHECK_PROBABILITY = 1e-4
+"""Smallest probability at which the number of counted failures is attributed to chance.
 
-    The value is chosen because three of four wheels then pass the next error test.
-    """
-    min_round_count_ratio: float = 1.25
-    """Smallest ratio of the numbers of rounds at two successive error tests.
+The value is chosen because a wrong alarm is then rare among some thousands of wheels.
+"""
+CONFIDENCE_LEVEL = 0.99
+"""Confidence level of the error estimate.
 
-    The value is chosen because later error tests need wider confidence intervals.
-    """
-    max_start_effect_per_tol: float = 0.1
-    """Largest remaining fraction of the effect of the start, divided by the tolerance."""
-    min_effective_failures: float = 100.0
-    """Smallest effective number of sampled failures for which an error is estimated.
+An error test compares the error with the tolerance. The probability that the interval of an error
+test misses the mean is a fraction of 1 - `CONFIDENCE_LEVEL`. The fractions of all error tests sum
+to 1, so that the level holds although the error decides when sampling ends.
+"""
+FIRST_ERROR_TEST_FRACTIONS = (0.45, 0.45)
+"""Fractions of the miss probability 1 - `CONFIDENCE_LEVEL` for the first two error tests.
 
-    The value is chosen because a few likelihood ratios dominate smaller samples. The spread of
-    these ratios is then no estimate of the error.
-    """
-    min_effective_failure_fraction: float = 0.02
-    """Smallest accepted ratio of the effective number of failures to the number of failing walks.
+Each later error test has half of the remaining fraction. The values are chosen because nearly all
+wheels pass one of the first two tests.
+"""
 
-    The value is chosen because it is a tenth of the usual ratio. A lower ratio means that the fit
-    misses a part of the failures. Failures are then counted if they are frequent enough.
-    """
-    n_failure_check_steps: int = 12
-    """Number of gait steps per walker whose failures are counted to check importance sampling.
-
-    The value is chosen because these steps take a sixth of the computing time for a usual wheel.
-    """
-    min_failure_check_probability: float = 1e-4
-    """Smallest probability at which the number of counted failures is attributed to chance.
-
-    The value is chosen because a wrong alarm is then rare among some thousands of wheels.
-    """
-    confidence_level: float = 0.99
-    """Confidence level of the error estimate.
-
-    An error test compares the error with the tolerance. The probability that the interval of an
-    error test misses the mean is a fraction of 1 - `confidence_level`. The fractions of all error
-    tests sum to 1, so that the level holds although the error decides when sampling ends.
-    """
-    first_error_test_fractions: tuple[float, ...] = (0.45, 0.45)
-    """Fractions of the miss probability 1 - `confidence_level` for the first two error tests.
-
-    Each later error test has half of the remaining fraction. The values are chosen because nearly
-    all wheels pass one of the first two tests.
-    """
-
-
-PASSAGE_SAMPLING_OPTIONS = PassageSamplingOptions()
 
 N_FIXED_POINT_ITERATIONS = 60
 """Number of fixed-point iterations for the failure probability, chosen because each iteration
@@ -200,7 +170,29 @@ class WalkerGroups:
     step_options: StepOptions
     n_walkers: int
     random: np.random.Generator
-    options: PassageSamplingOptions = PASSAGE_SAMPLING_OPTIONS
+    n_groups: int = 32
+    """Number of independent groups of walkers.
+
+    The value is chosen because the quantile for 99 % of Student's distribution is then within 7 %
+    of that of the normal distribution.
+    """
+    negligible_ground_line_effect: float = 0.01
+    """Relative effect of a line's slope below which the slope is drawn without bias.
+
+    A line joins two footholds. The effect is that on a later state, divided by that on the next
+    state. The result has no bias for any value. The value is chosen because likelihood ratios are
+    then similar.
+    """
+    min_forgetting_steps: int = 6
+    """Smallest number of gait steps after which the effect of the start is considered to have
+    decayed.
+    """
+    min_effective_failures: float = 100.0
+    """Smallest effective number of sampled failures for which an error is estimated.
+
+    The value is chosen because a few likelihood ratios dominate smaller samples. The spread of
+    these ratios is then no estimate of the error.
+    """
     sd_name: str = "slope_sd"  # or "height_sd"
 
     @property
@@ -209,7 +201,6 @@ class WalkerGroups:
         return self.sd_name == "height_sd"
 
     def __post_init__(self) -> None:
-        self.n_groups = self.options.n_walker_groups
         self.n_walkers_per_group = 1 << (-(-self.n_walkers // self.n_groups) - 1).bit_length()
         self.n_walkers = self.n_groups * self.n_walkers_per_group
         self.n_steps = 0
@@ -377,20 +368,19 @@ def sample_passage(
     Raises:
         ExtinctGroupError: if no walker of a group survives a step.
     """
-    options = walker_groups.options
     count_decay_steps = lambda remaining_start_effect, decay_factor: int(
         np.ceil(np.log(remaining_start_effect) / np.log(np.clip(decay_factor, 0.01, 0.99)))
     )
     n_biased_ground_lines = min(
-        count_decay_steps(options.negligible_ground_line_effect, spectral_radius),
-        options.max_biased_ground_lines,
+        count_decay_steps(walker_groups.negligible_ground_line_effect, spectral_radius),
+        MAX_BIASED_GROUND_LINES,
     )
-    max_start_effect = options.max_start_effect_per_tol * relative_tolerance
+    max_start_effect = MAX_START_EFFECT_PER_TOL * relative_tolerance
     n_forgetting_steps = int(
         np.clip(
             count_decay_steps(max_start_effect, spectral_radius),
-            options.min_forgetting_steps,
-            options.max_forgetting_steps,
+            walker_groups.min_forgetting_steps,
+            MAX_FORGETTING_STEPS,
         )
     )
     surviving_fractions, step_transitions = _step_until_start_is_forgotten(
@@ -398,9 +388,7 @@ def sample_passage(
     )
     while True:
         n_forgetting_steps = len(step_transitions)
-        late_transitions = step_transitions[
-            -max(options.n_kappa_2_steps, n_forgetting_steps // 2) :
-        ]
+        late_transitions = step_transitions[-max(N_KAPPA_2_STEPS, n_forgetting_steps // 2) :]
         kappa_1 = float(np.mean([transition.is_walker_alive for transition in late_transitions]))
         kappa_2 = _estimate_kappa_2(
             late_transitions,
@@ -413,7 +401,7 @@ def sample_passage(
         # The number of steps is at most doubled, because more transitions improve kappa_2.
         n_required_steps = min(
             n_decay_steps - n_biased_ground_lines,
-            options.max_forgetting_steps,
+            MAX_FORGETTING_STEPS,
             2 * n_forgetting_steps,
         )
         if n_required_steps <= n_forgetting_steps:
@@ -438,10 +426,10 @@ def sample_passage(
     )
     failure_probability, relative_error, start_effect = 0.0, np.inf, 0.0
     n_effective_lines = count_decay_steps(
-        options.negligible_ground_line_effect, start_effect_factor
+        walker_groups.negligible_ground_line_effect, start_effect_factor
     )
     n_failures_over_lines = n_effective_lines * np.mean(~step_transitions[-1].is_walker_alive)
-    are_failures_counted = n_failures_over_lines > options.min_failures_for_counting
+    are_failures_counted = n_failures_over_lines > MIN_FAILURES_FOR_COUNTING
     if not are_failures_counted:
         failure_density = fit_failure_density(
             lambda slope_deviations: walker_groups.run_walks(slope_deviations)[:2],
@@ -462,7 +450,8 @@ def sample_passage(
                 relative_error = np.inf
         n_expected_failures = failure_probability * (max_steps - walker_groups.n_steps)
         are_failures_counted = (
-            not np.isfinite(relative_error) and n_expected_failures > options.min_effective_failures
+            not np.isfinite(relative_error)
+            and n_expected_failures > walker_groups.min_effective_failures
         )
     if are_failures_counted:
         walker_groups.weight_by_outcome.clear()
@@ -530,8 +519,7 @@ def _estimate_failure_probability(
     """
     from scipy import stats  # This import is slow.
 
-    options = walker_groups.options
-    first_fractions = options.first_error_test_fractions
+    first_fractions = FIRST_ERROR_TEST_FRACTIONS
 
     def compute_student_t_quantile(error_test_number: int) -> float:
         n_later_tests = error_test_number - len(first_fractions)
@@ -540,7 +528,7 @@ def _estimate_failure_probability(
             if n_later_tests > 0
             else first_fractions[error_test_number - 1]
         )
-        miss_probability = (1.0 - options.confidence_level) * miss_fraction
+        miss_probability = (1.0 - CONFIDENCE_LEVEL) * miss_fraction
         return float(stats.t.isf(0.5 * miss_probability, walker_groups.n_groups - 1))
 
     weight_sum_by_group, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
@@ -548,12 +536,12 @@ def _estimate_failure_probability(
     failure_probability, relative_error = 0.0, np.inf
     start_effect_factor, n_steps_before_walks = start_effect_decay
     start_effect = start_effect_factor ** (n_steps_before_walks + n_ground_lines)
-    n_error_tests, n_rounds_at_error_test = 0, options.min_sampling_rounds
+    n_error_tests, n_rounds_at_error_test = 0, MIN_SAMPLING_ROUNDS
     while n_sampling_rounds == 0 or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
     ):
         while n_sampling_rounds < n_rounds_at_error_test and (
-            n_sampling_rounds < options.min_sampling_rounds or walker_groups.n_steps < max_steps
+            n_sampling_rounds < MIN_SAMPLING_ROUNDS or walker_groups.n_steps < max_steps
         ):
             report_progress(f"{walker_groups.n_walkers:,} walks of {walker_groups.n_steps:,} steps")
             if n_error_tests >= len(first_fractions):
@@ -575,9 +563,9 @@ def _estimate_failure_probability(
             last_step_failure_probability, n_ground_lines
         )
         n_effective_failures = failure_weight_sum**2 / squared_weight_sum
-        if n_effective_failures < (options.min_effective_failure_fraction * n_failing_walks):
+        if n_effective_failures < (MIN_EFFECTIVE_FAILURE_FRACTION * n_failing_walks):
             return failure_probability, np.inf, start_effect
-        if n_effective_failures < options.min_effective_failures:
+        if n_effective_failures < walker_groups.min_effective_failures:
             continue
         n_error_tests += 1
         relative_standard_error = (
@@ -610,8 +598,8 @@ def _estimate_failure_probability(
                 np.ceil(
                     n_sampling_rounds
                     * max(
-                        options.n_rounds_safety_factor * sampling_error_ratio**2,
-                        options.min_round_count_ratio,
+                        N_ROUNDS_SAFETY_FACTOR * sampling_error_ratio**2,
+                        MIN_ROUND_COUNT_RATIO,
                     )
                 )
             )
@@ -633,14 +621,13 @@ def _step_until_start_is_forgotten(
     """
     from scipy import stats  # This import is slow.
 
-    options = walker_groups.options
     max_relative_variance = (
-        relative_tolerance / stats.norm.isf(0.5 * (1.0 - options.confidence_level))
+        relative_tolerance / stats.norm.isf(0.5 * (1.0 - CONFIDENCE_LEVEL))
     ) ** 2
     fractions_by_round: list[np.ndarray] = []
     relative_variance_sum = 0.0
     while not fractions_by_round or (
-        len(fractions_by_round) < options.max_rounds_from_gait
+        len(fractions_by_round) < MAX_ROUNDS_FROM_GAIT
         and relative_variance_sum > max_relative_variance * len(fractions_by_round) ** 2
     ):
         walker_groups.restart_at_gait()
@@ -661,7 +648,7 @@ def _estimate_step_distance(
     """Return the mean distance of completed steps along the mean slope, and its error, m."""
     from scipy import stats  # This import is slow.
 
-    n_groups, options = walker_groups.n_groups, walker_groups.options
+    n_groups = walker_groups.n_groups
     distance_sums, n_completed = np.zeros((2, n_groups))
     for transition in step_transitions:
         is_alive = transition.is_walker_alive
@@ -671,7 +658,7 @@ def _estimate_step_distance(
         )
         distance_sums += distances.reshape(n_groups, -1).sum(1)
         n_completed += is_alive.reshape(n_groups, -1).sum(1)
-    quantile = stats.t.isf(0.5 * (1.0 - options.confidence_level), n_groups - 1)
+    quantile = stats.t.isf(0.5 * (1.0 - CONFIDENCE_LEVEL), n_groups - 1)
     group_means = distance_sums / n_completed
     return (
         float(np.sum(distance_sums) / np.sum(n_completed)),
@@ -689,19 +676,16 @@ def _has_missed_failures(walker_groups: WalkerGroups, max_failure_probability: f
     """
     from scipy import stats  # This import is slow.
 
-    options = walker_groups.options
     importance_weight_by_outcome = walker_groups.weight_by_outcome
-    n_failures_by_outcome = walker_groups.advance_without_counting(options.n_failure_check_steps)
-    max_failure_count = (
-        max_failure_probability * options.n_failure_check_steps * walker_groups.n_walkers
-    )
+    n_failures_by_outcome = walker_groups.advance_without_counting(N_FAILURE_CHECK_STEPS)
+    max_failure_count = max_failure_probability * N_FAILURE_CHECK_STEPS * walker_groups.n_walkers
     total_failure_weight = importance_weight_by_outcome.total()
     return any(
         stats.poisson.sf(
             n_failures - 1.0,
             max_failure_count * importance_weight_by_outcome[outcome_code] / total_failure_weight,
         )
-        < options.min_failure_check_probability
+        < MIN_FAILURE_CHECK_PROBABILITY
         for outcome_code, n_failures in n_failures_by_outcome.items()
     )
 
@@ -829,7 +813,7 @@ def _estimate_kappa_2(
             1,
         )
         if has_quadratic_features and len(regressor_matrix) < (
-            PASSAGE_SAMPLING_OPTIONS.min_transitions_per_regressor * regressor_matrix.shape[1]
+            MIN_TRANSITIONS_PER_REGRESSOR * regressor_matrix.shape[1]
         ):
             return np.nan
         state_features_after_step = np.where(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,25 +19,18 @@ from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND
 from vrw_jax.studies.store_integrity import read_scan_manifest
 from vrw_jax.wheel.outcomes import Outcome
 
-
-@dataclass(frozen=True)
-class SobolOptions:
-    """Numerical options for estimating Sobol' indices.
-
-    - `min_saltelli_rows`: smallest number of rows of a `saltelli` design, chosen because indices
-      from fewer rows are noise;
-    - `n_bootstrap_resamples`: number of bootstrap resamples of the rows;
-    - `confidence_interval_quantiles`: quantiles that bound the confidence interval, chosen for 95
-      %;
-    - `max_roundoff_spread`: largest spread of a measure that counts as round-off, as a fraction of
-      its largest magnitude. The value is chosen because round-off in the parameters causes spreads
-      of 4e-14 in measures and 5e-12 in margins.
-    """
-
-    min_saltelli_rows: int = 64
-    n_bootstrap_resamples: int = 200
-    confidence_interval_quantiles: tuple[float, float] = (0.025, 0.975)
-    max_roundoff_spread: float = 1e-11
+MIN_SALTELLI_ROWS = 64
+"""Smallest number of rows of a `saltelli` design, chosen because indices from fewer rows are noise.
+"""
+N_BOOTSTRAP_RESAMPLES = 200
+"""Number of bootstrap resamples of the rows."""
+CONFIDENCE_INTERVAL_QUANTILES = (0.025, 0.975)
+"""Quantiles that bound the confidence interval, chosen for 95 %."""
+MAX_ROUNDOFF_SPREAD = 1e-11
+"""Largest spread of a measure that counts as round-off, as a fraction of its largest magnitude. The
+value is chosen because round-off in the parameters causes spreads of 4e-14 in measures and 5e-12
+in margins.
+"""
 
 
 def sobol_indices(
@@ -98,7 +90,6 @@ def sobol_indices(
                 f"scan{format_name_suggestion(measure_name, map(str, scan))}: ask for one that was "
                 "scanned."
             )
-    sobol_options = SobolOptions()
     sample_positions = _locate_design_samples(scan, swept_parameters, design_settings["shape"][0])
     is_present = sample_positions >= 0
     has_gait = is_present & (scan.outcome.values[sample_positions] == Outcome.STEPPED)
@@ -118,11 +109,11 @@ def sobol_indices(
         for reason, n_missing in missing_sample_counts.items()
         if n_missing
     )
-    if n_saltelli_rows < sobol_options.min_saltelli_rows:
+    if n_saltelli_rows < MIN_SALTELLI_ROWS:
         samples_note = f" (samples: {missing_samples_text})" if missing_samples_text else ""
         raise ValueError(
             f"only {len(complete_rows)} of {len(is_complete_row)} rows walk "
-            f"throughout{samples_note}, but indices need {sobol_options.min_saltelli_rows}: narrow "
+            f"throughout{samples_note}, but indices need {MIN_SALTELLI_ROWS}: narrow "
             "the ranges to where there are gaits, or take more rows."
         )
     if missing_samples_text:
@@ -134,17 +125,17 @@ def sobol_indices(
     measure_values = measure_values[..., complete_rows[:n_saltelli_rows]]
 
     random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
-    roundoff_spreads = sobol_options.max_roundoff_spread * np.abs(measure_values).max(axis=(0, 2))
+    roundoff_spreads = MAX_ROUNDOFF_SPREAD * np.abs(measure_values).max(axis=(0, 2))
     sobol_index_estimates = _estimate_sobol_indices(measure_values, roundoff_spreads)
     resampled_index_estimates = [
         _estimate_sobol_indices(
             measure_values[..., random_generator.integers(0, n_saltelli_rows, n_saltelli_rows)],
             roundoff_spreads,
         )
-        for _ in range(sobol_options.n_bootstrap_resamples)
+        for _ in range(N_BOOTSTRAP_RESAMPLES)
     ]
     lower_bounds, upper_bounds = np.quantile(
-        resampled_index_estimates, sobol_options.confidence_interval_quantiles, axis=0
+        resampled_index_estimates, CONFIDENCE_INTERVAL_QUANTILES, axis=0
     )
     is_constant_measure = _detect_constant_measures(measure_values, roundoff_spreads)
     if is_constant_measure.any():

@@ -16,7 +16,6 @@ from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.models.stepping import ModelLike
 from vrw_jax.studies.gait_arrival import StableGait, walk_until_on_gait
@@ -89,7 +88,6 @@ class SmallestDisturbance(AbstractPrintable):
         ]
 
 
-@with_default_jax_settings
 @announce_wait("gaits, walks and derivatives", "20 s")
 def smallest_disturbance(
     params: WheelParams,

@@ -31,7 +31,6 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.gait_search import GaitChoice, parse_gait_choice
 from vrw_jax.gaits.gait_walks import compute_walk_starts
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.studies.lower_fidelity import (
     LowerFidelityGaits,
     ModelIndex,
@@ -63,7 +62,6 @@ from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, convert_friction
 MIN_TOL_FOR_TIGHT_STEPS = 1e-7
 
 
-@with_default_jax_settings
 @announce_wait("gait steps of each model", "30 s")
 def measure_to_tolerance(
     measures: str | Sequence[str],

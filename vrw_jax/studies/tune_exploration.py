@@ -5,7 +5,6 @@ the best start. If a trial has no gait, the parameters of its start do not chang
 is halved.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -15,28 +14,16 @@ from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
 from vrw_jax.studies.tune_maximization import TrialEvaluator
 from vrw_jax.studies.tune_objective import compute_max_violation, compute_slack_scales
 
-
-@dataclass(frozen=True)
-class ExplorationOptions:
-    """Options of the exploration of many starts.
-
-    - `n_first_order_steps`: number of first-order optimizer steps;
-    - `first_optimizer_step_length`: length of Adam's first step, in widths between the bounds;
-    - `gradient_decay`, `squared_gradient_decay`: decay rates of Adam's running averages of the
-      gradient and of the squared gradient;
-    - `penalty_weight`: penalty on a violation of one width between the bounds, in units of the
-      objective.
-    """
-
-    n_first_order_steps: int = 25
-    first_optimizer_step_length: float = 0.06
-    gradient_decay: float = 0.7
-    squared_gradient_decay: float = 0.9
-    penalty_weight: float = 4.0
-
-
-EXPLORATION_OPTIONS = ExplorationOptions()
-"""Options of the exploration that `vrw.tune` uses."""
+N_FIRST_ORDER_STEPS = 25
+"""Number of first-order optimizer steps."""
+FIRST_OPTIMIZER_STEP_LENGTH = 0.06
+"""Length of Adam's first step, in widths between the bounds."""
+GRADIENT_DECAY = 0.7
+"""Decay rate of Adam's running average of the gradient."""
+SQUARED_GRADIENT_DECAY = 0.9
+"""Decay rate of Adam's running average of the squared gradient."""
+PENALTY_WEIGHT = 4.0
+"""Penalty on a violation of one width between the bounds, in units of the objective."""
 
 
 class ExplorationResult(NamedTuple):
@@ -88,18 +75,16 @@ def explore_starts(
         np.linalg.norm(current_trials.objective_gradient[has_active_gait], axis=1)
     )
     objective_gradient_norm = objective_gradient_norm or 1.0  # if the objective is constant
-    optimizer_step_lengths = np.full((n_starts, 1), EXPLORATION_OPTIONS.first_optimizer_step_length)
-    optimizer = optax.scale_by_adam(
-        b1=EXPLORATION_OPTIONS.gradient_decay, b2=EXPLORATION_OPTIONS.squared_gradient_decay
-    )
+    optimizer_step_lengths = np.full((n_starts, 1), FIRST_OPTIMIZER_STEP_LENGTH)
+    optimizer = optax.scale_by_adam(b1=GRADIENT_DECAY, b2=SQUARED_GRADIENT_DECAY)
     optimizer_state = optimizer.init(jnp.asarray(normalized_starts))
     constraint_multipliers = np.zeros((n_starts, len(slack_scales)))
     n_lost_trials = np.zeros(n_starts, int)
-    for step_index in range(EXPLORATION_OPTIONS.n_first_order_steps):
+    for step_index in range(N_FIRST_ORDER_STEPS):
         penalty_weights = np.maximum(
             0.0,
             constraint_multipliers
-            - EXPLORATION_OPTIONS.penalty_weight * current_trials.constraint_slacks / slack_scales,
+            - PENALTY_WEIGHT * current_trials.constraint_slacks / slack_scales,
         )
         constraint_multipliers = np.where(
             has_active_gait[:, None], penalty_weights, constraint_multipliers
@@ -116,9 +101,7 @@ def explore_starts(
             jnp.asarray(ascent_direction), optimizer_state
         )
         trial_step_lengths = (
-            optimizer_step_lengths
-            * 0.5
-            * (1.0 + np.cos(np.pi * step_index / EXPLORATION_OPTIONS.n_first_order_steps))
+            optimizer_step_lengths * 0.5 * (1.0 + np.cos(np.pi * step_index / N_FIRST_ORDER_STEPS))
         )
         trial_parameters = np.clip(
             current_trials.normalized_parameters + trial_step_lengths * np.asarray(adam_update),
@@ -137,11 +120,8 @@ def explore_starts(
         )
     end_objectives = np.where(has_active_gait, current_trials.objective, np.nan)
     max_violations = compute_max_violation(current_trials.constraint_slacks, slack_scales)
-    penalized_objectives = (
-        end_objectives
-        - EXPLORATION_OPTIONS.penalty_weight * np.abs(end_objectives) * max_violations
-    )
-    n_evaluations = n_starts * (EXPLORATION_OPTIONS.n_first_order_steps + 1)
+    penalized_objectives = end_objectives - PENALTY_WEIGHT * np.abs(end_objectives) * max_violations
+    n_evaluations = n_starts * (N_FIRST_ORDER_STEPS + 1)
     return ExplorationResult(
         normalized_starts,
         current_trials.normalized_parameters,

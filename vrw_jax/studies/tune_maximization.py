@@ -14,7 +14,6 @@ each step maximizes the linear model from the values and gradients of all nearby
 import enum
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,47 +113,44 @@ class _SlowConvergenceError(Exception):
     """Exception that signals that SLSQP has used its evaluations, as it does at kinks."""
 
 
-@dataclass(frozen=True)
-class MaximizationOptions:
-    """Options of the maximization. Lengths are in widths between the bounds.
-
-    - `full_trust_box_radius`: half the side of the largest box, chosen because that box contains
-      all bounds from any center;
-    - `min_trust_box_radius`: half the side of a box so small that the branch is considered to end
-      there;
-    - `coarse_objective_tolerance`: relative change of the objective at which SLSQP stops in a box
-      smaller than the largest, chosen because another search continues from the result;
-    - `fine_objective_tolerance`: relative change of the objective at which SLSQP stops in the
-      largest box, chosen because the objective of a gait is not more accurate;
-    - `active_bound_tolerance`: relative slack below which a constraint is treated as active;
-    - `max_smooth_kkt_residual`: largest residual of the first-order condition at the end of SLSQP,
-      chosen because SLSQP leaves less than a tenth of it at smooth optima, and more at kinks;
-    - `max_slsqp_evaluations`: evaluations of one run of SLSQP. It needs about 20 at smooth optima;
-    - `cutting_plane_box_radius`: largest half side of the box of the cutting planes;
-    - `violation_penalty`: loss of objective per violation, in units of its largest gradient. It
-      must exceed the multipliers, and a larger number only loses digits;
-    - `max_piece_distance`: distance from the optimum within which gradients are compared;
-    - `min_gradient_jump`: relative difference of two gradients at a kink. It is a hundred times
-      the difference that a smooth function has over `max_piece_distance`;
-    - `price_accuracy`: relative width of a price's range below which the price is unique.
-    """
-
-    full_trust_box_radius: float = 1.0
-    min_trust_box_radius: float = 1e-7
-    coarse_objective_tolerance: float = 1e-3
-    fine_objective_tolerance: float = 1e-10
-    active_bound_tolerance: float = 1e-6
-    max_smooth_kkt_residual: float = 1e-3
-    max_slsqp_evaluations: int = 40
-    cutting_plane_box_radius: float = 0.1
-    violation_penalty: float = 1e3
-    max_piece_distance: float = 1e-4
-    min_gradient_jump: float = 1e-2
-    price_accuracy: float = 1e-2
-
-
-MAXIMIZATION_OPTIONS = MaximizationOptions()
-"""Options of the maximization that `vrw.tune` uses."""
+FULL_TRUST_BOX_RADIUS = 1.0
+"""Half the side of the largest box, in widths between the bounds, chosen because that box contains
+all bounds from any center.
+"""
+MIN_TRUST_BOX_RADIUS = 1e-7
+"""Half the side of a box so small that the branch is considered to end there, in widths between the
+bounds.
+"""
+COARSE_OBJECTIVE_TOLERANCE = 1e-3
+"""Relative change of the objective at which SLSQP stops in a box smaller than the largest, chosen
+because another search continues from the result.
+"""
+FINE_OBJECTIVE_TOLERANCE = 1e-10
+"""Relative change of the objective at which SLSQP stops in the largest box, chosen because the
+objective of a gait is not more accurate.
+"""
+ACTIVE_BOUND_TOLERANCE = 1e-6
+"""Relative slack below which a constraint is treated as active."""
+MAX_SMOOTH_KKT_RESIDUAL = 1e-3
+"""Largest residual of the first-order condition at the end of SLSQP, chosen because SLSQP leaves
+less than a tenth of it at smooth optima, and more at kinks.
+"""
+MAX_SLSQP_EVALUATIONS = 40
+"""Evaluations of one run of SLSQP. It needs about 20 at smooth optima."""
+CUTTING_PLANE_BOX_RADIUS = 0.1
+"""Largest half side of the box of the cutting planes, in widths between the bounds."""
+VIOLATION_PENALTY = 1e3
+"""Loss of objective per violation, in units of its largest gradient. It must exceed the
+multipliers, and a larger number only loses digits.
+"""
+MAX_PIECE_DISTANCE = 1e-4
+"""Distance from the optimum within which gradients are compared, in widths between the bounds."""
+MIN_GRADIENT_JUMP = 1e-2
+"""Relative difference of two gradients at a kink. It is a hundred times the difference that a
+smooth function has over `MAX_PIECE_DISTANCE`.
+"""
+PRICE_ACCURACY = 1e-2
+"""Relative width of a price's range below which the price is unique."""
 
 TrialEvaluator = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
 """Function that evaluates the trial with given normalized parameters. If a neighboring trial is
@@ -247,7 +243,7 @@ def maximize_objective(
     compute_violation_of = lambda trial: compute_max_violation(
         trial.constraint_slacks, slack_scales
     )
-    active_bound_tolerance = MAXIMIZATION_OPTIONS.active_bound_tolerance
+    active_bound_tolerance = ACTIVE_BOUND_TOLERANCE
 
     def record_iterate(trial_parameters: np.ndarray) -> None:
         """Record an iterate of the present box, and stop if it is an optimum."""
@@ -262,7 +258,7 @@ def maximize_objective(
     def evaluate_loss(trial_parameters: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the function that SLSQP minimizes, and its gradient."""
         n_box_trials = len(trial_record.trials) - n_trials_before_trust_box
-        if n_box_trials > MAXIMIZATION_OPTIONS.max_slsqp_evaluations:
+        if n_box_trials > MAX_SLSQP_EVALUATIONS:
             raise _SlowConvergenceError
         trial = trial_record.evaluate_trial_once(trial_parameters)
         return -trial.objective / gradient_norm, -trial.objective_gradient / gradient_norm
@@ -285,7 +281,7 @@ def maximize_objective(
         ),
     }
     center_trial = start_trial
-    trust_box_radius = max_trust_box_radius = MAXIMIZATION_OPTIONS.full_trust_box_radius
+    trust_box_radius = max_trust_box_radius = FULL_TRUST_BOX_RADIUS
     tune_status, n_trials_before_trust_box = TuneStatus.CONVERGED, 0
     while True:
         # If this box had no new evaluation, the next box is smaller, because the search would be
@@ -294,7 +290,7 @@ def maximize_objective(
             max_trust_box_radius *= 0.5
         n_trials_before_trust_box = len(trial_record.trials)
         trust_box_radius = min(trust_box_radius, max_trust_box_radius)
-        if trust_box_radius < MAXIMIZATION_OPTIONS.min_trust_box_radius:
+        if trust_box_radius < MIN_TRUST_BOX_RADIUS:
             tune_status = TuneStatus.BRANCH_ENDED
             break
         lower_trust_box_side = np.maximum(
@@ -313,9 +309,9 @@ def maximize_objective(
                 constraints=slack_constraints,
                 method="SLSQP",
                 options={
-                    "ftol": MAXIMIZATION_OPTIONS.fine_objective_tolerance
+                    "ftol": FINE_OBJECTIVE_TOLERANCE
                     if trust_box_radius >= max_trust_box_radius
-                    else MAXIMIZATION_OPTIONS.coarse_objective_tolerance,
+                    else COARSE_OBJECTIVE_TOLERANCE,
                     "maxiter": 100,
                 },
                 callback=record_iterate,
@@ -346,12 +342,12 @@ def maximize_objective(
             end_trial.normalized_parameters >= upper_trust_box_side - 1e-9
         ) & (upper_trust_box_side < 1.0)
         center_trial = end_trial
-        if trust_box_radius >= MAXIMIZATION_OPTIONS.full_trust_box_radius:
+        if trust_box_radius >= FULL_TRUST_BOX_RADIUS:
             break
         trust_box_radius = (
-            min(2.0 * trust_box_radius, MAXIMIZATION_OPTIONS.full_trust_box_radius)
+            min(2.0 * trust_box_radius, FULL_TRUST_BOX_RADIUS)
             if has_reached_inner_box_side.any()
-            else MAXIMIZATION_OPTIONS.full_trust_box_radius
+            else FULL_TRUST_BOX_RADIUS
         )
     if (
         tune_status == TuneStatus.CONVERGED
@@ -394,19 +390,18 @@ def _maximize_by_cutting_planes(
     A step without a gain shrinks the box, and its trial improves the model. The method is that of
     bundles with a trust region (Kiwiel, Methods of Descent for Nondifferentiable Optimization).
     """
-    options, gradient_norm = MAXIMIZATION_OPTIONS, trial_record.gradient_norm
+    gradient_norm = trial_record.gradient_norm
 
     def compute_merit(trial: EvaluatedTrial) -> float:
         return float(
             trial.objective / gradient_norm
-            - options.violation_penalty
-            * compute_max_violation(trial.constraint_slacks, slack_scales)
+            - VIOLATION_PENALTY * compute_max_violation(trial.constraint_slacks, slack_scales)
         )
 
-    trust_box_radius = options.cutting_plane_box_radius
+    trust_box_radius = CUTTING_PLANE_BOX_RADIUS
     center_trial, is_box_lost = max(trial_record.usable_trials, key=compute_merit), False
     n_null_steps = 0
-    while trust_box_radius >= options.min_trust_box_radius:
+    while trust_box_radius >= MIN_TRUST_BOX_RADIUS:
         model_step, predicted_gain = _maximize_linear_model(
             center_trial, trial_record.usable_trials, trust_box_radius, gradient_norm, slack_scales
         )
@@ -430,7 +425,7 @@ def _maximize_by_cutting_planes(
         if n_null_steps > len(model_step):
             trust_box_radius, n_null_steps = 0.5 * trust_box_radius, 0
         elif gain > 0.75 * predicted_gain:
-            trust_box_radius = min(2.0 * trust_box_radius, options.cutting_plane_box_radius)
+            trust_box_radius = min(2.0 * trust_box_radius, CUTTING_PLANE_BOX_RADIUS)
     return center_trial, TuneStatus.BRANCH_ENDED if is_box_lost else TuneStatus.CONVERGED
 
 
@@ -469,7 +464,7 @@ def _maximize_linear_model(
         ):
             rows.append(np.r_[-slack_gradient / slack_scale, 0.0, -1.0])
             right_hand_sides.append(slack / slack_scale)
-    penalty = MAXIMIZATION_OPTIONS.violation_penalty
+    penalty = VIOLATION_PENALTY
     lower_sides = np.maximum(-center, -trust_box_radius)
     upper_sides = np.minimum(1.0 - center, trust_box_radius)
     # The unknowns are the step, the gain of the objective, and the largest violation.
@@ -499,7 +494,7 @@ class OptimalityConditions(NamedTuple):
     @property
     def are_satisfied(self) -> bool:
         """Return whether the residual is as small as at an optimum, so that prices are defined."""
-        return self.kkt_residual <= MAXIMIZATION_OPTIONS.max_smooth_kkt_residual
+        return self.kkt_residual <= MAX_SMOOTH_KKT_RESIDUAL
 
 
 def compute_optimality_conditions(
@@ -515,7 +510,7 @@ def compute_optimality_conditions(
 
     parameters, n_free = trial.normalized_parameters, trial.normalized_parameters.size
     slack_scales = compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian)
-    tolerance = MAXIMIZATION_OPTIONS.active_bound_tolerance
+    tolerance = ACTIVE_BOUND_TOLERANCE
     gradient_norm = max(map(_compute_gradient_norm, evaluated_trials))
     objective_pieces, *constraint_pieces = _collect_gradient_pieces(
         trial, evaluated_trials, np.r_[gradient_norm, slack_scales]
@@ -563,7 +558,7 @@ def compute_optimality_conditions(
                 [1.0],
             )
             price_ranges[limit_index, end] = np.inf if solution.x is None else sign * solution.fun
-    is_unique = np.diff(price_ranges)[:, 0] <= MAXIMIZATION_OPTIONS.price_accuracy * prices
+    is_unique = np.diff(price_ranges)[:, 0] <= PRICE_ACCURACY * prices
     price_ranges[is_unique] = prices[is_unique, None]
     price_ranges[price_ranges[:, 1] <= tolerance] = 0.0  # round-off of limits that hold nothing
     price_units = gradient_norm / np.r_[slack_scales, np.ones(2 * n_free)]
@@ -583,14 +578,13 @@ def _collect_gradient_pieces(
 
     - `scales`: scales of the objective and of the constraints.
     """
-    options = MAXIMIZATION_OPTIONS
     collect_values = lambda trial: np.r_[trial.objective, trial.constraint_slacks]
     collect_gradients = lambda trial: np.vstack([trial.objective_gradient, trial.slack_jacobian])
     compute_changes = lambda other: trial.normalized_parameters - other.normalized_parameters
     compute_distance = lambda other: float(np.max(np.abs(compute_changes(other))))
     pieces = [[gradient] for gradient in collect_gradients(trial)]
     for neighbor in sorted(evaluated_trials, key=compute_distance):
-        if compute_distance(neighbor) > options.max_piece_distance:
+        if compute_distance(neighbor) > MAX_PIECE_DISTANCE:
             break
         gradients = collect_gradients(neighbor)
         # The value of a tied instant, extrapolated to the trial, equals that of the trial.
@@ -602,8 +596,8 @@ def _collect_gradient_pieces(
         ):
             gradient_jump = min(np.linalg.norm(gradient - piece) for piece in function_pieces)
             if (
-                abs(value_gap) <= 10.0 * options.active_bound_tolerance * scale
-                and gradient_jump > options.min_gradient_jump * scale
+                abs(value_gap) <= 10.0 * ACTIVE_BOUND_TOLERANCE * scale
+                and gradient_jump > MIN_GRADIENT_JUMP * scale
             ):
                 function_pieces.append(gradient)
     return pieces

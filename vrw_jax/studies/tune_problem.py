@@ -42,7 +42,6 @@ from vrw_jax.gaits.finder import (
 from vrw_jax.gaits.finder_selection import make_finder, resolve_model
 from vrw_jax.gaits.margin_defaults import default_margins
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     MEASURES,
@@ -96,31 +95,20 @@ ParameterBounds = Mapping[str, tuple[float, float]]
 ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array] | WheelObjective
 
 
-@dataclasses.dataclass(frozen=True)
-class WalkValidationOptions:
-    """Options of the walk that validates a tuned wheel.
-
-    - `n_steps_of_walk`: number of walking steps;
-    - `relative_start_displacement`: relative displacement of the start from the limit cycle;
-    - `constraint_value_tolerance`: accepted violation of a constraint, as a fraction of its value.
-      This tolerance and the next are chosen because of two effects. The optimum satisfies a
-      constraint within 1e-6 of its change between the bounds, and the start is displaced. Each
-      effect is some thousandths of a take-off margin;
-    - `default_margin_tolerance`: accepted violation, as a fraction of the constraint's default
-      margin.
-    """
-
-    n_steps_of_walk: int = 10
-    relative_start_displacement: float = 1e-5
-    constraint_value_tolerance: float = 1e-3
-    default_margin_tolerance: float = 1e-2
+N_STEPS_OF_WALK = 10
+"""Number of steps of the walk that validates a tuned wheel."""
+RELATIVE_START_DISPLACEMENT = 1e-5
+"""Relative displacement of the start from the limit cycle."""
+CONSTRAINT_VALUE_TOLERANCE = 1e-3
+"""Accepted violation of a constraint, as a fraction of its value. This tolerance and the next are
+chosen because of two effects. The optimum satisfies a constraint within 1e-6 of its change
+between the bounds, and the start is displaced. Each effect is some thousandths of a take-off
+margin.
+"""
+DEFAULT_MARGIN_TOLERANCE = 1e-2
+"""Accepted violation, as a fraction of the constraint's default margin."""
 
 
-WALK_VALIDATION_OPTIONS = WalkValidationOptions()
-"""Options of all walks that validate tuned wheels."""
-
-
-@with_default_jax_settings
 @announce_wait("the gait, objective and constraints with derivatives", "25 s")
 def tune(
     params: WheelParams,
@@ -497,13 +485,12 @@ class TuneProblem:
         """Simulate a walk that starts near the section state of the gait, and return its
         validation.
         """
-        options = WALK_VALIDATION_OPTIONS
         cycle_section_state = np.array(gait.cycle.section_state)
         # The state is scaled down, not up, because no leg may be beyond its stopper.
-        section_state = cycle_section_state * (1.0 - options.relative_start_displacement)
+        section_state = cycle_section_state * (1.0 - RELATIVE_START_DISPLACEMENT)
         is_gait_feasible, walk_outcome, n_steps_walked = True, Outcome.STEPPED, 0
         default_margins_by_name = default_margins(params)
-        for _ in range(options.n_steps_of_walk):
+        for _ in range(N_STEPS_OF_WALK):
             step_result = self.gait_finder.take_gait_step(params, jnp.asarray(section_state))
             walk_outcome = Outcome(int(step_result.outcome))
             if walk_outcome != Outcome.STEPPED:
@@ -519,8 +506,8 @@ class TuneProblem:
                     constraint_value = -constraint_value
                 default_margin = abs(default_margins_by_name.get(constraint_name, 0.0))
                 violation_tolerance = (
-                    options.constraint_value_tolerance * np.max(np.abs(constraint_value))
-                    + options.default_margin_tolerance * default_margin
+                    CONSTRAINT_VALUE_TOLERANCE * np.max(np.abs(constraint_value))
+                    + DEFAULT_MARGIN_TOLERANCE * default_margin
                 )
                 is_gait_feasible &= bool(
                     np.all(constraint_value >= min_constraint_value - violation_tolerance)
