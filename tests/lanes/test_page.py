@@ -8,12 +8,11 @@ from vrw_jax import lanes
 PAGE = (Path(__file__).parents[2] / "docs" / "developer" / "machine_code.md").read_text()
 
 
-def test_the_page_has_the_table_of_primitives():
-    table = PAGE.split("## Primitives")[1].strip().split("\n\n")[0]
-    rows = [row.strip("| ").split(" | ") for row in table.splitlines()[2:]]
-    result_by_name = {name: does for names, does in rows for name in re.findall("`(.+?)`", names)}
-    assert result_by_name == lanes.describe_supported_primitives()
-    assert all(result_by_name.values())
+def test_the_page_lists_all_primitives_and_each_has_a_description():
+    listed_names = PAGE.split("## Primitives")[1].strip().split("\n\n")[1]
+    descriptions = lanes.describe_supported_primitives()
+    assert re.findall("`(.+?)`", listed_names) == sorted(descriptions)
+    assert all(descriptions.values())
 
 
 def test_the_example_of_the_simd_page_runs():

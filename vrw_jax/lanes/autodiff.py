@@ -32,8 +32,7 @@ derivatives).
 def enable_all_ad_modes(
     function: ForwardFunction,
     function_to_differentiate: ForwardFunction | None = None,
-    make_jacobian: Callable[[tuple[int, ...]], ForwardFunction] | None = None,
-    compile_jacobian: Callable[[ForwardFunction, tuple], ForwardFunction] | None = None,
+    compile_jacobian: Callable[[ForwardFunction, tuple], ForwardFunction] = lambda f, _: f,
     differentiated_arguments: tuple[tuple[int, ...], ...] = (),
 ) -> ForwardFunction:
     """Return `function` with derivatives in forward and reverse mode, to any order.
@@ -41,10 +40,10 @@ def enable_all_ad_modes(
     All arguments of `function` must be floating-point arrays. `jax.jvp` must be able to
     differentiate it to the requested order, and its closure must not contain values that are
     differentiated. If `function_to_differentiate` is given, derivatives are those of this function,
-    which may for example use tighter tolerances. `make_jacobian(argnums)` may provide another
-    function that returns (Jacobians with respect to the arguments `argnums`, float outputs), and
-    the other outputs. `compile_jacobian` compiles Jacobians of any order; its second argument are
-    the `argnums` of each order. Function and Jacobians are compiled once each: outside of `jit`,
+    which may for example use tighter tolerances. `compile_jacobian` compiles Jacobians of any
+    order, or replaces them by other functions; its second argument are the `argnums` of each order.
+    A Jacobian returns (Jacobians with respect to the arguments `argnums`, float outputs), and the
+    other outputs. Function and Jacobians are compiled once each: outside of `jit`,
     forward mode, reverse mode and single directions all call the same compiled Jacobian.
 
     - `differentiated_arguments`: `argnums` of the orders that `function` already has.
@@ -65,17 +64,13 @@ def enable_all_ad_modes(
             )
             return (argument_jacobians, float_outputs), nonfloat_outputs
 
-        if compile_jacobian is not None:
-            argnums_by_order = (*differentiated_arguments, argnums)
-            return enable_all_ad_modes(
-                compile_jacobian(compute_argument_jacobians, argnums_by_order),
-                compute_argument_jacobians,
-                compile_jacobian=compile_jacobian,
-                differentiated_arguments=argnums_by_order,
-            )
-        if make_jacobian is None:
-            return enable_all_ad_modes(compute_argument_jacobians)
-        return enable_all_ad_modes(make_jacobian(argnums), compute_argument_jacobians)
+        argnums_by_order = (*differentiated_arguments, argnums)
+        return enable_all_ad_modes(
+            compile_jacobian(compute_argument_jacobians, argnums_by_order),
+            compute_argument_jacobians,
+            compile_jacobian,
+            argnums_by_order,
+        )
 
     @with_default_jax_settings
     def compute_function_jvp(primals: tuple, tangents: tuple) -> tuple:
@@ -128,8 +123,10 @@ def differentiate(
 
     @functools.cache
     def differentiate_leaf_function(structure: Any) -> ForwardFunction:
-        def make_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
-            assert make_column_function is not None
+        def compile_jacobian(jacobian: ForwardFunction, argnums_by_order: tuple) -> ForwardFunction:
+            if make_column_function is None or len(argnums_by_order) > 1:
+                return jacobian
+            (argnums,) = argnums_by_order
             compute_columns = make_column_function(structure, argnums)
 
             def compute_jacobian(*leaves: Array) -> tuple:
@@ -142,7 +139,7 @@ def differentiate(
         return enable_all_ad_modes(
             make_leaf_function(function, structure),
             make_leaf_function(reference, structure),
-            make_column_function and make_jacobian,
+            compile_jacobian,
         )
 
     def call_differentiable_function(*arguments: PyTree) -> PyTree:

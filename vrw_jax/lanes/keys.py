@@ -149,15 +149,6 @@ def make_key_with_origin(*values: Any) -> tuple[str, bool]:
     return digester.hasher.hexdigest(), not digester.reaches_user_code
 
 
-@dataclasses.dataclass(frozen=True)
-class Placeholder:
-    """A number of a closure that is an argument of the compiled function."""
-
-    shape: tuple[int, ...]
-    dtype: str
-    is_weakly_typed: bool
-
-
 def lift_numbers(function: Callable) -> tuple[list[Any], Callable[[Sequence[Any]], Callable]]:
     """Return the numbers in the closure of a user's function, and how to replace them.
 
@@ -202,10 +193,10 @@ def lift_numbers(function: Callable) -> tuple[list[Any], Callable[[Sequence[Any]
     return numbers, rebuild
 
 
-def make_placeholder(number: Any) -> Placeholder:
-    """Return the placeholder that stands for a number in a key."""
+def make_placeholder(number: Any) -> tuple:
+    """Return what stands in a key for a number that is an argument of the compiled function."""
     aval = jax.typeof(number)
-    return Placeholder(aval.shape, aval.dtype.name, aval.weak_type)
+    return "argument", aval.shape, aval.dtype.name, aval.weak_type
 
 
 def _is_number(value: Any) -> bool:

@@ -10,7 +10,7 @@ Wheels whose steps need similar work are neighbors in the batch.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -298,7 +298,7 @@ def _step_batch_without_contact(
     engine_by_solver = {SolverIndex.REQUESTED_SOLVER: select_engine(requested_engine, options)}
     solver_indices = np.full(n_wheels, SolverIndex.REQUESTED_SOLVER, np.int32)
     solver_names: tuple[str, ...] = (options.solver,)
-    engine_name = engine_by_solver[SolverIndex.REQUESTED_SOLVER].engine_name
+    engine_name, _ = engine_by_solver[SolverIndex.REQUESTED_SOLVER]
     if requested_engine == "auto" and engine_name == "lanes":
         solver_names = (options.solver, STABLE_SOLVER_NAME, IMPLICIT_SOLVER_NAME)
         solver_indices = select_cheapest_solver(
@@ -318,7 +318,7 @@ def _step_batch_without_contact(
         active_lanes = walk_batch.find_walking_lanes()
         if is_ground_uneven:
             parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
-        for solver_index, selected_engine in engine_by_solver.items():
+        for solver_index, (_, take_lane_steps) in engine_by_solver.items():
             lane_indices = active_lanes[solver_indices[active_lanes] == solver_index]
             if not len(lane_indices):
                 continue
@@ -329,7 +329,7 @@ def _step_batch_without_contact(
                 ground_inputs = (ground_slopes[k + 1][lanes],)
             elif rises is not None:
                 ground_inputs = rises[k][lanes], rises[k + 1][lanes]
-            step_outputs = selected_engine.take_lane_steps(*lane_inputs, *ground_inputs)
+            step_outputs = take_lane_steps(*lane_inputs, *ground_inputs)
             if solver_index == SolverIndex.STABLE_SOLVER:
                 # A phase may last longer than `select_cheapest_solver` assumes. The implicit
                 # solver, which is next, then repeats the step.
@@ -367,19 +367,13 @@ def order_wheels_by_work(
     return np.argsort(log_solver_work)
 
 
-class _BatchEngine(NamedTuple):
-    """Engine that computes one gait step for any number of lanes. The last axis of its NumPy arrays
-    is that of the lanes.
-    """
+LaneStepFunction = Callable[..., tuple[np.ndarray, ...]]
+"""Function that computes one gait step for any number of lanes, which are on the last axis.
 
-    engine_name: str
-    take_lane_steps: Callable[..., tuple[np.ndarray, ...]]
-    """Function that computes one gait step. Its arguments are parameters, section states and, on
-    uneven ground, the inputs from `GROUND_INPUT_INDEX`.
-
-    The function returns section states, durations, outcomes, numbers of solver steps and, if
-    derivatives are requested, Jacobians.
-    """
+Its arguments are parameters, section states and, on uneven ground, the inputs from
+`GROUND_INPUT_INDEX`. It returns section states, durations, outcomes, numbers of solver steps and,
+if derivatives are requested, Jacobians.
+"""
 
 
 def _select_batch_engine(
@@ -388,9 +382,9 @@ def _select_batch_engine(
     input_indices: tuple[int, ...],
     requested_engine: str,
     options: StepOptions,
-) -> _BatchEngine:
-    """Return the requested engine, or the fastest engine that supports the model and the solver if
-    "auto" is requested.
+) -> tuple[str, LaneStepFunction]:
+    """Return the name and the function of the requested engine, or those of the fastest engine that
+    supports the model and the solver if "auto" is requested.
     """
     has_lane_kernel = (
         model.batch_kernel == "phases" and load_explicit_tableau(options.solver) is not None
@@ -404,11 +398,11 @@ def _select_batch_engine(
         step_by_diffrax = functools.partial(
             _step_lanes_by_diffrax, model, options.with_engine("diffrax"), n_legs, input_indices
         )
-        return _BatchEngine("diffrax", step_by_diffrax)
+        return "diffrax", step_by_diffrax
     step_by_kernel = functools.partial(
         _step_lanes_by_kernel, model.stop_at_lift_off, options, n_legs, input_indices
     )
-    return _BatchEngine("lanes", step_by_kernel)
+    return "lanes", step_by_kernel
 
 
 def _step_lanes_by_kernel(
@@ -422,7 +416,7 @@ def _step_lanes_by_kernel(
 ) -> tuple[np.ndarray, ...]:
     """Return the results of one gait step for all lanes, computed by machine code or XLA.
 
-    The results are those of `_BatchEngine.take_lane_steps`.
+    The results are those of a `LaneStepFunction`.
     """
     compiled_step = _compile_lane_step(stop_at_lift_off, n_legs, input_indices, len(ground_inputs))
     kernel_results = compiled_step.run(
@@ -494,7 +488,7 @@ def _step_lanes_by_diffrax(
     """Return the results of one gait step for all lanes, computed by `model.advance` under
     `jax.vmap`.
 
-    The results are those of `_BatchEngine.take_lane_steps`.
+    The results are those of a `LaneStepFunction`.
     """
     convert_options_dtype = functools.partial(
         jax.tree.map, lambda step_option_leaf: np.asarray(step_option_leaf, parameter_matrix.dtype)
