@@ -17,7 +17,7 @@ from experiments.speed import peers
 from experiments.speed.peers import hy
 from vrw_jax import Outcome
 from vrw_jax.lanes import select_tree_rows
-from vrw_jax.wheel import Motion, Symbols, dynamics, geometry, transitions
+from vrw_jax.wheel import Motion, Symbols, dynamics, transitions
 
 Rows = Iterator[dict[str, object]]
 START = np.array([0.1, 1.6, -0.1])  # near the gait of Table 1
@@ -96,13 +96,13 @@ def phases() -> tuple[Phase, Phase, Phase]:
     sin, cos = hy.sin(th), hy.cos(th)
 
     x1, rear_normal, *_ = peers.double_support(sin, cos, w, hy.par[10], P)
-    circle = geometry.compute_double_support_circle(s, hy.par[10], sin, cos)
+    circle = dynamics.compute_double_support_circle(s, hy.par[10], sin, cos)
     m = Motion(sin, cos, circle.L1, circle.L2, w, circle.dL1_dtheta * w, circle.dL2_dtheta * w)
     a = dynamics.Acceleration(
         x1, circle.dL1_dtheta * x1 - circle.L1 * w * w, circle.dL2_dtheta * x1 - circle.L2 * w * w
     )
     rear = dynamics.compute_rear_foot_force(s, m, a)
-    height = geometry.compute_landing_foot_height
+    height = dynamics.compute_landing_foot_height
     falls = lambda m, fore: [m.dtheta, m.L1 - s.a, m.L2 - s.a, fore.normal]
     dls = Phase(
         [(th, w), (w, x1)],

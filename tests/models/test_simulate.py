@@ -11,8 +11,7 @@ from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
 from vrw_jax.models.measures import MEASURES, TRAJECTORY_MEASURES
-from vrw_jax.wheel.dynamics import compute_momentum
-from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.dynamics import Motion, compute_momentum
 
 N_SAMPLES = 1001
 STEADY_STATE = jnp.array([0.102726965088900357, 1.61345343427543820, -0.109037270])

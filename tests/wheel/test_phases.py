@@ -24,7 +24,7 @@ from vrw_jax.wheel import (
     stack_parameters,
     transitions,
 )
-from vrw_jax.wheel.geometry import compute_double_support_circle
+from vrw_jax.wheel.dynamics import compute_double_support_circle
 
 PARAMS = vrw.WheelParams()
 SYMBOLS = PARAMS.symbols()

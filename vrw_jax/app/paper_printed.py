@@ -12,8 +12,12 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from vrw_jax.wheel.dynamics import compute_mass_matrix, compute_momentum
-from vrw_jax.wheel.geometry import Motion, compute_length_at_touchdown
+from vrw_jax.wheel.dynamics import (
+    Motion,
+    compute_length_at_touchdown,
+    compute_mass_matrix,
+    compute_momentum,
+)
 from vrw_jax.wheel.params import Symbols, WheelParams
 
 _compute_length_at_touchdown = jax.jit(compute_length_at_touchdown)

@@ -41,7 +41,7 @@ from vrw_jax.models.step_results import DoubleSupportIndicators, Margins, Sectio
 from vrw_jax.models.stepping import step
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.dynamics import Motion
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams, make_wheel_from_parameters, stack_parameters
 from vrw_jax.wheel.phases import make_paper_phases

@@ -10,7 +10,7 @@ from vrw_jax.gaits.phase_collocation import PhasePoints
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.wheel import dynamics
-from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.dynamics import Motion
 from vrw_jax.wheel.params import Symbols, WheelParams
 
 

@@ -23,7 +23,7 @@ from vrw_jax.gaits.phase_collocation import (
     PhaseSequence,
 )
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.geometry import rotate_to_rear_leg
+from vrw_jax.wheel.dynamics import rotate_to_rear_leg
 from vrw_jax.wheel.params import Symbols, compute_symbols
 from vrw_jax.wheel.phases import PAPER_PHASES, TRANSITION_ASSUMPTIONS, Assumption, PhaseInstant
 

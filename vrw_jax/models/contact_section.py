@@ -20,7 +20,7 @@ from vrw_jax.models.phase_sequence import (
     replace_invalid_inputs,
 )
 from vrw_jax.models.step_results import PAPER_START_STATE
-from vrw_jax.wheel.geometry import compute_length_at_touchdown
+from vrw_jax.wheel.dynamics import compute_length_at_touchdown
 from vrw_jax.wheel.ground import GroundAhead, compute_line_slope
 from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import MAX_SI_VALUE, Symbols, WheelParams, WheelUnits

@@ -30,7 +30,7 @@ from vrw_jax.models.step_results import (
     Trajectory,
 )
 from vrw_jax.wheel import dynamics, transitions
-from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.dynamics import Motion
 from vrw_jax.wheel.ground import (
     GroundAhead,
     compute_foot_distance,

@@ -29,8 +29,8 @@ from vrw_jax.models.step_results import (
     StepResult,
     Trajectory,
 )
-from vrw_jax.wheel import dynamics, geometry, transitions
-from vrw_jax.wheel.geometry import Motion, compute_rear_foot_height
+from vrw_jax.wheel import dynamics, transitions
+from vrw_jax.wheel.dynamics import Motion, compute_rear_foot_height
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, Symbols, WheelParams, require_known_friction
@@ -658,9 +658,9 @@ def _compute_gravity_stiffness(s: Symbols) -> Elementwise:
     return s.Mt * s.g * s.L0 / _compute_foot_inertia(s)
 
 
-def _rotate_to_vertical(s: Symbols, theta: Elementwise | float) -> geometry.SineCosine:
+def _rotate_to_vertical(s: Symbols, theta: Elementwise | float) -> dynamics.SineCosine:
     """Return the sine and cosine of theta + phi, the angle of the stance leg from the vertical."""
-    return geometry.rotate_to_vertical(s, jnp.sin(theta), jnp.cos(theta))
+    return dynamics.rotate_to_vertical(s, jnp.sin(theta), jnp.cos(theta))
 
 
 def _compute_rolling_time(

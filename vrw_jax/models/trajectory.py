@@ -35,8 +35,12 @@ from vrw_jax.models.phase_sequence import select_stance_line
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.stepping import ModelLike, SectionStateLike, convert_walk_arguments
 from vrw_jax.models.unilateral_wheel import UnilateralTrajectory
-from vrw_jax.wheel.dynamics import compute_damping_power
-from vrw_jax.wheel.geometry import Motion, rotate_to_landing_leg, rotate_to_rear_leg
+from vrw_jax.wheel.dynamics import (
+    Motion,
+    compute_damping_power,
+    rotate_to_landing_leg,
+    rotate_to_rear_leg,
+)
 from vrw_jax.wheel.ground import compute_line_slope
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams

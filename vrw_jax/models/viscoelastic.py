@@ -57,7 +57,7 @@ from vrw_jax.models.step_results import (
     Trajectory,
 )
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.geometry import Motion
+from vrw_jax.wheel.dynamics import Motion
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
     WheelParams,

@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Int
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel import dynamics, transitions
-from vrw_jax.wheel.dynamics import Acceleration, FootForce
-from vrw_jax.wheel.geometry import (
+from vrw_jax.wheel.dynamics import (
+    Acceleration,
     DoubleSupportCircle,
+    FootForce,
     Motion,
     compute_double_support_circle,
     compute_landing_foot_height,

@@ -16,21 +16,19 @@ from vrw_jax.wheel.dynamics import (
     EquationTerms,
     FootForce,
     MassMatrix,
+    Motion,
+    compute_double_support_circle,
     compute_fore_foot_force,
     compute_kinetic_energy,
+    compute_length_at_touchdown,
     compute_mass_matrix,
     compute_momentum,
     compute_rear_foot_force,
     compute_rear_force_from_residual,
-    solve_double_support,
-    solve_unconstrained_dynamics,
-)
-from vrw_jax.wheel.geometry import (
-    Motion,
-    compute_double_support_circle,
-    compute_length_at_touchdown,
     rotate_to_landing_leg,
     rotate_to_rear_leg,
+    solve_double_support,
+    solve_unconstrained_dynamics,
 )
 from vrw_jax.wheel.params import Symbols
 
