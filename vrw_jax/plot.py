@@ -3,8 +3,7 @@
 from vrw_jax.app import figure_style as style
 from vrw_jax.app._branch_figures import basin_figure, branch_figure
 from vrw_jax.app._scan_figures import map_figure, scan_figures
-from vrw_jax.app._tornado_figures import tornado_figure
-from vrw_jax.app._tuning_figures import tuning_figure
+from vrw_jax.app._tuning_figures import tornado_figure, tuning_figure
 from vrw_jax.app._walk_figures import (
     foot_height,
     gait_panels,

@@ -20,7 +20,7 @@ from vrw_jax.hybrid import (
     simulate_hybrid,
     time_errors,
 )
-from vrw_jax.lanes.program_cache import (
+from vrw_jax.lanes.saved_traces import (
     MAX_CACHED_PROGRAMS,
     _program_by_key,
     call_compiled_program,

@@ -14,7 +14,7 @@ from vrw_jax.app.paper_claims import (
     TYPICAL_GAIT_CLAIMS,
 )
 from vrw_jax.app.paper_fact import PaperEvidence, PaperFact
-from vrw_jax.app.paper_misprints import MISPRINT_CLAIMS
+from vrw_jax.app.paper_printed import MISPRINT_CLAIMS
 from vrw_jax.base.printing import format_markdown_table
 
 FACTS_PAGE_INTRODUCTION = (

@@ -1,7 +1,9 @@
-"""Text for results: labeled lines, HTML and Markdown tables."""
+"""Text for results: labeled lines, tables, symbols as mathtext, and sentences for status codes."""
 
 import abc
 import enum
+import re
+import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import Any
@@ -130,3 +132,56 @@ def format_numbers(printed_numbers: object) -> str:
     return ", ".join(
         f"{printed_number:.5g}" for printed_number in np.ravel(np.asarray(printed_numbers))
     )
+
+
+_MATHTEXT_BY_SYMBOL = {
+    "θ": r"\theta ", "κ": r"\kappa ", "λ": r"\lambda ", "μ": r"\mu ", "ρ": r"\rho ",
+    "Δ": r"\Delta ", "σ": r"\sigma ", "∂": r"\partial ", "phi": r"\phi ", "min": r"\min ",
+    "⁺": "^+", "⁻": "^-", "²": "^2", "*": "^*", "₀": "_0", "₁": "_1",
+}  # fmt: skip
+_SYMBOL_TOKEN_PATTERN = re.compile(
+    r"_(?P<below>\w[\w-]*(?:, ?\w+)?)|(?P<dotted>\w)\u0307|(?P<twice>\w)\u0308"
+    r"|(?P<word>[A-Za-z]{2,}(?:-I+)?)"
+    r"|(?P<index>(?<=[^\W\d_]|\u0307|\u0308)\d)|(?P<sign>[^\s\d()|/,A-Za-z-])"
+)
+
+
+def format_mathtext(symbol_text: str) -> str:
+    r"""Convert a symbol to mathtext: "θ̇⁺" to \dot{\theta}^+, "L1" to L_1."""
+
+    def format_symbol_token(token_match: re.Match[str]) -> str:
+        token_kind = token_match.lastgroup or ""
+        token_text = token_match[token_kind]
+        is_upright_text = token_kind == "word" or re.search("[A-Za-z]{3}", token_text)
+        token_mathtext = _MATHTEXT_BY_SYMBOL.get(
+            token_text, f"\\mathrm{{{token_text}}}" if is_upright_text else token_text
+        )
+        return {
+            "below": f"_{{{token_mathtext}}}",
+            "dotted": f"\\dot{{{token_mathtext}}}",
+            "twice": f"\\ddot{{{token_mathtext}}}",
+            "index": f"_{token_mathtext}",
+        }.get(token_kind, token_mathtext)
+
+    return _SYMBOL_TOKEN_PATTERN.sub(format_symbol_token, unicodedata.normalize("NFD", symbol_text))
+
+
+class StatusCode(enum.IntEnum):
+    """Base class for enumerations of status codes. Members are defined as `NAME = number,
+    "sentence"`.
+
+    The number is the member's value, and the sentence is the member's attribute `meaning`.
+    """
+
+    meaning: str
+
+    def __new__(cls, value: int, meaning: str = "") -> "StatusCode":
+        status_code = int.__new__(cls, value)
+        status_code._value_, status_code.meaning = value, meaning
+        return status_code
+
+
+def describe_step_ending(status_codes: Any, status_code_class: type[StatusCode]) -> Any:
+    """Return the sentence that explains a status code, or an array of sentences for a batch."""
+    describe_status_code = lambda status_code: status_code_class(int(status_code)).meaning
+    return format_each_batch_element(describe_status_code, status_codes)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_positive
 from vrw_jax.base.elementwise import select_trees_by_condition
-from vrw_jax.base.status_codes import StatusCode
+from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.types import Scalar
 from vrw_jax.branches.crossings import BranchJumpSuspicion, is_multiplier_change_explained
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian

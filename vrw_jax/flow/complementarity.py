@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.base.checks import has_traced_leaf, require_no_masked_entries
-from vrw_jax.base.status_codes import StatusCode
+from vrw_jax.base.printing import StatusCode
 
 MAX_LCP_CONTACTS = 10
 """Largest number of contacts in an LCP.

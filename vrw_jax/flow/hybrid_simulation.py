@@ -22,8 +22,8 @@ from vrw_jax.base.checks import check_callable, check_int, check_reals, check_ty
 from vrw_jax.base.elementwise import make_opaque_loop_condition
 from vrw_jax.base.forward_only import forbid_reverse_mode
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.printing import StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.status_codes import StatusCode, describe_step_ending
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.diffrax_minima import (
     GuardsAndMargins,
@@ -32,7 +32,7 @@ from vrw_jax.flow.diffrax_minima import (
 )
 from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
 from vrw_jax.flow.solver_steps import VectorField
-from vrw_jax.lanes.program_cache import call_compiled_program
+from vrw_jax.lanes.saved_traces import call_compiled_program
 
 MAX_STORED_NUMBERS = 100_000_000
 """Largest product of the number of events and the dimension of the state.

@@ -18,7 +18,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.hybrid_simulation import Guard, HybridSolution, Mode, convert_modes_to_tuple
 from vrw_jax.flow.phase_integration import sample_phase
-from vrw_jax.lanes.program_cache import call_compiled_program
+from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
 def flow_jacobian_determinant(

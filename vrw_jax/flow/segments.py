@@ -21,7 +21,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.flow.solver_steps import VectorField
-from vrw_jax.lanes.program_cache import call_compiled_program
+from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
 class FlowSegments(NamedTuple):

@@ -23,7 +23,7 @@ from vrw_jax.flow.hybrid_simulation import Termination
 from vrw_jax.flow.return_map import ReturnMap
 from vrw_jax.gaits.floquet import UNIT_CIRCLE_DISTANCE, floquet_multipliers
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian, make_zero_tangent
-from vrw_jax.lanes.program_cache import get_compiled_program
+from vrw_jax.lanes.saved_traces import get_compiled_program
 from vrw_jax.lanes.settings import with_default_jax_settings
 
 UNIT_MULTIPLIER_ADVICE = (

@@ -399,32 +399,20 @@ def _select_batch_engine(
             _step_lanes_by_diffrax, model, options.with_engine("diffrax"), n_legs, input_indices
         )
         return "diffrax", step_by_diffrax
-    step_by_kernel = functools.partial(
-        _step_lanes_by_kernel, model.stop_at_lift_off, options, n_legs, input_indices
-    )
+
+    def step_by_kernel(
+        parameter_matrix: np.ndarray, section_states: np.ndarray, *ground_inputs: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        compiled_step = _compile_lane_step(
+            model.stop_at_lift_off, n_legs, input_indices, len(ground_inputs)
+        )
+        _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = compiled_step.run(
+            jax.tree.map(lambda x: np.asarray(x, parameter_matrix.dtype), options),
+            (*parameter_matrix, *section_states, *ground_inputs),
+        )
+        return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
+
     return "lanes", step_by_kernel
-
-
-def _step_lanes_by_kernel(
-    stop_at_lift_off: bool,
-    options: StepOptions,
-    n_legs: int,
-    input_indices: tuple[int, ...],
-    parameter_matrix: np.ndarray,
-    section_states: np.ndarray,
-    *ground_inputs: np.ndarray,
-) -> tuple[np.ndarray, ...]:
-    """Return the results of one gait step for all lanes, computed by machine code or XLA.
-
-    The results are those of a `LaneStepFunction`.
-    """
-    compiled_step = _compile_lane_step(stop_at_lift_off, n_legs, input_indices, len(ground_inputs))
-    kernel_results = compiled_step.run(
-        jax.tree.map(lambda x: np.asarray(x, parameter_matrix.dtype), options),
-        (*parameter_matrix, *section_states, *ground_inputs),
-    )
-    _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = kernel_results
-    return step_outputs[:3], step_outputs[3:], step_outcomes, n_solver_steps, *step_jacobian
 
 
 @functools.cache

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float, Int
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
+    describe_step_ending,
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.base.status_codes import describe_step_ending
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.wheel.outcomes import Outcome
 

@@ -22,12 +22,12 @@ from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
+    describe_step_ending,
     format_numbers,
     format_outcome_counts,
     format_quantity,
 )
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.status_codes import describe_step_ending
 from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues

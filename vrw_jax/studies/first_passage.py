@@ -19,9 +19,8 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText
+from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.status_codes import StatusCode, describe_step_ending
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.finder_selection import resolve_model
 from vrw_jax.gaits.gait_search import limit_cycle

@@ -9,9 +9,8 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.checks import check_names, has_traced_leaf, require_known_name
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText
+from vrw_jax.base.printing import AbstractPrintable, LabelAndText, describe_step_ending
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.status_codes import describe_step_ending
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.finder import AbstractGaitFinder
 from vrw_jax.gaits.finder_selection import UserCycleGuess, resolve_finder, resolve_model

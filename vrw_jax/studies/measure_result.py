@@ -9,10 +9,11 @@ import numpy as np
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
+    StatusCode,
+    describe_step_ending,
     format_each_batch_element,
     format_outcome_counts,
 )
-from vrw_jax.base.status_codes import StatusCode, describe_step_ending
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.studies.lower_fidelity import MODEL_NAMES, ModelIndex
 from vrw_jax.wheel.outcomes import Outcome

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
-from vrw_jax.base.status_codes import StatusCode
 from vrw_jax.studies.tune_objective import (
     GaitEvaluation,
     compute_max_violation,

@@ -13,7 +13,7 @@ from enum import IntEnum
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.status_codes import StatusCode
+from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.types import Elementwise
 
 
