@@ -94,7 +94,13 @@ def emit_static_slice(
     slice_starts = slice_params["start_indices"]
     slice_strides = slice_params["strides"] or (1,) * len(slice_starts)
     axis_slices = list(map(slice, slice_starts, slice_params["limit_indices"], slice_strides))
-    axis_slices = axis_slices[: len(array.shape)]
+    return _take_slice(array_emitter, array, axis_slices[: len(array.shape)])
+
+
+def _take_slice(
+    array_emitter: ArrayEmitter, array: LlvmArray, axis_slices: Sequence[slice]
+) -> LlvmArray:
+    """Return the entries of an array that the slices of its axes contain."""
     if isinstance(array, np.ndarray):
         return array[tuple(axis_slices)]
 
@@ -108,7 +114,31 @@ def emit_static_slice(
             ),
         )
 
-    return LazyArray(primitive_call.result_shape, array.entry_type, get_sliced_entry)
+    slice_shape = tuple(len(range(x.start, x.stop, x.step)) for x in axis_slices)
+    return LazyArray(slice_shape, array.entry_type, get_sliced_entry)
+
+
+def _split_along_axis(
+    jaxpr_lowering: JaxprLowering, equation: Any, array: LlvmArray, part_lengths: Sequence[int]
+) -> list[LlvmArray]:
+    """Return the parts of an array that follow each other along the axis of an equation."""
+    split_axis = equation.params["axis"]
+    if split_axis == len(array.shape):
+        raise make_lane_mixing_error(equation.primitive.name)
+    whole_axes = [slice(0, axis_length, 1) for axis_length in array.shape]
+    part_ends = np.cumsum(part_lengths).tolist()
+    return [
+        _take_slice(
+            jaxpr_lowering.array_emitter,
+            array,
+            [
+                *whole_axes[:split_axis],
+                slice(part_end - part_length, part_end, 1),
+                *whole_axes[split_axis + 1 :],
+            ],
+        )
+        for part_end, part_length in zip(part_ends, part_lengths, strict=True)
+    ]
 
 
 def emit_concatenated_array(
@@ -136,48 +166,16 @@ def emit_unstacked_arrays(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
     """Return the arrays of equal shape that result from splitting an array along one axis."""
-    (array,), split_axis = operands, equation.params["axis"]
-    if split_axis == len(array.shape):
-        raise make_lane_mixing_error("unstack")
-
-    def take_axis_slice(slice_position: int) -> LlvmArray:
-        slice_shape = (*array.shape[:split_axis], *array.shape[split_axis + 1 :])
-        if isinstance(array, np.ndarray):
-            return array.take([slice_position], split_axis).reshape(slice_shape)
-        get_slice_entry = lambda entry_index: jaxpr_lowering.array_emitter.get_array_entry(
-            array, (*entry_index[:split_axis], slice_position, *entry_index[split_axis:])
-        )
-        return LazyArray(slice_shape, array.entry_type, get_slice_entry)
-
-    return [take_axis_slice(slice_position) for slice_position in range(len(equation.outvars))]
+    parts = _split_along_axis(jaxpr_lowering, equation, operands[0], [1] * len(equation.outvars))
+    reshape_array, split_axis = jaxpr_lowering.array_emitter.reshape_array, equation.params["axis"]
+    return [reshape_array(x, (*x.shape[:split_axis], *x.shape[split_axis + 1 :])) for x in parts]
 
 
 def emit_split_arrays(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
     """Return the parts of an array that follow each other along one axis."""
-    (array,), split_axis = operands, equation.params["axis"]
-    if split_axis == len(array.shape):
-        raise make_lane_mixing_error("split")
-    array_emitter = jaxpr_lowering.array_emitter
-    part_starts = np.cumsum([0, *equation.params["sizes"]]).tolist()
-
-    def take_part(part_start: int, part_length: int) -> LlvmArray:
-        part_index = (*[slice(None)] * split_axis, slice(part_start, part_start + part_length))
-        if isinstance(array, np.ndarray):
-            return array[part_index]
-        part_shape = (*array.shape[:split_axis], part_length, *array.shape[split_axis + 1 :])
-        get_part_entry = lambda entry_index: array_emitter.get_array_entry(
-            array,
-            (
-                *entry_index[:split_axis],
-                array_emitter.emit_affine_index(entry_index[split_axis], part_start),
-                *entry_index[split_axis + 1 :],
-            ),
-        )
-        return LazyArray(part_shape, array.entry_type, get_part_entry)
-
-    return list(map(take_part, part_starts, equation.params["sizes"]))
+    return _split_along_axis(jaxpr_lowering, equation, operands[0], equation.params["sizes"])
 
 
 def emit_optimization_barrier(
