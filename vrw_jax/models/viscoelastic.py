@@ -114,20 +114,10 @@ class ViscoelasticWheel(AbstractWheel):
         return jnp.asarray(PAPER_START_STATE, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        return self._compute_step(params, x, options, records_margins=False)
+        return _compile_step(self, _select_engine(options), False)(params, x, options)
 
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
-        return self._compute_step(params, x, options, records_margins=True)
-
-    def _compute_step(
-        self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
-    ) -> Any:
-        """Return the results of a step, computed with the compiled function.
-
-        - `records_margins`: whether the results include indicators, margins and energies.
-        """
-        engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
-        return _compile_step(self, engine, records_margins)(params, x, options)
+        return _compile_step(self, _select_engine(options), True)(params, x, options)
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
@@ -192,9 +182,16 @@ class ViscoelasticWheel(AbstractWheel):
         )
 
 
+def _select_engine(options: StepOptions) -> str:
+    return "lanes" if can_use_batch_kernel(options) else "diffrax"
+
+
 @functools.cache
 def _compile_step(model: ViscoelasticWheel, engine: str, records_margins: bool) -> Callable:
-    """Return a compiled function of (params, x, options), differentiable in any mode."""
+    """Return a compiled function of (params, x, options), differentiable in any mode.
+
+    - `records_margins`: whether the results include indicators, margins and energies.
+    """
 
     def take_diffrax_step(params: WheelParams, x: SectionState, options: StepOptions) -> Any:
         """Compute a step with diffrax.
