@@ -25,7 +25,7 @@ from vrw_jax.base.checks import (
     require_known_name,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.status_codes import describe_step_ending
+from vrw_jax.base.printing import describe_step_ending
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.diffrax_minima import StateArray
 from vrw_jax.flow.hybrid_simulation import (

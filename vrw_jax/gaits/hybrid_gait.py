@@ -15,7 +15,7 @@ from vrw_jax.base.printing import format_heading_and_rows, format_numbers, forma
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point_implicit
-from vrw_jax.lanes.program_cache import call_compiled_program
+from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
 class HybridGait(NamedTuple):

@@ -134,7 +134,7 @@ class ArrayEmitter:
             entry_key = (
                 "entry",
                 id(array),
-                *(i if isinstance(i, int) else ("at", id(i)) for i in entry_index),
+                *(i if isinstance(i, int | np.integer) else ("at", id(i)) for i in entry_index),
             )
             return self.value_emitter.emit_value_once(
                 entry_key, lambda: array.get_entry_at_index(entry_index)
@@ -145,10 +145,10 @@ class ArrayEmitter:
             0 if axis_stride == 0 or axis_length == 1 else i
             for i, axis_stride, axis_length in indices_strides_lengths
         )
-        llvm_index = tuple(i for i in entry_index if not isinstance(i, int))
+        llvm_index = tuple(i for i in entry_index if not isinstance(i, int | np.integer))
         if not llvm_index:
             return array[entry_index]
-        integer_index = tuple(i if isinstance(i, int) else slice(None) for i in entry_index)
+        integer_index = tuple(i if isinstance(i, int | np.integer) else slice(None) for i in entry_index)
         memory_table = self.value_emitter.emit_value_once(
             ("table", id(array), str(integer_index)),
             lambda: self.make_memory_table(array[integer_index]),
@@ -183,8 +183,8 @@ class ArrayEmitter:
         memory_offset: LlvmValue = None
         for i, axis_length in zip(entry_index, array_shape, strict=True):
             axis_stride //= axis_length
-            if isinstance(i, int):
-                constant_offset += i * axis_stride
+            if isinstance(i, int | np.integer):
+                constant_offset += int(i) * axis_stride
                 continue
             axis_offset = self.emit_affine_index(i, 0, axis_stride)
             memory_offset = (
@@ -238,7 +238,7 @@ class ArrayEmitter:
         values.
         """
         first_iteration, end_iteration = (
-            ir.Constant(I64, i) if isinstance(i, int) else i
+            ir.Constant(I64, i) if isinstance(i, int | np.integer) else i
             for i in (first_iteration, end_iteration)
         )
 
@@ -470,8 +470,8 @@ class ArrayEmitter:
 
         If `i` is an integer, the function only computes the index and returns an integer.
         """
-        if isinstance(i, int):
-            return index_start + index_step * i
+        if isinstance(i, int | np.integer):
+            return index_start + index_step * int(i)
         i = i if index_step == 1 else self.llvm_builder.mul(i, ir.Constant(I64, index_step))
         return i if index_start == 0 else self.llvm_builder.add(i, ir.Constant(I64, index_start))
 
@@ -495,7 +495,7 @@ class ArrayEmitter:
             if isinstance(j, int):
                 return self.emit_affine_index(i, j)
             return (
-                self.emit_affine_index(j, i) if isinstance(i, int) else self.llvm_builder.add(i, j)
+                self.emit_affine_index(j, i) if isinstance(i, int | np.integer) else self.llvm_builder.add(i, j)
             )
 
         return tuple(
