@@ -148,7 +148,9 @@ class ArrayEmitter:
         llvm_index = tuple(i for i in entry_index if not isinstance(i, int | np.integer))
         if not llvm_index:
             return array[entry_index]
-        integer_index = tuple(i if isinstance(i, int | np.integer) else slice(None) for i in entry_index)
+        integer_index = tuple(
+            i if isinstance(i, int | np.integer) else slice(None) for i in entry_index
+        )
         memory_table = self.value_emitter.emit_value_once(
             ("table", id(array), str(integer_index)),
             lambda: self.make_memory_table(array[integer_index]),
@@ -492,11 +494,11 @@ class ArrayEmitter:
         """
 
         def emit_axis_index_sum(i: Any, j: Any) -> Any:
-            if isinstance(j, int):
-                return self.emit_affine_index(i, j)
-            return (
-                self.emit_affine_index(j, i) if isinstance(i, int | np.integer) else self.llvm_builder.add(i, j)
-            )
+            if isinstance(j, int | np.integer):
+                return self.emit_affine_index(i, int(j))
+            if isinstance(i, int | np.integer):
+                return self.emit_affine_index(j, int(i))
+            return self.llvm_builder.add(i, j)
 
         return tuple(
             emit_axis_index_sum(i, j) for i, j in zip(entry_index, offset_index, strict=True)
