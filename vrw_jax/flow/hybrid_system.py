@@ -95,9 +95,9 @@ class HybridSystem(eqx.Module):
     Examples:
         >>> fall = lambda y, p: jnp.stack([y[1], -p["gravity"] + 0.0 * y[1]])
         >>> bounce = lambda y, p: jnp.stack([0.0 * y[0], -p["restitution"] * y[1]])
-        >>> impact = hybrid.Guard(lambda y, p: y[0], bounce)
-        >>> ball = hybrid.HybridSystem(
-        ...     modes={"flight": hybrid.Mode(fall, {"impact": impact})},
+        >>> impact = vrw.hybrid.Guard(lambda y, p: y[0], bounce)
+        >>> ball = vrw.HybridSystem(
+        ...     modes={"flight": vrw.hybrid.Mode(fall, {"impact": impact})},
         ...     section="impact",
         ...     state=("height", "velocity"),
         ...     project=lambda y, p: y[1:],

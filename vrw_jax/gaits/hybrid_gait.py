@@ -25,6 +25,21 @@ class HybridGait(NamedTuple):
     - `period`: duration of all its steps, s;
     - `last_step`: the last `HybridStep` of the gait;
     - `fixed_point`: the fixed point, with the Jacobian and the status of Newton's method.
+
+    Examples:
+        >>> decay = lambda y, p: jnp.stack([-p["rate"] * y[0], 1.0 + 0.0 * y[1]])
+        >>> kick = lambda y, p: jnp.stack([y[0] + 1.0, 0.0 * y[1]])
+        >>> guards = {"kick": vrw.hybrid.Guard(lambda y, p: 1.0 - y[1], kick)}
+        >>> system = vrw.HybridSystem(
+        ...     modes={"decay": vrw.hybrid.Mode(decay, guards)},
+        ...     section="kick",
+        ...     state=("level", "time"),
+        ...     project=lambda y, p: y[:1],
+        ...     embed=lambda x, p: jnp.stack([x[0], 0.0 * x[0]]),
+        ... )
+        >>> gait = vrw.limit_cycle({"rate": 1.0}, model=system, guess=[1.0])
+        >>> print(f"{gait.section_state[0]:.6f} {gait.multipliers[0].real:.6f}")
+        1.581977 0.367879
     """
 
     section_state: Float[Array, " n"]
