@@ -429,6 +429,59 @@ def test_invalid_samples_get_outcomes_and_leave_the_others_unchanged(
         assert np.all(np.isnan(mixed[name][:4]))
 
 
+def scan_and_search(rows: np.ndarray) -> tuple[xr.Dataset, vrw.LimitCycle]:
+    """Return the scan and the limit cycles of wheels with given dampings, stiffnesses, natural
+    lengths and slopes."""
+    columns = dict(
+        zip(("damping", "stiffness", "natural_length", "slope"), np.transpose(rows), strict=True)
+    )
+    measures = ["dls_fraction", "speed", "spectral_radius"]
+    return vrw.scan(vrw.samples(columns), measures), vrw.limit_cycles(WheelParams(**columns))
+
+
+def check_same_gaits(scanned: xr.Dataset, cycles: vrw.LimitCycle) -> None:
+    """The scan has one mesh for each wheel, and `limit_cycles` one for all: 1e-9 in values."""
+    np.testing.assert_array_equal(scanned.outcome, cycles.outcome)
+    found = np.asarray(cycles.found)
+    for name in ("dls_fraction", "speed", "spectral_radius"):
+        np.testing.assert_allclose(
+            scanned[name].values[found], getattr(cycles, name)[found], rtol=1e-7, atol=1e-8
+        )
+
+
+def test_a_scan_reports_the_gaits_and_reasons_that_limit_cycles_reports() -> None:
+    """Found at once, on a finer mesh, from a walk, in more iterations; and three kinds of failure.
+
+    Before scans had this search, they reported only the first of the four gaits."""
+    scanned, cycles = scan_and_search(
+        np.array(
+            [
+                [200.0, 500.0, 1.025, 0.3],
+                [95.09570, 872.5634, 1.0342, 0.0687],
+                [262.1757, 2453.0364, 1.0104, 0.1247],
+                [47.9742225, 927.510420, 1.02902603, 0.130571501],
+                [300.0, 500.0, 1.025, 0.3],
+                [28.9, 4000.0, 1.0, 0.05],
+                [np.nan, 500.0, 1.025, 0.3],
+            ]
+        )
+    )
+    assert np.asarray(cycles.found).tolist() == [True] * 4 + [False] * 3
+    check_same_gaits(scanned, cycles)
+
+
+@pytest.mark.slow
+def test_a_scan_far_from_the_paper_s_ranges_finds_every_gait() -> None:
+    """400 wheels, of which earlier scans found 71 gaits and `limit_cycles` 144.
+
+    24,576 walks from random starts on the other wheels settled on no further gait."""
+    lows, highs = np.log([[20.0, 300.0, 1.0, 0.05], [400.0, 3000.0, 1.05, 0.35]])
+    rows = np.exp(np.random.default_rng(42).uniform(lows, highs, (400, 4)))
+    scanned, cycles = scan_and_search(rows)
+    assert np.count_nonzero(cycles.found) >= 144
+    check_same_gaits(scanned, cycles)
+
+
 def test_a_derivative_by_name_equals_the_difference_quotient(engine: CollocationScanEngine) -> None:
     h = 1e-3
     near = engine({"damping": np.array([180.0 - h, 180.0, 180.0 + h])})

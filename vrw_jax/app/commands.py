@@ -37,8 +37,8 @@ from vrw_jax.base.start import start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.continuation import continue_branch
 from vrw_jax.branches.special_point_map import SPECIAL_POINT_MEASURES
-from vrw_jax.gaits.finder_selection import make_finder, resolve_model_with_reason
-from vrw_jax.gaits.gait_search import limit_cycle
+from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.gait_search import limit_cycle, resolve_model_with_reason
 from vrw_jax.lanes.disk_cache import find_library_version
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models.registry import list_model_config_names

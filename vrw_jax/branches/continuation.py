@@ -53,7 +53,7 @@ from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME,
 from vrw_jax.branches.hybrid_branch import find_parameter, make_section_map
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.cycle import AbstractCycle
-from vrw_jax.gaits.finder_selection import make_finder, resolve_model
+from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.fixed_points import (
     UNIT_MULTIPLIER_ADVICE,
     check_state_units,
@@ -62,6 +62,7 @@ from vrw_jax.gaits.fixed_points import (
     has_unit_multiplier,
 )
 from vrw_jax.gaits.floquet import floquet_multipliers
+from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions

@@ -1,6 +1,7 @@
 """Find gaits of the paper's model by collocation, and check each gait by one event-driven step."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ClassVar
@@ -111,7 +112,9 @@ class CollocationFinder(AbstractGaitFinder):
             return jnp.where(is_takeoff_scuffing, step.measures()["clearance_sls2"], measure_value)
         return measure_value
 
-    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> LimitCycle:
+    def find_cycle(
+        self, params: WheelParams, cycle_guess: Any = None, starts_only_from_guess: bool = False
+    ) -> LimitCycle:
         if isinstance(cycle_guess, LimitCycle) and cycle_guess.system == self.collocation_system:
             cycle_guess = cycle_guess.collocation_state
         elif cycle_guess is not None and not isinstance(cycle_guess, CollocationState):
@@ -119,8 +122,17 @@ class CollocationFinder(AbstractGaitFinder):
             params, section_state, _, _ = convert_step_arguments(params, section_state, None, None)
             cycle_guess = self.guess_cycle_from_state(*lax.stop_gradient((params, section_state)))
         return dataclasses.replace(
-            solve_limit_cycle(params, self.collocation_system, cycle_guess), model=self.model
+            solve_limit_cycle(params, self.collocation_system, cycle_guess, starts_only_from_guess),
+            model=self.model,
         )
+
+    def find_cycles(
+        self, params: WheelParams, cycle_guess: Any = None, starts_only_from_guess: bool = False
+    ) -> Any:
+        find_cycle = functools.partial(
+            self.find_cycle, starts_only_from_guess=starts_only_from_guess
+        )
+        return jax.vmap(find_cycle)(params, cycle_guess)
 
     def guess_cycle_from_state(
         self, params: WheelParams, section_state: SectionState

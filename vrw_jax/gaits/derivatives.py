@@ -198,6 +198,7 @@ def _make_tangent_function(collocation_system: CollocationSystem) -> Callable:
 def _search_in_scaled_units(
     collocation_system: CollocationSystem,
     run_attempts: BatchFunction,
+    starts_only_from_guess: bool,
     parameters: LaneParameters,
     *si_guess: CollocationState,
 ) -> CycleSearchResult:
@@ -234,7 +235,11 @@ def _search_in_scaled_units(
         )
     ]
     search_result = search_all_attempts(
-        collocation_system, run_attempts, jnp.stack(scaled_parameters), *scaled_search_guess
+        collocation_system,
+        run_attempts,
+        starts_only_from_guess,
+        jnp.stack(scaled_parameters),
+        *scaled_search_guess,
     )
     monodromy_matrix = section_units[:, None] * search_result.monodromy_matrix / section_units
     return search_result._replace(
@@ -244,7 +249,10 @@ def _search_in_scaled_units(
 
 
 def solve_cycle_with_derivatives(
-    collocation_system: CollocationSystem, parameters: Array, search_guess: CollocationState | None
+    collocation_system: CollocationSystem,
+    parameters: Array,
+    search_guess: CollocationState | None,
+    starts_only_from_guess: bool = False,
 ) -> tuple[CollocationState, tuple]:
     """Return the collocation state for the cycle of one wheel, and diagnostics of the search.
 
@@ -255,7 +263,9 @@ def solve_cycle_with_derivatives(
         collocation_system.cycle_options.batch_size,
     )
     search_one_wheel = unbatch(
-        functools.partial(_search_in_scaled_units, collocation_system, batched_search)
+        functools.partial(
+            _search_in_scaled_units, collocation_system, batched_search, starts_only_from_guess
+        )
     )
     compute_tangents = _make_tangent_function(collocation_system)
 

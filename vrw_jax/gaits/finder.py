@@ -208,12 +208,15 @@ class AbstractGaitFinder(eqx.Module):
         return self.model.take_step(params, section_state, self.step_options)
 
     def find_cycle_from_values(
-        self, parameter_values: ParameterValues, cycle_guess: Any = None
+        self, parameter_values: ParameterValues, cycle_guess: Any = None, **search_options: bool
     ) -> AbstractCycle:
-        """Find the cycle near `cycle_guess` for the wheel that `parameter_values` describes."""
+        """Find the cycle near `cycle_guess` for the wheel that `parameter_values` describes.
+
+        - `search_options`: further arguments of `find_cycle`.
+        """
         model, params = self.model.from_parameter_values(parameter_values, self.n_legs)
         return eqx.tree_at(lambda gait_finder: gait_finder.model, self, model).find_cycle(
-            params, cycle_guess
+            params, cycle_guess, **search_options
         )
 
     def refine_cycle_guess(self, parameter_values: ParameterValues, cycle_guess: Any) -> Any:

@@ -68,39 +68,6 @@ def make_finder(
     )
 
 
-def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
-    """Return the model to which a wheel's gait belongs.
-
-    A ladder of models is replaced by the simplest model that is valid for the gait. The gait is
-    first computed with the paper's model. If this gait is not found or violates a margin on its
-    ground, a more general model is returned. If the parameters have no concrete values, the ladder
-    is returned unchanged. Any other model is also returned unchanged.
-    """
-    return resolve_model_with_reason(params, model)[0]
-
-
-def resolve_model_with_reason(
-    params: WheelParams, model: ModelLike | None
-) -> tuple[ModelLike | None, str | None]:
-    """Return the model to which a wheel's gait belongs and, for the ladder, the reason in one
-    sentence.
-    """
-    selected_model: Any = convert_model_argument(model)
-    if (
-        selected_model.fallback_model is selected_model
-        or not isinstance(params, WheelParams)
-        or has_traced_leaf(params, model)
-        or params.damping.ndim
-    ):
-        return model, None
-    paper_cycle: Any = make_finder(None, params.n_legs).find_cycle(params)
-    if not bool(paper_cycle.found):
-        return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.ending}"
-    section_state = selected_model.complete_section_state(params, paper_cycle.section_state)
-    model_choice = selected_model.choose_model(params, section_state, StepOptions())[0]
-    return model_choice.model, model_choice.why
-
-
 def check_cycle_guess(cycle_guess: Any) -> Any:
     """Convert a user's guess to a cycle, a `CollocationState` or a finite section state.
 

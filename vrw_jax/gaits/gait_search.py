@@ -7,6 +7,7 @@ mesh is too coarse, it is refined. These fallbacks depend on concrete values. Un
 or `vmap`, only the search runs.
 """
 
+import dataclasses
 import functools
 from typing import Any, Literal, get_args, overload
 
@@ -31,33 +32,28 @@ from vrw_jax.gaits.attracting_gaits import find_attracting_gaits, find_slowest_g
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES
-from vrw_jax.gaits.finder import AbstractGaitFinder
 from vrw_jax.gaits.finder_selection import (
     UserCycleGuess,
     check_cycle_guess,
     resolve_finder,
-    resolve_model,
 )
-from vrw_jax.gaits.gait_walks import (
-    MAX_NEWTON_START_DEFECT,
-    MAX_SETTLED_DEFECT,
-    compute_fallback_walk_starts,
-    compute_walk_starts,
-    measure_period_defects,
-    walk_to_gaits,
+from vrw_jax.gaits.further_search import (
+    MeshSearch,
+    replace_rows,
+    search_further,
+    transfer_to_mesh,
 )
 from vrw_jax.gaits.hybrid_gait import HybridGait, find_hybrid_gait
 from vrw_jax.gaits.last_gait import describe_last_gait
-from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
+from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.models.batch_stiffness import SolverIndex, select_cheapest_solver
 from vrw_jax.models.step_batch import step_batch
-from vrw_jax.models.stepping import ModelLike
+from vrw_jax.models.stepping import ModelLike, convert_model_argument
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, stack_parameters
+from vrw_jax.wheel.params import WheelParams
 
 FailureFillName = Literal["zeros", "nan"]
 FAILURE_FILLS: tuple[str, ...] = get_args(FailureFillName)
@@ -254,6 +250,39 @@ def limit_cycles(
 LAST_GAIT_DESCRIBERS[:] = [functools.partial(describe_last_gait, limit_cycle, limit_cycles)]
 
 
+def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
+    """Return the model to which a wheel's gait belongs.
+
+    A ladder of models is replaced by the simplest model that is valid for the gait. The gait is
+    first computed with the paper's model. If this gait is not found or violates a margin on its
+    ground, a more general model is returned. If the parameters have no concrete values, the ladder
+    is returned unchanged. Any other model is also returned unchanged.
+    """
+    return resolve_model_with_reason(params, model)[0]
+
+
+def resolve_model_with_reason(
+    params: WheelParams, model: ModelLike | None
+) -> tuple[ModelLike | None, str | None]:
+    """Return the model to which a wheel's gait belongs and, for the ladder, the reason in one
+    sentence.
+    """
+    selected_model: Any = convert_model_argument(model)
+    if (
+        selected_model.fallback_model is selected_model
+        or not isinstance(params, WheelParams)
+        or has_traced_leaf(params, model)
+        or params.damping.ndim
+    ):
+        return model, None
+    paper_cycle = limit_cycle(params)
+    if not bool(paper_cycle.found):
+        return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.ending}"
+    section_state = selected_model.complete_section_state(params, paper_cycle.section_state)
+    model_choice = selected_model.choose_model(params, section_state, StepOptions())[0]
+    return model_choice.model, model_choice.why
+
+
 def parse_gait_choice(which: GaitChoice) -> int:
     """Return the index of the chosen gait in a list of gaits that are sorted by
     increasing speed.
@@ -334,8 +363,18 @@ def _search_with_fallbacks(
         else:
             guess_section_state = getattr(cycle_guess, "section_state", cycle_guess)
         section_state = np.asarray(lax.stop_gradient(guess_section_state))[None]
-    finder_and_starts = _find_fallback_starts(
-        gait_finder, *params_and_cycle, section_state, can_refine_mesh
+    finder_and_starts = _collect_starts_on_finest_mesh(
+        gait_finder,
+        params_and_cycle[1],
+        search_further(
+            find_cycles_from_starts,
+            gait_finder,
+            params_and_cycle[0],
+            summarize_search(params_and_cycle[1]),
+            batch_sizes.GAIT_BATCH_SIZES,
+            section_state,
+            can_refine_mesh,
+        ),
     )
     if gait_finder.period_n > 1 and section_state is not None:
         finder_and_starts = _choose_first_step(
@@ -343,21 +382,81 @@ def _search_with_fallbacks(
         )
     if finder_and_starts is None:
         return cycle
-    gait_finder, collocation_state = finder_and_starts
+    finest_finder, starts = finder_and_starts
     if are_params_concrete:
-        retried_cycle = drop_added_axis(
-            map_in_batches(
-                gait_finder.find_cycles,
-                batch_sizes.GAIT_BATCH_SIZES,
-                params_and_cycle[0],
-                collocation_state,
-            )
-        )  # a compiled program
-    else:
-        retried_cycle = _search_without_fallbacks(
-            gait_finder, params, jax.device_put(drop_added_axis(collocation_state))
+        return drop_added_axis(
+            _find_cycles_on_finest_mesh(gait_finder, finest_finder, *params_and_cycle, starts)
         )
+    retried_cycle = _search_without_fallbacks(
+        finest_finder, params, jax.device_put(drop_added_axis(starts)), starts_only_from_guess=True
+    )
     return _restore_first_failure_reason(cycle, retried_cycle)
+
+
+def summarize_search(cycle: LimitCycle) -> MeshSearch:
+    """Return the cycles of a batch with their mesh errors, from which a search goes on."""
+    mesh_error = map_in_batches(lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle)
+    return MeshSearch(cycle.outcome, mesh_error, cycle.collocation_state, cycle)
+
+
+def find_cycles_from_starts(
+    gait_finder: CollocationFinder, params: WheelParams, starts: CollocationState
+) -> MeshSearch:
+    """Search for the cycles of a batch from the given starts only."""
+    find_cycles = functools.partial(gait_finder.find_cycles, starts_only_from_guess=True)
+    return summarize_search(
+        map_in_batches(find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, starts)
+    )
+
+
+def _collect_starts_on_finest_mesh(
+    gait_finder: CollocationFinder,
+    cycle: LimitCycle,
+    gaits_by_mesh: list[tuple[CollocationFinder, np.ndarray, MeshSearch]],
+) -> tuple[CollocationFinder, CollocationState] | None:
+    """Return the finder of the finest mesh, and the state of each wheel on this mesh.
+
+    The result is None if there are no further gaits.
+    """
+    collocation_state = cycle.collocation_state
+    for mesh_finder, wheel_indices, mesh_search in gaits_by_mesh:
+        while gait_finder.cycle_options != mesh_finder.cycle_options:
+            finer_finder = gait_finder.with_finer_mesh()
+            collocation_state = transfer_to_mesh(
+                gait_finder, finer_finder, collocation_state, batch_sizes.GAIT_BATCH_SIZES
+            )
+            gait_finder = finer_finder
+        collocation_state = replace_rows(
+            collocation_state, wheel_indices, mesh_search.collocation_state
+        )
+    return (gait_finder, collocation_state) if gaits_by_mesh else None
+
+
+def _find_cycles_on_finest_mesh(
+    gait_finder: CollocationFinder,
+    finest_finder: CollocationFinder,
+    params: WheelParams,
+    cycle: LimitCycle,
+    starts: CollocationState,
+) -> LimitCycle:
+    """Return the cycles of a batch on one mesh. Wheels without a gait keep their first result."""
+    wheels_with_gait = np.flatnonzero(np.asarray(starts.has_cycle) > 0.5)
+    cycle_on_finest_mesh = dataclasses.replace(
+        cycle,
+        collocation_state=cycle.collocation_state._replace(solution=starts.solution),
+        system=finest_finder.collocation_system,
+    )
+    mesh_search = find_cycles_from_starts(
+        finest_finder, *select_tree_rows((params, starts), wheels_with_gait)
+    )
+    is_found = np.asarray(mesh_search.outcome) == Outcome.STEPPED
+    return jax.device_put(
+        replace_rows(
+            cycle_on_finest_mesh,
+            wheels_with_gait[is_found],
+            select_tree_rows(mesh_search.gaits, is_found),
+        )
+    )
 
 
 def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
@@ -382,12 +481,12 @@ def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) 
 
 
 def _search_without_fallbacks(
-    gait_finder: AbstractGaitFinder, params: WheelParams, cycle_guess: Any
+    gait_finder: Any, params: WheelParams, cycle_guess: Any, **search_options: bool
 ) -> Any:
     if not params.damping.ndim:
-        return gait_finder.find_cycle(params, cycle_guess)
+        return gait_finder.find_cycle(params, cycle_guess, **search_options)
     if cycle_guess is not None or has_traced_leaf(params):
-        return gait_finder.find_cycles(params, cycle_guess)
+        return gait_finder.find_cycles(params, cycle_guess, **search_options)
     return map_in_batches(gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
 
 
@@ -397,221 +496,6 @@ def _take_wheels_on_device(tree_over_wheels: Any, wheel_indices: Any) -> Any:
     NumPy selects the wheels, because JAX would compile a program for each shape.
     """
     return jax.device_put(select_tree_rows(tree_over_wheels, wheel_indices))
-
-
-def _replace_wheels(
-    tree_over_wheels: Any, wheel_indices: np.ndarray, tree_of_new_wheels: Any
-) -> Any:
-
-    def replace_wheel_rows(array_over_wheels: Any, array_of_new_wheels: Any) -> np.ndarray:
-        array_over_wheels = np.array(array_over_wheels)
-        array_over_wheels[wheel_indices] = array_of_new_wheels
-        return array_over_wheels
-
-    return jax.tree.map(replace_wheel_rows, tree_over_wheels, tree_of_new_wheels)
-
-
-def _find_walk_end_states(
-    gait_finder: CollocationFinder,
-    params: WheelParams,
-    is_walk_needed: np.ndarray,
-    guess_states_by_wheel: np.ndarray | None,
-) -> np.ndarray:
-    """Return for each wheel the state at the end of its walk with the smallest period defect.
-
-    The states are section states, shape (wheels, 3). A state is NaN if no walk of the wheel nearly
-    repeats, or if the wheel requires no walk. If a guess nearly repeats, it is returned instead of
-    the end of a walk. No walks are computed for wheels that are too stiff for explicit solvers.
-    With an implicit solver, the walks of one such wheel would take minutes.
-    """
-    # NumPy is used, because JAX would compile a program for each number of wheels.
-    parameter_matrix = np.stack([np.asarray(getattr(params, name)) for name in PARAMETER_NAMES])
-    solver_indices = select_cheapest_solver(parameter_matrix, StepOptions())
-    is_solver_explicit = solver_indices != SolverIndex.IMPLICIT_SOLVER
-    unsettled_wheel_indices = np.flatnonzero(is_walk_needed & is_solver_explicit)
-    parameter_values = parameter_matrix.T
-    walk_end_states = np.full((len(is_walk_needed), 3), np.nan)
-    smallest_period_defects = np.full(len(is_walk_needed), MAX_NEWTON_START_DEFECT)
-    if guess_states_by_wheel is not None:
-        guess_states = guess_states_by_wheel[unsettled_wheel_indices]
-        guess_defects = measure_period_defects(
-            gait_finder, parameter_values[unsettled_wheel_indices], guess_states
-        )
-        is_guess_usable = guess_defects < MAX_NEWTON_START_DEFECT
-        walk_end_states[unsettled_wheel_indices[is_guess_usable]] = guess_states[is_guess_usable]
-        unsettled_wheel_indices = unsettled_wheel_indices[~is_guess_usable]
-    for start_state_function in (compute_walk_starts, compute_fallback_walk_starts):
-        if not len(unsettled_wheel_indices):
-            break
-        wheel_indices, *walk_ends = walk_to_gaits(
-            gait_finder, parameter_values[unsettled_wheel_indices], start_state_function
-        )
-        for wheel_index, walk_end_state, period_defect in zip(
-            unsettled_wheel_indices[wheel_indices], *walk_ends, strict=True
-        ):
-            if period_defect < smallest_period_defects[wheel_index]:
-                smallest_period_defects[wheel_index] = period_defect
-                walk_end_states[wheel_index] = walk_end_state
-        has_not_settled = smallest_period_defects[unsettled_wheel_indices] >= MAX_SETTLED_DEFECT
-        unsettled_wheel_indices = unsettled_wheel_indices[has_not_settled]
-    return walk_end_states
-
-
-def _make_search_starts(
-    gait_finder: CollocationFinder,
-    params: WheelParams,
-    collocation_state: CollocationState,
-    has_known_state: np.ndarray,
-    walk_end_states: np.ndarray,
-) -> CollocationState:
-    """Return the start of the search for each wheel.
-
-    - `collocation_state`: starts of the wheels for which `has_known_state` is true;
-    - `walk_end_states`: section states, NaN if a wheel has none. They are the starts of wheels
-      without a known state.
-
-    The gait surface predicts the starts of all remaining wheels.
-    """
-    start_states = map_in_batches(
-        lambda batch_params: gait_finder.make_initial_guesses(stack_parameters(batch_params).T),
-        batch_sizes.GAIT_BATCH_SIZES,
-        params,
-    )
-    wheels_with_walk = np.flatnonzero(np.isfinite(walk_end_states[:, 0]) & ~has_known_state)
-    if len(wheels_with_walk):
-        start_states = _replace_wheels(
-            start_states,
-            wheels_with_walk,
-            map_in_batches(
-                jax.vmap(gait_finder.guess_cycle_from_state),
-                batch_sizes.GAIT_BATCH_SIZES,
-                _take_wheels_on_device(params, wheels_with_walk),
-                walk_end_states[wheels_with_walk],
-            ),
-        )
-    return _replace_wheels(
-        start_states, has_known_state, _take_wheels_on_device(collocation_state, has_known_state)
-    )
-
-
-# Estimated mesh error above which a finer mesh is used. The value is chosen because actual errors
-# are a hundredth of the estimate.
-MAX_UNREFINED_MESH_ERROR = 1e-7
-
-
-def _has_large_mesh_error(cycle: LimitCycle) -> np.ndarray:
-    """Return for each wheel whether its mesh error is too large without a finer mesh."""
-    mesh_errors = map_in_batches(
-        lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle
-    )
-    return np.asarray(mesh_errors) > MAX_UNREFINED_MESH_ERROR
-
-
-# Largest number of times that the number of mesh intervals is doubled.
-MAX_SEARCH_MESH_REFINEMENTS = 3
-
-
-def _find_fallback_starts(
-    gait_finder: CollocationFinder,
-    params: WheelParams,
-    cycle: LimitCycle,
-    guess_states_by_wheel: np.ndarray | None,
-    can_refine_mesh: bool,
-) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the starts from which it finds more gaits of a batch.
-
-    The result is None if no more gaits are found.
-
-    - `guess_states_by_wheel`: section states of the user's guesses, shape (wheels, 3);
-    - `can_refine_mesh`: whether a finer mesh may be used.
-    """
-    search_outcomes = np.asarray(cycle.outcome)
-    has_large_mesh_error = can_refine_mesh & _has_large_mesh_error(cycle)
-    is_gait_missing = np.isin(search_outcomes, RETRY_OUTCOMES)
-    needs_better_gait = is_gait_missing | has_large_mesh_error
-    if not needs_better_gait.any():
-        return None
-    walk_end_states = _find_walk_end_states(
-        gait_finder, params, is_gait_missing, guess_states_by_wheel
-    )
-    # `collocation_state` contains the best start so far of each wheel, on the last finder's mesh.
-    collocation_state = cycle.collocation_state
-    has_known_state = has_large_mesh_error.copy()
-    is_mesh_too_coarse = search_outcomes == Outcome.MESH_TOO_COARSE
-    best_finder_and_starts = None
-    n_refinements = MAX_SEARCH_MESH_REFINEMENTS if can_refine_mesh else 0
-    for refinement_index in range(1 + n_refinements):
-        if refinement_index:
-            coarser_finder = gait_finder
-            gait_finder = coarser_finder.with_finer_mesh()
-            transfer_solution = functools.partial(
-                transfer_solution_to_mesh,
-                coarser_finder.collocation_system,
-                gait_finder.collocation_system,
-            )
-            collocation_state = collocation_state._replace(
-                solution=map_in_batches(
-                    jax.vmap(transfer_solution),
-                    batch_sizes.GAIT_BATCH_SIZES,
-                    collocation_state.solution,
-                )
-            )
-        # The search without walks has already used this mesh. One finer mesh is always used.
-        is_retry_promising = (
-            np.isfinite(walk_end_states[:, 0])
-            | has_known_state
-            | (is_mesh_too_coarse & (refinement_index > 0))
-            | (refinement_index == 1)
-        )
-        retried_wheel_indices = np.flatnonzero(needs_better_gait & is_retry_promising)
-        if not len(retried_wheel_indices):
-            continue
-        retried_params = _take_wheels_on_device(params, retried_wheel_indices)
-        start_states = _make_search_starts(
-            gait_finder,
-            retried_params,
-            _take_wheels_on_device(collocation_state, retried_wheel_indices),
-            has_known_state[retried_wheel_indices],
-            walk_end_states[retried_wheel_indices],
-        )
-        retried_cycle = map_in_batches(
-            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, retried_params, start_states
-        )
-        # JAX would compile a comparison for every number of wheels.
-        retried_outcomes = np.asarray(retried_cycle.outcome)
-        is_gait_found = retried_outcomes == Outcome.STEPPED
-        found_wheel_indices = retried_wheel_indices[is_gait_found]
-        collocation_state = _replace_wheels(
-            collocation_state,
-            found_wheel_indices,
-            _take_wheels_on_device(retried_cycle.collocation_state, is_gait_found),
-        )
-        if len(found_wheel_indices):
-            best_finder_and_starts = gait_finder, collocation_state
-        has_known_state[found_wheel_indices] = True
-        is_mesh_too_coarse[retried_wheel_indices] = retried_outcomes == Outcome.MESH_TOO_COARSE
-        needs_better_gait[found_wheel_indices] = (
-            can_refine_mesh & _has_large_mesh_error(retried_cycle)[is_gait_found]
-        )
-    return best_finder_and_starts
-
-
-def search_again_from_walks(
-    gait_finder: Any, params: WheelParams, search_result: LimitCycle
-) -> LimitCycle:
-    """Search again for the wheels without a cycle, starting from walks on the same mesh.
-
-    Return the search result, completed by the cycles of the second search.
-    """
-    finder_and_starts = _find_fallback_starts(
-        gait_finder, params, search_result, None, can_refine_mesh=False
-    )
-    if finder_and_starts is None:
-        return search_result
-    retried_cycle = map_in_batches(
-        gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, finder_and_starts[1]
-    )
-    return _restore_first_failure_reason(search_result, retried_cycle)
 
 
 def _choose_first_step(

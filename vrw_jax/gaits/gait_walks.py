@@ -72,6 +72,32 @@ def compute_fallback_walk_starts(params: WheelParams) -> np.ndarray:
     return _make_section_states(wheels, angle_shares * wheels.leg_angle, rate_shares)
 
 
+def compute_all_walk_starts(params: WheelParams) -> np.ndarray:
+    """Return the section states of WALK_STARTS and FALLBACK_WALK_STARTS, in this order."""
+    return np.concatenate([compute_walk_starts(params), compute_fallback_walk_starts(params)])
+
+
+def can_walk_from_fast_starts(gait_finder: Any, parameter_values: np.ndarray) -> np.ndarray:
+    """Return for each wheel whether one of three walks from fast starts makes eight steps.
+
+    Wheels whose root has another order of events are worth more walks only in this case. Of 59 such
+    wheels with 8 legs to whose gaits walks led, 57 make these steps. Of 327 such wheels in the
+    paper's ranges, which have no gait, none does.
+    """
+    starts = compute_all_walk_starts(_split_parameter_values(gait_finder, parameter_values)[1])
+    walk_outcomes = _simulate_wheel_walks(
+        gait_finder,
+        np.tile(parameter_values, (len(FAST_START_INDICES), 1)),
+        np.concatenate(starts[list(FAST_START_INDICES)]),
+        N_WALK_STEPS_BY_ROUND[0],
+    )[1]
+    return (walk_outcomes == Outcome.STEPPED).reshape(-1, len(parameter_values)).any(0)
+
+
+FAST_START_INDICES = (2, 14, 17)
+"""Indices in the result of `compute_all_walk_starts` that `can_walk_from_fast_starts` uses."""
+
+
 def _make_section_states(
     wheels: WheelParams, touchdown_angles: np.ndarray, rolling_rate_shares: np.ndarray
 ) -> np.ndarray:

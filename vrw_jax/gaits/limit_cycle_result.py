@@ -236,15 +236,21 @@ _attach_monodromy_compiled = jax.jit(attach_monodromy_derivatives, static_argnum
 
 
 def solve_limit_cycle(
-    params: WheelParams, collocation_system: CollocationSystem, cycle_guess: CollocationState | None
+    params: WheelParams,
+    collocation_system: CollocationSystem,
+    cycle_guess: CollocationState | None,
+    starts_only_from_guess: bool = False,
 ) -> LimitCycle:
-    """Find the cycle of one wheel by the search, without fallbacks."""
+    """Find the cycle of one wheel on the mesh of the collocation system."""
     cycle_solver = _solve_limit_cycle if is_inside_jit() else _solve_limit_cycle_compiled
-    return cycle_solver(params, collocation_system, cycle_guess)
+    return cycle_solver(params, collocation_system, cycle_guess, starts_only_from_guess)
 
 
 def _solve_limit_cycle(
-    params: WheelParams, collocation_system: CollocationSystem, cycle_guess: CollocationState | None
+    params: WheelParams,
+    collocation_system: CollocationSystem,
+    cycle_guess: CollocationState | None,
+    starts_only_from_guess: bool,
 ) -> LimitCycle:
     """Find the cycle of one wheel by the search, outside compiled code."""
     is_in_domain = params.is_in_domain()
@@ -255,7 +261,9 @@ def _solve_limit_cycle(
     parameters = jnp.where(is_in_domain, parameters, table_1_parameters)
     searched_parameters = lax.stop_gradient(parameters)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
-        solve_cycle_with_derivatives(collocation_system, parameters, cycle_guess)
+        solve_cycle_with_derivatives(
+            collocation_system, parameters, cycle_guess, starts_only_from_guess
+        )
     )
     has_cycle = is_in_domain & (collocation_state.has_cycle > 0.5)
     # Inputs and outputs are masked, so that measures and derivatives are zero if there is no cycle.

@@ -14,8 +14,8 @@ from vrw_jax.gaits.finder_selection import (
     UserCycleGuess,
     check_cycle_guess,
     resolve_finder,
-    resolve_model,
 )
+from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.stepping import ModelLike

@@ -22,8 +22,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
-from vrw_jax.gaits.finder_selection import resolve_model
-from vrw_jax.gaits.gait_search import limit_cycle
+from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.lanes.autodiff import make_zero_tangent
 from vrw_jax.models.capabilities import PassageMethod
 from vrw_jax.models.stepping import (

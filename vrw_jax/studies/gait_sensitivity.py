@@ -13,8 +13,8 @@ from vrw_jax.base.printing import AbstractPrintable, LabelAndText, describe_step
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.finder import AbstractGaitFinder
-from vrw_jax.gaits.finder_selection import UserCycleGuess, resolve_finder, resolve_model
-from vrw_jax.gaits.gait_search import limit_cycle
+from vrw_jax.gaits.finder_selection import UserCycleGuess, resolve_finder
+from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.slope_response import compute_sensitivity_norms
 from vrw_jax.models.measures import (

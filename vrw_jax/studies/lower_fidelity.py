@@ -4,7 +4,7 @@ The Jacobians are used to propagate a defect of the return map to the measures.
 """
 
 import enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ import numpy as np
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.gait_search import search_again_from_walks
+from vrw_jax.gaits.further_search import search_further
+from vrw_jax.gaits.gait_search import find_cycles_from_starts, summarize_search
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.models.rigid import RigidWheel
@@ -42,13 +43,6 @@ MODEL_NAMES = (
 """Names of the models, in the order of `ModelIndex`."""
 
 SECTION_STATE_NAME = "section_state"
-
-FINAL_OUTCOMES = (Outcome.STEPPED, Outcome.EVENT_ORDER_MISMATCH)
-"""Outcomes of a gait search after which no walk is tried.
-
-They are chosen because few further gaits are reached. Of 210 wheels with 6 to 12 legs whose
-solution has another order of phases, only 3 reach a gait by a walk.
-"""
 
 
 class LowerFidelityGaits(NamedTuple):
@@ -91,20 +85,20 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
 
     The Jacobians are those of one walking step from each gait's section state.
     """
-    cycle_finder = make_finder(None, params.n_legs)
+    cycle_finder: Any = make_finder(None, params.n_legs)
     limit_cycles = map_in_batches(cycle_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
     section_states = np.array(limit_cycles.section_state)
     search_outcomes = np.array(limit_cycles.outcome)
-    (unsolved_wheel_indices,) = np.nonzero(~np.isin(search_outcomes, FINAL_OUTCOMES))
-    if len(
-        unsolved_wheel_indices
-    ):  # One mesh for all elements makes the digits independent of the batch.
-        limit_cycles = search_again_from_walks(
-            cycle_finder,
-            *jax.device_put(select_tree_rows((params, limit_cycles), unsolved_wheel_indices)),
-        )
-        section_states[unsolved_wheel_indices] = limit_cycles.section_state
-        search_outcomes[unsolved_wheel_indices] = limit_cycles.outcome
+    # Each element has its own mesh, so that its digits do not depend on the batch.
+    for _, wheel_indices, mesh_search in search_further(
+        find_cycles_from_starts,
+        cycle_finder,
+        params,
+        summarize_search(limit_cycles),
+        batch_sizes.GAIT_BATCH_SIZES,
+    ):
+        section_states[wheel_indices] = mesh_search.gaits.section_state
+        search_outcomes[wheel_indices] = mesh_search.outcome
     gaits_of_all_wheels = make_empty_gaits(len(section_states))
     gaits_of_all_wheels.search_outcomes[:] = search_outcomes
     (found_wheel_indices,) = np.nonzero(search_outcomes == Outcome.STEPPED)

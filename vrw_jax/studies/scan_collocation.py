@@ -1,13 +1,15 @@
-"""Steady gaits of many wheels by collocation, computed by one compiled function for batches of one
-size.
+"""Steady gaits of many wheels by the search of `vrw.limit_cycles`, with measures and derivatives.
 
 The samples are divided into batches of equal size, and the last batch is padded. The same compiled
 code evaluates every batch, so the result for a sample depends neither on its position nor on the
 other samples. Batches run in parallel with one compiled program: one thread per core, or one thread
-per GPU.
+per GPU. Samples that need walks or finer meshes are then gathered in smaller batches of one size.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from threading import Lock
@@ -20,11 +22,17 @@ from jaxtyping import Array
 from vrw_jax import lanes
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
-from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.finder import confirm_outcome_by_step
 from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.further_search import MeshSearch, replace_rows, search_further
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.lanes.batching import choose_batch_size
+from vrw_jax.lanes.batching import (
+    choose_batch_size,
+    concatenate_tree_rows,
+    map_in_numpy_batches,
+    select_tree_rows,
+)
 from vrw_jax.lanes.saved_traces import compile_exported_function
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import MARGIN_MEASURES
@@ -39,7 +47,7 @@ from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, make_wheel_from_parameters
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
-"""Outcome of the search for a gait, section state of the gait, and measures of the gait by name."""
+"""Outcome of a gait step, section state at its end, and measures of the step by name."""
 
 
 class EvaluationRequest(NamedTuple):
@@ -81,9 +89,10 @@ class EvaluationRequest(NamedTuple):
 class CollocationScanEngine:
     """Scan engine for the paper's model and a fixed set of measures, compiled on the first call.
 
-    The engine computes each limit cycle and the requested derivatives by collocation. It then
-    computes one event-driven gait step from the cycle, which gives the margins and checks the
-    cycle. The two functions are compiled in parallel.
+    The engine computes each limit cycle and the requested derivatives by collocation. It searches
+    further for the missing gaits, as `vrw.limit_cycles` does. It then computes one event-driven
+    gait step from each cycle, which gives the margins and checks the cycle. The two functions for
+    all samples are compiled in parallel.
     """
 
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None = None) -> None:
@@ -102,27 +111,35 @@ class CollocationScanEngine:
             list(map(PARAMETER_NAMES.index, differentiation_parameters)), int
         )
         n_legs = base_wheel.n_legs
-        gait_finder = make_finder(
+        gait_finder: Any = make_finder(
             wheel_model, n_legs, cycle_options=cycle_options, step_options=step_options
         )
 
-        def evaluate_cycle(parameter_values: Array) -> GaitOutputs:
-            """Return outcome, section state, measures and derivatives of the limit cycle for one
-            vector of parameters.
+        def evaluate_cycle(
+            cycle_options: CycleOptions, parameter_values: Array, *search_start: CollocationState
+        ) -> tuple:
+            """Return the entries of a `MeshSearch` for one vector of parameters.
+
+            Its gaits consist of the section state, the measures and the derivatives of the cycle.
+
+            - `search_start`: the only start of the search; without it, all attempts are made.
             """
 
             def find_measures_and_cycle(
                 differentiated_parameter_values: Array,
-            ) -> tuple[dict[str, Array], AbstractCycle]:
-                limit_cycle = gait_finder.find_cycle_from_values(
+            ) -> tuple[dict[str, Array], Any]:
+                limit_cycle = mesh_finder.find_cycle_from_values(
                     parameter_values.at[differentiated_parameter_indices].set(
                         differentiated_parameter_values
-                    )
+                    ),
+                    *search_start,
+                    starts_only_from_guess=bool(search_start),
                 )
                 return limit_cycle.measures(
                     derivative.measure_name for derivative in requested_derivatives
                 ), limit_cycle
 
+            mesh_finder = dataclasses.replace(gait_finder, cycle_options=cycle_options)
             if requested_derivatives:
                 find_measures_and_cycle = jax.jacfwd(find_measures_and_cycle, has_aux=True)
             measure_jacobian, limit_cycle = find_measures_and_cycle(
@@ -133,16 +150,17 @@ class CollocationScanEngine:
                 for measure_name in measure_names
                 if measure_name in DIFFERENTIABLE_MEASURES
             ]
+            measures = limit_cycle.measures([*cycle_measure_names, "spectral_radius"]) | {
+                derivative.variable_name: measure_jacobian[derivative.measure_name][
+                    differentiation_parameters.index(derivative.parameter_name)
+                ]
+                for derivative in requested_derivatives
+            }
             return (
                 limit_cycle.outcome,
-                limit_cycle.section_state,
-                limit_cycle.measures([*cycle_measure_names, "spectral_radius"])
-                | {
-                    derivative.variable_name: measure_jacobian[derivative.measure_name][
-                        differentiation_parameters.index(derivative.parameter_name)
-                    ]
-                    for derivative in requested_derivatives
-                },
+                limit_cycle.mesh_error,
+                limit_cycle.collocation_state,
+                (limit_cycle.section_state, measures),
             )
 
         def evaluate_confirming_step(
@@ -162,7 +180,9 @@ class CollocationScanEngine:
             }
             return step_result.outcome, step_result.section_state, step_measures
 
-        self._evaluate_cycle_batch = jax.vmap(evaluate_cycle)
+        self._gait_finder = gait_finder
+        self._evaluate_cycle = evaluate_cycle
+        self._evaluate_cycle_batch = jax.vmap(functools.partial(evaluate_cycle, cycle_options))
         self._evaluate_step_batch: Callable = jax.vmap(
             evaluate_confirming_step, in_axes=(0, 0, None)
         )
@@ -171,6 +191,7 @@ class CollocationScanEngine:
         )
         self._free_programs: SimpleQueue[_CompiledDevicePrograms] = SimpleQueue()
         self._n_workers, self._compilation_lock = 0, Lock()
+        self._programs_by_mesh: dict[CycleOptions, Callable] = {}
 
     def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
         """Return the value of each variable for all samples, by the name of the variable.
@@ -181,51 +202,85 @@ class CollocationScanEngine:
         with self._compilation_lock:
             if not self._n_workers:
                 self._compile_programs()
-        parameter_batches = (
-            parameter_rows[first_sample_index : first_sample_index + self._batch_size]
-            for first_sample_index in range(0, len(parameter_rows), self._batch_size)
+        first_search = MeshSearch(
+            *self._map_in_threads(self._run_cycle_program, self._batch_size, parameter_rows)
+        )
+        cycle_outcomes, gaits = np.array(first_search.outcome), first_search.gaits
+        for _, sample_indices, mesh_search in search_further(
+            self._find_gaits_from_starts,
+            self._gait_finder,
+            make_wheel_from_parameters(
+                tuple(jax.device_put(list(parameter_rows.T))),
+                self._evaluation_request.base_wheel.n_legs,
+            ),
+            first_search,
+            (batch_sizes.GAIT_READ_BATCH_SIZE,),
+            # A mesh that the user has chosen is fixed.
+            can_refine_mesh=self._gait_finder.cycle_options == CycleOptions(),
+        ):
+            cycle_outcomes[sample_indices] = mesh_search.outcome
+            gaits = replace_rows(gaits, sample_indices, mesh_search.gaits)
+        section_states, cycle_measures = gaits
+        step_outcomes, step_end_states, step_measures = self._map_in_threads(
+            self._run_step_program, self._batch_size, parameter_rows, section_states
+        )
+        confirmed_outcomes = confirm_outcome_by_step(
+            cycle_outcomes, section_states, step_outcomes, step_end_states
+        )
+        return mask_failed_samples(confirmed_outcomes, cycle_measures | step_measures)
+
+    def _map_in_threads(self, function: Callable, batch_size: int, *trees: Any) -> Any:
+        """Apply a function of batches of one size to trees of arrays, in all threads."""
+        batches = [
+            select_tree_rows(trees, slice(first_row, first_row + batch_size))
+            for first_row in range(0, len(jax.tree.leaves(trees)[0]), batch_size)
+        ]
+        evaluate_batch = with_default_jax_settings(  # Threads have separate settings.
+            lambda batch: map_in_numpy_batches(function, (batch_size,), *batch)
         )
         with ThreadPoolExecutor(self._n_workers) as scan_thread_pool:
-            results_by_batch = list(
-                scan_thread_pool.map(self._evaluate_sample_batch, parameter_batches)
+            return concatenate_tree_rows(*scan_thread_pool.map(evaluate_batch, batches))
+
+    def _run_cycle_program(self, parameter_rows: np.ndarray) -> tuple:
+        with self._take_programs() as (device, cycle_program, _):
+            return cycle_program(jax.device_put(parameter_rows, device))
+
+    def _run_step_program(self, parameter_rows: np.ndarray, section_states: np.ndarray) -> tuple:
+        with self._take_programs() as (device, _, step_program):
+            return step_program(
+                *jax.device_put(
+                    (parameter_rows, section_states, self._evaluation_request.step_options), device
+                )
             )
-        return {
-            variable_name: variable_values[: len(parameter_rows)]
-            for variable_name, variable_values in concatenate_results(results_by_batch).items()
-        }
 
-    @with_default_jax_settings  # It runs in a thread of its own.
-    def _evaluate_sample_batch(self, parameter_rows: np.ndarray) -> ValuesByVariable:
-        """Return the value of each variable for a batch of samples, by the name of the variable.
-
-        A small batch is padded with copies of its first wheel.
-
-        - `parameter_rows`: parameters of the wheels, shape (samples, parameters).
-        """
-        padded_parameter_rows = np.concatenate(
-            [
-                parameter_rows,
-                np.repeat(parameter_rows[:1], self._batch_size - len(parameter_rows), 0),
-            ]
-        )
+    @contextlib.contextmanager
+    def _take_programs(self) -> Iterator["_CompiledDevicePrograms"]:
+        """Return a context in which one thread uses the programs of a device."""
         device_programs = self._free_programs.get()
         try:
-            device_parameter_rows = jax.device_put(padded_parameter_rows, device_programs.device)
-            cycle_outcome, cycle_section_state, cycle_measures = device_programs.cycle_program(
-                device_parameter_rows
-            )
-            device_step_options = jax.device_put(
-                self._evaluation_request.step_options, device_programs.device
-            )
-            step_outcome, step_end_state, step_measures = device_programs.step_program(
-                device_parameter_rows, cycle_section_state, device_step_options
-            )
-            confirmed_outcome = confirm_outcome_by_step(
-                cycle_outcome, cycle_section_state, step_outcome, step_end_state
-            )
+            yield device_programs
         finally:
             self._free_programs.put(device_programs)
-        return mask_failed_samples(confirmed_outcome, cycle_measures | step_measures)
+
+    def _find_gaits_from_starts(
+        self, gait_finder: Any, params: WheelParams, starts: CollocationState
+    ) -> MeshSearch:
+        """Search for gaits on the mesh of `gait_finder` from the given starts."""
+        parameter_rows = np.stack([getattr(params, name) for name in PARAMETER_NAMES], -1)
+        batch_size = batch_sizes.GAIT_READ_BATCH_SIZE
+        with self._compilation_lock:
+            cycle_program = self._programs_by_mesh.get(gait_finder.cycle_options)
+            if cycle_program is None:
+                cycle_program = compile_exported_function(
+                    jax.vmap(functools.partial(self._evaluate_cycle, gait_finder.cycle_options)),
+                    jax.tree.map(
+                        lambda x: jax.ShapeDtypeStruct((batch_size, *x.shape[1:]), x.dtype),
+                        (parameter_rows, starts),
+                    ),
+                    jax.local_devices()[0],
+                )
+                self._programs_by_mesh[gait_finder.cycle_options] = cycle_program
+        return MeshSearch(*self._map_in_threads(cycle_program, batch_size, parameter_rows, starts))
 
     def _compile_programs(self) -> None:
         """Compile the functions for cycles and for gait steps in parallel, once for each device.

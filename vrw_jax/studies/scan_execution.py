@@ -97,7 +97,8 @@ def scan(
             paper.
         model: model of the wheel; "auto" for the simplest valid model for each sample.
         options: numerical options of the gait steps that check the gaits.
-        cycle_options: numerical options of the search for gaits.
+        cycle_options: numerical options of the search for gaits. By default, the mesh of each
+            sample is refined until its gait is accurate, and otherwise the mesh is fixed.
         store: local folder to which the result is written, not a URL; may begin with `~`.
         chunk: number of samples that are written at a time; 4,096 by default.
         on_progress: function that is called with the `ScanProgress` after each chunk.

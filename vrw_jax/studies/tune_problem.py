@@ -39,7 +39,8 @@ from vrw_jax.gaits.finder import (
     evaluate_on_gaits,
     is_same_branch,
 )
-from vrw_jax.gaits.finder_selection import make_finder, resolve_model
+from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.margin_defaults import default_margins
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.models.measures import (
