@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from support.machine_code import CodeRegistrySpy, disable_machine_code
+from support.machine_code import CodeRegistrySpy, disable_machine_code, use_cache_folder
 
 from vrw_jax import lanes
 
@@ -164,7 +164,7 @@ def test_derivatives_of_every_mode_agree_with_an_unrolled_loop(transform):
     assert_equal_trees(actual, transform(unroll)(jnp.asarray(X[0]), LAW))
 
 
-def test_other_numbers_in_closures_trace_nothing_anew(monkeypatch):
+def test_other_numbers_in_closures_trace_nothing_anew(monkeypatch, tmp_path):
     class Law(eqx.Module):
         stiffness: float
         table: np.ndarray
@@ -177,12 +177,13 @@ def test_other_numbers_in_closures_trace_nothing_anew(monkeypatch):
         inner = lambda x: law.force(x) + shift
         return lambda x: inner(x) * stiffness
 
-    spy = CodeRegistrySpy(monkeypatch)
-    for stiffness, shift in ((2.0, 1.0), (3.0, -1.0), (4.0, 0.5)):
-        compiled = lanes.jit(make(stiffness, shift))
-        expected = stiffness * (stiffness * X + 2.0 * shift)
-        np.testing.assert_allclose(compiled.batch(X), expected, rtol=1e-14, atol=1e-14)
-    assert spy.n_traces == 1
+    with use_cache_folder(tmp_path):
+        spy = CodeRegistrySpy(monkeypatch)
+        for stiffness, shift in ((2.0, 1.0), (3.0, -1.0), (4.0, 0.5)):
+            compiled = lanes.jit(make(stiffness, shift))
+            expected = stiffness * (stiffness * X + 2.0 * shift)
+            np.testing.assert_allclose(compiled.batch(X), expected, rtol=1e-14, atol=1e-14)
+        assert spy.n_traces == 1
     # Derivatives with respect to a number of the closure.
     slope = jax.grad(lambda k: lanes.jit(make(k, 1.0))(0.5))(2.0)
     assert slope == pytest.approx(2.0 * 2.0 * 0.5 + 2.0, rel=1e-14)
