@@ -193,9 +193,10 @@ def convert_step_arguments(
             f"dL1-), shape (3,){full_state_shape_text}: for batches map over it with jax.vmap."
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
-    StepOptions.check_tolerances(options, jnp.result_type(*jax.tree.leaves(params)))
+    parameter_dtype = jnp.result_type(*jax.tree.leaves(params))
     common_dtype = jnp.result_type(section_state, params.damping)
-    StepOptions.check_tolerances(options, common_dtype)
+    for dtype in {parameter_dtype, common_dtype}:
+        StepOptions.check_tolerances(options, dtype)
 
     converted_arguments = params, section_state, options
     if any(leaf.dtype != common_dtype for leaf in jax.tree.leaves(converted_arguments)):
