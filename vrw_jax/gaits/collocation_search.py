@@ -686,10 +686,9 @@ def _run_search_attempt(
         is_before_target & (failed_check == FAILED_MESH_CHECK_CODE)
     )
     homotopy_check = jnp.where(is_segment_solved, 0.0, homotopy_check)
-    # The long search without double support may end far from the border of the gaits.
+    # The long search without double support may end far from gaits, which is no reason.
     failed_check = jnp.where(
-        (attempt_index == N_DIRECT_ATTEMPTS - 1)
-        & collocation_system.is_beyond_border(failed_check, False),
+        (attempt_index == N_DIRECT_ATTEMPTS - 1) & (failed_check != FAILED_MESH_CHECK_CODE),
         0.0,
         failed_check,
     )
