@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from vrw_jax.app.explorer import explore
 from vrw_jax.base.checks import format_name_suggestion
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import parameter
 from vrw_jax.base.start import start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
@@ -123,6 +124,7 @@ __all__ = (
     "multifidelity_mean",
     "open_scan",
     "paper_start",
+    "parameter",
     "parameter_sets",
     "plot",
     "return_map",

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import DOP853
+from scipy.integrate import DOP853, quad
 from scipy.optimize import brentq
 
 from . import five_coordinates_equations as equations
 
 Array = NDArray[Any]
-Params = Mapping[str, float]
+Params = Mapping[str, Any]
 
 NO_EVENT = "no touchdown in time"
 MAX_PHASE_TIME = 20.0  # s
@@ -47,11 +47,28 @@ class Wheel:
         object.__setattr__(self, "pack", pack)
 
     def spring_damper(self, q: Array, v: Array) -> Array:
-        """Viscoelastic force tau_ve, eq. (3)."""
-        k, c, natural = (self.params[name] for name in ("stiffness", "damping", "natural_length"))
+        """Viscoelastic force tau_ve, eq. (3), or that of another law of the legs."""
         tau = np.zeros(5)
-        tau[3:] = -k * (q[3:] - natural) - c * v[3:]
+        tau[3:] = self.leg_force(q[3:], v[3:])
         return tau
+
+    def leg_force(self, length: Array, rate: Array) -> Array:
+        """Force along a leg by eq. (3), or by the function ``leg_force`` of the parameters, N."""
+        if "leg_force" in self.params:
+            return self.params["leg_force"](length, rate)
+        k, c, natural = (self.params[name] for name in ("stiffness", "damping", "natural_length"))
+        return -k * (length - natural) - c * rate
+
+    def damping_power(self, length: Array, rate: Array) -> float:
+        """Power that the legs dissipate, eq. (29), W."""
+        if "leg_force" not in self.params:
+            return self.params["damping"] * float(rate @ rate)
+        static_force = self.leg_force(length, 0.0 * rate)
+        return float(np.sum((static_force - self.leg_force(length, rate)) * rate))
+
+    def elastic(self, length: float) -> float:
+        """Elastic energy of a leg of another law, from its locked length, by quadrature, J."""
+        return quad(self.leg_force, length, self.params["locked_length"], (0.0,), epsabs=1e-13)[0]
 
     def acceleration(self, q: Array, v: Array, mode: str) -> tuple[Array, Array]:
         """q'' and the contact multipliers lambda1..lambda4 (zero where there is no contact)."""
@@ -88,6 +105,9 @@ class Wheel:
 
     def energy(self, q: Array, v: Array) -> float:
         """Mechanical energy of eqs (26), (27) with n - 2 locked legs, J."""
+        if "leg_force" in self.params:
+            elastic = sum(map(self.elastic, q[3:]))
+            return float(sum(equations.energies(q, v, self.pack))) + elastic
         k, natural = self.params["stiffness"], self.params["natural_length"]
         preload = (self.params["n_legs"] - 2) * (self.params["locked_length"] - natural) ** 2
         elastic = 0.5 * k * (float(np.sum((q[3:] - natural) ** 2)) + preload)
@@ -165,11 +185,10 @@ def run_phase(
     max_step: float,
 ) -> Phase:
     """Integrate one phase from (q, v) until the earliest guard falls through zero."""
-    c = wheel.params["damping"]
 
     def rhs(_: float, y: Array) -> Array:
         accelerations = wheel.acceleration(y[:5], y[5:10], mode)[0]
-        power = c * (y[8] ** 2 + y[9] ** 2)  # eq. (29)
+        power = wheel.damping_power(y[3:5], y[8:10])
         return np.concatenate([y[5:10], accelerations, [power]])
 
     def value(name: str, y: Array) -> float:

@@ -92,7 +92,7 @@ def contact_forces(wheel: Wheel, q: Array, v: Array, a: Array, mode: str) -> Arr
     total = np.sum(demands, axis=0)
     if mode != "DLS":
         return np.array([*total, 0.0, 0.0])
-    push = params["stiffness"] * (params["natural_length"] - q[3:]) - params["damping"] * v[3:]
+    push = wheel.leg_force(q[3:], v[3:])
     angles = q[2], q[2] + wheel.alpha
     axial_parts = [demands[i + 1] @ _radial(angles[i]) + push[i] for i in range(2)]
     return _split(total, axial_parts[0], axial_parts[1], *angles)
@@ -106,7 +106,7 @@ def stopper_forces(wheel: Wheel, q: Array, v: Array, a: Array) -> Array:
     """
     params = wheel.params
     gravity = params["gravity"] * np.array([math.sin(params["slope"]), -math.cos(params["slope"])])
-    preload = params["stiffness"] * (params["natural_length"] - params["locked_length"])
+    preload = wheel.leg_force(params["locked_length"], 0.0)
     accelerations = mass_accelerations(wheel, q, v, a)
     return np.array(
         [

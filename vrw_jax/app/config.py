@@ -442,7 +442,7 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
         for setting_name, setting_value in tables["model"].items()
         if setting_name != "name"
     }
-    parameter_names = model_class.parameter_names
+    parameter_names = model_class().parameter_names
     sample_design = None
     if design_kinds:
         design_kind = design_kinds[0]

@@ -1,6 +1,7 @@
 """Text for results: labeled lines, tables, symbols as mathtext, and sentences for status codes."""
 
 import abc
+import dataclasses
 import enum
 import re
 import unicodedata
@@ -18,12 +19,16 @@ LabelAndText = tuple[str, str]
 def has_concrete_numbers(result_tree: Any) -> bool:
     """Return whether all fields of a result are set and all its numbers are concrete.
 
-    Inside `jit`, numbers are not concrete.
+    Inside `jit`, numbers are not concrete. Fields that no caller gives, such as the leg force of a
+    wheel, may be None.
     """
     is_leaf_concrete = lambda result_leaf: (
         eqx.is_array_like(result_leaf) and not isinstance(result_leaf, int | jax.core.Tracer)
     )
-    has_all_fields = not any(field_value is None for field_value in vars(result_tree).values())
+    has_all_fields = not any(
+        field.init and getattr(result_tree, field.name) is None
+        for field in dataclasses.fields(result_tree)
+    )
     return has_all_fields and all(map(is_leaf_concrete, jax.tree.leaves(result_tree)))
 
 

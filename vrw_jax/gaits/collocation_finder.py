@@ -47,12 +47,7 @@ from vrw_jax.models.step_results import AbstractStep, SectionState, StepResult
 from vrw_jax.models.stepping import convert_step_arguments
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.params import (
-    PARAMETER_NAMES,
-    WheelParams,
-    make_wheel_from_parameters,
-    stack_parameters,
-)
+from vrw_jax.wheel.params import WheelParams
 
 
 class CollocationFinder(AbstractGaitFinder):
@@ -92,7 +87,11 @@ class CollocationFinder(AbstractGaitFinder):
     def collocation_system(self) -> CollocationSystem:
         """Return the collocation system that the search solves."""
         return CollocationSystem(
-            self.n_legs, self.period_n, self.cycle_options, self.model.stop_at_lift_off
+            self.n_legs,
+            self.period_n,
+            self.cycle_options,
+            self.model.stop_at_lift_off,
+            jax.tree.structure(self.model.leg_force),
         )
 
     def with_finer_mesh(self) -> "CollocationFinder":
@@ -115,6 +114,7 @@ class CollocationFinder(AbstractGaitFinder):
     def find_cycle(
         self, params: WheelParams, cycle_guess: Any = None, starts_only_from_guess: bool = False
     ) -> LimitCycle:
+        params = self.model.attach_leg_force(params)
         if isinstance(cycle_guess, LimitCycle) and cycle_guess.system == self.collocation_system:
             cycle_guess = cycle_guess.collocation_state
         elif cycle_guess is not None and not isinstance(cycle_guess, CollocationState):
@@ -123,7 +123,7 @@ class CollocationFinder(AbstractGaitFinder):
             cycle_guess = self.guess_cycle_from_state(*lax.stop_gradient((params, section_state)))
         return dataclasses.replace(
             solve_limit_cycle(params, self.collocation_system, cycle_guess, starts_only_from_guess),
-            model=self.model,
+            model=self.model.with_leg_force_of(params),
         )
 
     def find_cycles(
@@ -140,6 +140,7 @@ class CollocationFinder(AbstractGaitFinder):
         """Compute a guess of the cycle from a walk of `period_n` gait steps that starts at
         `section_state`.
         """
+        params = self.model.attach_leg_force(params)
         walk_samples = sample_walk_in_time(self.model, params, section_state, self.period_n)
         return guess_cycle_from_walk(self.collocation_system, params, walk_samples)
 
@@ -174,8 +175,8 @@ class CollocationFinder(AbstractGaitFinder):
             self.collocation_system, parameter_values, cycle_guess
         )
         step, step_derivatives = compute_step_and_derivatives(
+            self.collocation_system,
             self.model,
-            self.n_legs,
             parameter_values,
             cycle.section_state,
             cycle_derivatives.section_state,
@@ -215,12 +216,12 @@ class CollocationFinder(AbstractGaitFinder):
         )
 
     def precompile_programs(self, params: WheelParams) -> None:
-        parameter_values = stack_parameters(params)
+        parameter_values = self.model.collect_parameter_values(params)
         section_state = jnp.asarray(
             self.model.compute_default_start(params), parameter_values.dtype
         )
         section_state_derivatives = jnp.zeros(
-            (len(PARAMETER_NAMES), section_state.shape[0]), section_state.dtype
+            (len(parameter_values), section_state.shape[0]), section_state.dtype
         )
         with ThreadPoolExecutor(2) as compile_pool:
             cycle_program_future = compile_pool.submit(
@@ -231,8 +232,8 @@ class CollocationFinder(AbstractGaitFinder):
             )
             step_program_future = compile_pool.submit(
                 with_default_jax_settings(compute_step_and_derivatives),
+                self.collocation_system,
                 self.model,
-                self.n_legs,
                 parameter_values,
                 section_state,
                 section_state_derivatives,
@@ -251,7 +252,7 @@ def compute_cycle_and_derivatives(
     """
 
     find_cycle = lambda parameter_values: solve_limit_cycle(
-        make_wheel_from_parameters(parameter_values, collocation_system.n_legs),
+        collocation_system.make_wheel(parameter_values),
         collocation_system,
         cycle_guess,
     )
@@ -261,8 +262,8 @@ def compute_cycle_and_derivatives(
 
 @eqx.filter_jit
 def compute_step_and_derivatives(
+    collocation_system: CollocationSystem,
     model: ViscoelasticWheel,
-    n_legs: int,
     parameter_values: Array,
     section_state: Array,
     section_state_derivatives: Array,
@@ -277,7 +278,7 @@ def compute_step_and_derivatives(
 
     n_parameter_values = len(parameter_values)
     take_step = lambda step_inputs: model.take_step(
-        make_wheel_from_parameters(step_inputs[:n_parameter_values], n_legs),
+        collocation_system.make_wheel(step_inputs[:n_parameter_values]),
         step_inputs[n_parameter_values:],
         options,
     )

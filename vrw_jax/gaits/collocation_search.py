@@ -40,14 +40,21 @@ from vrw_jax.gaits.phase_collocation import (
 )
 from vrw_jax.gaits.phase_sequence import (
     ADMISSIBILITY_CHECKS,
+    N_LAW_SCALES,
     compute_phase_constants,
     make_post_impact_sequence,
 )
 from vrw_jax.lanes.batching import BatchFunction
-from vrw_jax.wheel.params import WheelParams, make_wheel_from_parameters, stack_parameters
+from vrw_jax.wheel.params import (
+    NO_LEG_FORCE,
+    PARAMETER_NAMES,
+    WheelParams,
+    make_wheel_from_parameters,
+    stack_parameters,
+)
 
 LaneParameters = Float[Array, "n_parameters lanes"]
-"""Parameters of each wheel (lane) as floats, in the order of PARAMETER_NAMES."""
+"""Parameters of each wheel (lane) as floats, in the order of `stack_parameters`."""
 
 
 class CollocationSystem(NamedTuple):
@@ -57,11 +64,14 @@ class CollocationSystem(NamedTuple):
     period_n: int
     cycle_options: CycleOptions
     stop_at_lift_off: bool = True  # whether the normal force must be positive in an admissible gait
+    leg_force_structure: Any = NO_LEG_FORCE
 
     @property
     def phase_sequence(self) -> PhaseSequence:
         """Return the phases of one gait step and the functions that describe them."""
-        return make_post_impact_sequence(self.n_legs, self.stop_at_lift_off)
+        return make_post_impact_sequence(
+            self.n_legs, self.stop_at_lift_off, self.leg_force_structure
+        )
 
     @property
     def phase_meshes(self) -> tuple[PhaseMesh, ...]:
@@ -78,7 +88,13 @@ class CollocationSystem(NamedTuple):
         """Return the function that maps the parameters to the constants of the
         equations of motion.
         """
-        return functools.partial(compute_phase_constants, self.n_legs)
+        return functools.partial(compute_phase_constants, self.n_legs, self.leg_force_structure)
+
+    def make_wheel(self, parameters: Array) -> WheelParams:
+        """Return the wheel with the parameters on the first axis, in SI units."""
+        return make_wheel_from_parameters(
+            parameters, self.n_legs, leg_force_structure=self.leg_force_structure
+        )
 
     def is_beyond_border(self, failed_check: Any, has_dls: Any) -> Any:
         """Return for each wheel whether its root shows that it is just beyond the border of its
@@ -87,12 +103,16 @@ class CollocationSystem(NamedTuple):
         The force on the rear foot then has the wrong sign, or the next foot meets the ground too
         early after double support. Neither a homotopy nor walks lead to a gait of such a wheel:
         none of 1,900 such wheels with 8 legs had one. With 6 or 16 legs, 9 of 600 had one, so
-        that the result is false for all wheels with another number of legs than 8.
+        that the result is false for all wheels with another number of legs than 8. It is false
+        with a user's law of the legs too, for which no such numbers are known.
 
         - `failed_check`: `CollocationState.failed_check` of the root;
         - `has_dls`: whether the root has double support.
         """
-        return (self.n_legs == WheelParams().n_legs) & (
+        is_paper_wheel = (
+            self.n_legs == WheelParams().n_legs and self.leg_force_structure == NO_LEG_FORCE
+        )
+        return is_paper_wheel & (
             (failed_check == REAR_FORCE_CHECK_CODES[0])
             | (failed_check == REAR_FORCE_CHECK_CODES[1])
             | ((failed_check == EARLY_TOUCHDOWN_CHECK_CODE) & has_dls)
@@ -185,7 +205,7 @@ class CollocationSystem(NamedTuple):
         """Return the lowest acceleration of the rear foot at take-off over the gait steps of one
         wheel, m/s^2.
         """
-        s = make_wheel_from_parameters(parameters, self.n_legs).symbols()
+        s = self.make_wheel(parameters).symbols()
         points_by_step = self.evaluate_phase_points(parameters, collocation_solution)
         return jnp.min(
             jnp.stack(
@@ -252,7 +272,7 @@ def predict_start_from_gait_surface(
     Without DLS, the duration of SLS-I includes that of DLS.
     """
     predicted_solution = predict_gait(
-        make_wheel_from_parameters(parameters, collocation_system.n_legs),
+        make_wheel_from_parameters(parameters[: len(PARAMETER_NAMES)], collocation_system.n_legs),
         collocation_system.phase_meshes,
     )
     dls_duration, sls1_duration, sls2_duration = predicted_solution.durations[0]
@@ -628,9 +648,22 @@ def _run_search_attempt(
     is_before_target = is_on_segment & (search_attempt.homotopy_segment < N_HOMOTOPY_SEGMENTS)
     is_second_try = search_attempt.is_second_try == 1
     table_1_wheel = WheelParams(n_legs=collocation_system.n_legs)
+    n_wheel_parameters = len(PARAMETER_NAMES)
     table_1_parameters = jnp.broadcast_to(
-        stack_parameters(table_1_wheel).astype(parameters.dtype)[:, None], parameters.shape
+        stack_parameters(table_1_wheel).astype(parameters.dtype)[:, None],
+        (n_wheel_parameters, *parameters.shape[1:]),
     )
+    if collocation_system.leg_force_structure != NO_LEG_FORCE:
+        # The homotopy begins with the paper's force, so the share of the law is zero there.
+        share_index = len(parameters) - N_LAW_SCALES
+        table_1_parameters = jnp.concatenate(
+            [
+                table_1_parameters,
+                parameters[n_wheel_parameters:share_index],
+                jnp.zeros_like(parameters[:1]),
+                parameters[share_index + 1 :],
+            ]
+        )
     homotopy_fraction = (
         search_attempt.homotopy_segment.astype(parameters.dtype) / N_HOMOTOPY_SEGMENTS
     )

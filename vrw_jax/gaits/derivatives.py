@@ -37,6 +37,7 @@ from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models import unit_scaling as scales
 from vrw_jax.wheel.params import (
+    NO_LEG_FORCE,
     PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     compute_symbols,
@@ -92,15 +93,31 @@ def _compute_monodromy_tangents(
     """Return the derivatives of the monodromy matrix with respect to the parameters on the branch.
 
     The parameters are on a leading axis. The directions are computed one after another, so that the
-    compiled program is as short as for one direction. Three of the nine derivatives follow from
-    changes of units. A change of the unit of mass scales hub mass and leg mass by one factor.
-    Therefore, of the derivatives with respect to the two masses, only the derivative in the
-    orthogonal direction is computed.
+    compiled program is as short as for one direction. With the paper's force, three of the nine
+    derivatives follow from changes of units. A change of the unit of mass scales hub mass and leg
+    mass by one factor. Therefore, of the derivatives with respect to the two masses, only the
+    derivative in the orthogonal direction is computed.
 
     - `solution_and_tangents`: the solution z and its derivatives dz/dp with respect to the
       parameters.
     """
     collocation_state, state_tangents = solution_and_tangents
+    identity_matrix = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
+    parameter_tangents = jnp.broadcast_to(identity_matrix, (len(parameters), *parameters.shape))
+
+    def compute_monodromy_jvps(directions: Any) -> tuple[Array, Array]:
+        return lax.map(
+            lambda tangents: jax.jvp(
+                functools.partial(_compute_masked_monodromy, collocation_system),
+                (parameters, collocation_state),
+                tangents,
+            ),
+            directions,
+        )
+
+    if collocation_system.leg_force_structure != NO_LEG_FORCE:
+        # The numbers of a law may have any units, so that units determine nothing.
+        return compute_monodromy_jvps((parameter_tangents, state_tangents))[1]
     hub_mass_index = PARAMETER_NAMES.index("hub_mass")
     leg_mass_index = PARAMETER_NAMES.index("leg_mass")
     total_mass = parameters[hub_mass_index] + parameters[leg_mass_index]
@@ -111,21 +128,14 @@ def _compute_monodromy_tangents(
         for i in range(len(parameters))
         if i not in (hub_mass_index, leg_mass_index, *scales.UNIT_SCALING_BY_PARAMETER_INDEX)
     ]
-    identity_matrix = jnp.eye(len(parameters), dtype=parameters.dtype)[..., None]
-    parameter_tangents = jnp.broadcast_to(identity_matrix, (len(parameters), *parameters.shape))
 
     def select_directions(x: Array) -> Array:
         """Return the tangents in the computed directions. The last one is that of the masses."""
         mass_tangent = hub_mass_share * x[leg_mass_index] - leg_mass_share * x[hub_mass_index]
         return jnp.stack([*(x[i] for i in unscaled_parameter_indices), mass_tangent])
 
-    monodromy_matrices, monodromy_tangents = lax.map(
-        lambda tangents: jax.jvp(
-            functools.partial(_compute_masked_monodromy, collocation_system),
-            (parameters, collocation_state),
-            tangents,
-        ),
-        jax.tree.map(select_directions, (parameter_tangents, state_tangents)),
+    monodromy_matrices, monodromy_tangents = compute_monodromy_jvps(
+        jax.tree.map(select_directions, (parameter_tangents, state_tangents))
     )
     tangent_by_parameter = dict(
         zip(unscaled_parameter_indices, monodromy_tangents[:-1], strict=True)
@@ -209,7 +219,7 @@ def _search_in_scaled_units(
     converted, because no unknown contains mass.
     """
     wheel_units = compute_wheel_units(
-        compute_symbols(collocation_system.n_legs, *parameters)
+        compute_symbols(collocation_system.n_legs, *parameters[: len(PARAMETER_NAMES)])
     )._replace(mass_unit=1.0)
     time_unit = wheel_units.time_unit
     angle_unit = jnp.ones_like(time_unit)
@@ -231,9 +241,13 @@ def _search_in_scaled_units(
     scaled_parameters = [
         parameter_value / wheel_units.compute_unit_in_si(parameter_domain.unit)
         for parameter_value, parameter_domain in zip(
-            parameters, PARAMETER_DOMAINS.values(), strict=True
+            parameters, PARAMETER_DOMAINS.values(), strict=False
         )
     ]
+    if collocation_system.leg_force_structure != NO_LEG_FORCE:
+        # A law is evaluated in SI units.
+        scales = jnp.ones_like(time_unit), wheel_units.length_unit, time_unit
+        scaled_parameters += [*parameters[len(PARAMETER_NAMES) :], *scales]
     search_result = search_all_attempts(
         collocation_system,
         run_attempts,

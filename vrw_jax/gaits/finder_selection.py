@@ -54,11 +54,14 @@ def make_finder(
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = convert_model_argument(model)
     finder_class: Any = FINDER_CLASS_BY_METHOD[resolved_model.capabilities.gait_method]
-    search_options = (
-        {"cycle_options": CycleOptions() if cycle_options is None else cycle_options}
-        if finder_class.options_type is CycleOptions
-        else {}
-    )
+    search_options = {}
+    if finder_class.options_type is CycleOptions:
+        default_options = CycleOptions()
+        if resolved_model.own_parameters is not None:
+            # With a user's law, the fast mode of the airborne leg may decay at a varying rate. The
+            # default mesh then has errors of 3e-9.
+            default_options = default_options.refine_mesh()
+        search_options = {"cycle_options": cycle_options or default_options}
     return finder_class(
         model=resolved_model,
         n_legs=n_legs,

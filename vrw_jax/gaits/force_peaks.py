@@ -15,7 +15,6 @@ from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.extrema import CollocatedPhaseMotion, PhaseExtrema, find_quantity_extrema
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.params import make_wheel_from_parameters
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant, make_paper_phases
 
 
@@ -29,7 +28,7 @@ def compute_force_peaks(
 
     Each measure is the largest value over the gait steps of the cycle.
     """
-    wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
+    wheel_symbols = collocation_system.make_wheel(parameters).symbols()
     peaks_by_step = []
     phase_points_by_step = collocation_system.evaluate_phase_points(
         parameters, collocation_solution

@@ -172,6 +172,7 @@ def limit_cycle(
         return find_hybrid_gait(model, params, guess, period_n, options)
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, period_n)
+    params = gait_finder.model.attach_leg_force(params)
     fills_missing_gait_with_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
     if guess is None and period_n > 1 and not gait_finder.is_multistable:
         raise ValueError(
@@ -220,6 +221,8 @@ def limit_cycles(
     """
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=...)")
     parse_gait_choice(which)
+    checked_model: Any = convert_model_argument(model, allows_friction_arrays=True)
+    params = checked_model.attach_leg_force(params)
     batch_shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
     if not batch_shape:
         model = resolve_model(params, model)
@@ -243,6 +246,8 @@ def limit_cycles(
     else:  # NumPy is used because JAX would compile a program for each batch size.
         params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), batch_shape), params)
         params, first_wheel_params = jax.device_put((params, select_tree_rows(params, 0)))
+    if getattr(checked_model, "leg_force", None) is not None:
+        model = checked_model.with_leg_force_of(first_wheel_params)
     gait_finder = resolve_finder(first_wheel_params, model, options, period_n)
     return _search_with_fallbacks(gait_finder, params, None, options is None, which)
 

@@ -43,7 +43,7 @@ from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import Motion
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import WheelParams, make_wheel_from_parameters, stack_parameters
+from vrw_jax.wheel.params import WheelParams, stack_parameters
 from vrw_jax.wheel.phases import make_paper_phases
 
 
@@ -61,7 +61,7 @@ class LimitCycle(AbstractCycle):
     - `outcome`: Outcome.STEPPED, or the reason of the failure;
     - `residual`: norm of Newton's last correction, in units of the wheel;
     - `n_newton_iterations`: number of linearizations in the search;
-    - `parameters`: parameters as floats, in the order of params.PARAMETER_NAMES;
+    - `parameters`: parameters as floats, in the order of the model's `parameter_names`;
     - `collocation_state`: solution and its active phases, a start of the search for similar wheels;
     - `monodromy_value`: monodromy matrix, without derivatives;
     - `searched_parameters`: parameters of the wheel, also if it has no gait, without derivatives;
@@ -196,7 +196,7 @@ class LimitCycle(AbstractCycle):
         """Return the margins of the first gait step, computed by an event-driven step."""
 
         def compute_step_margins(parameters: Array, section_state: Array) -> Margins:
-            wheel_params = make_wheel_from_parameters(parameters, self.system.n_legs)
+            wheel_params = self.system.make_wheel(parameters)
             return step(wheel_params, section_state, model=self.model).margins
 
         return self.map_over_batch_axes(compute_step_margins)(self.parameters, self.section_state)
@@ -204,7 +204,7 @@ class LimitCycle(AbstractCycle):
     @property
     def searched_wheel(self) -> tuple[ViscoelasticWheel, WheelParams]:
         parameters = jnp.moveaxis(self.searched_parameters, -1, 0)
-        return self.model, make_wheel_from_parameters(parameters, self.system.n_legs)
+        return self.model, self.system.make_wheel(parameters)
 
     @property
     def ending(self) -> Any:
@@ -255,9 +255,7 @@ def _solve_limit_cycle(
     """Find the cycle of one wheel by the search, outside compiled code."""
     is_in_domain = params.is_in_domain()
     parameters = stack_parameters(params)
-    table_1_parameters = stack_parameters(WheelParams(n_legs=collocation_system.n_legs)).astype(
-        parameters.dtype
-    )
+    table_1_parameters = stack_parameters(params.make_table_1_wheel()).astype(parameters.dtype)
     parameters = jnp.where(is_in_domain, parameters, table_1_parameters)
     searched_parameters = lax.stop_gradient(parameters)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
@@ -270,7 +268,7 @@ def _solve_limit_cycle(
     zero_without_gait = lambda value_of_gait: jnp.where(has_cycle, value_of_gait, 0.0)
     parameters = jnp.where(has_cycle, parameters, table_1_parameters)
 
-    wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
+    wheel_symbols = collocation_system.make_wheel(parameters).symbols()
     period_n = collocation_system.period_n
     # The states are theta, its rate and the rate of L1. At touchdown, L1 follows from theta.
     step_end_states = collocation_state.gait_step_end_states

@@ -10,6 +10,8 @@ import functools
 import math
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -24,7 +26,15 @@ from vrw_jax.gaits.phase_collocation import (
 )
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import rotate_to_rear_leg
-from vrw_jax.wheel.params import Symbols, compute_symbols
+from vrw_jax.wheel.leg_force import LegParameters
+from vrw_jax.wheel.params import (
+    NO_LEG_FORCE,
+    PARAMETER_DOMAINS,
+    PARAMETER_NAMES,
+    Symbols,
+    WheelUnits,
+    compute_symbols,
+)
 from vrw_jax.wheel.phases import PAPER_PHASES, TRANSITION_ASSUMPTIONS, Assumption, PhaseInstant
 
 N_SYMBOL_CONSTANTS = 12
@@ -34,17 +44,67 @@ The other fields follow from the number of legs.
 """
 
 
-def compute_phase_constants(n_legs: int, *parameters: Elementwise) -> PhaseConstants:
+class _ScaledLegForce(eqx.Module):
+    """User's law of a leg in other units of length and time, on the way from the paper's force.
+
+    A search continues gaits with the paper's force to gaits with the law, whose share grows to 1.
+    """
+
+    leg_force: Any  # in SI units
+    share: Elementwise
+    length_unit: Elementwise
+    time_unit: Elementwise
+
+    def __call__(self, L: Elementwise, dL: Elementwise, params: LegParameters) -> Elementwise:
+        units = WheelUnits(self.length_unit, self.time_unit, 1.0)
+        si_params = params._replace(
+            **{
+                name: getattr(params, name) * units.compute_unit_in_si(PARAMETER_DOMAINS[name].unit)
+                for name in params._fields
+                if name != "n_legs"
+            }
+        )
+        si_force = self.leg_force(L * units.length_unit, dL * units.velocity_unit, si_params)
+        paper_force = params.stiffness * (params.natural_length - L) - params.damping * dL
+        return self.share * (si_force / units.acceleration_unit) + (1.0 - self.share) * paper_force
+
+
+N_LAW_SCALES = 3
+"""Number of the values after those of a law: its share, and the units of length and time."""
+
+
+def count_phase_constants(leg_force_structure: Any) -> int:
+    """Return the number of constants on flat ground."""
+    if leg_force_structure == NO_LEG_FORCE:
+        return N_SYMBOL_CONSTANTS
+    return N_SYMBOL_CONSTANTS + leg_force_structure.num_leaves + N_LAW_SCALES
+
+
+def compute_phase_constants(
+    n_legs: int, leg_force_structure: Any, *parameters: Elementwise
+) -> PhaseConstants:
     """Return the combinations of parameters that occur in the formulas of all phases.
 
-    The arguments are the parameters in the order of PARAMETER_NAMES.
+    The arguments are the parameters in the order of `stack_parameters`. In a search, the values of
+    `_ScaledLegForce` follow those of a law.
     """
-    wheel_symbols: tuple[Any, ...] = compute_symbols(n_legs, *parameters)
-    return wheel_symbols[:N_SYMBOL_CONSTANTS]
+    n_wheel_parameters = len(PARAMETER_NAMES)
+    wheel_symbols: tuple[Any, ...] = compute_symbols(n_legs, *parameters[:n_wheel_parameters])
+    constants = (*wheel_symbols[:N_SYMBOL_CONSTANTS], *parameters[n_wheel_parameters:])
+    n_missing_scales = count_phase_constants(leg_force_structure) - len(constants)
+    return constants + (jnp.ones_like(parameters[0]),) * n_missing_scales
 
 
-def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
+def _restore_symbols(
+    n_legs: int, leg_force_structure: Any, phase_constants: PhaseConstants
+) -> Symbols:
     """Return all symbols of a wheel, computed from the symbols that vary between wheels."""
+    leg_force = None
+    if leg_force_structure != NO_LEG_FORCE:
+        n_constants = count_phase_constants(leg_force_structure)
+        *law_values, share, length_unit, time_unit = phase_constants[N_SYMBOL_CONSTANTS:n_constants]
+        law = jax.tree.unflatten(leg_force_structure, law_values)
+        leg_force = _ScaledLegForce(law, share, length_unit, time_unit)
     leg_angle = 2.0 * math.pi / n_legs
     symbol_values: tuple[Any, ...] = (
         *phase_constants[:N_SYMBOL_CONSTANTS],
@@ -52,12 +112,13 @@ def _restore_symbols(n_legs: int, phase_constants: PhaseConstants) -> Symbols:
         math.sin(leg_angle),
         math.cos(leg_angle),
         leg_angle,
+        leg_force,
     )
     return Symbols(*symbol_values)
 
 
 def _make_collocation_phase(
-    n_legs: int, stop_at_lift_off: bool, phase_index: int
+    n_legs: int, stop_at_lift_off: bool, leg_force_structure: Any, phase_index: int
 ) -> CollocationPhase:
     """Describe the phase with index `phase_index` by functions.
 
@@ -65,11 +126,12 @@ def _make_collocation_phase(
     follow, the angle by which the next line of the ground is steeper, rad.
     """
     phase_class = PAPER_PHASES[phase_index]
+    n_constants = count_phase_constants(leg_force_structure)
 
     def make_instant(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhaseInstant:
-        tilt = phase_constants[N_SYMBOL_CONSTANTS:]
+        tilt = phase_constants[n_constants:]
         wheel_phase = phase_class(
-            _restore_symbols(n_legs, phase_constants),
+            _restore_symbols(n_legs, leg_force_structure, phase_constants),
             phase_point.held_constants,
             True,
             compute_sine_cosine(*tilt) if tilt else (),
@@ -107,8 +169,8 @@ def _make_collocation_phase(
 
     def reset_to_section(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhasePoint:
         (theta, _), (dtheta, dL1) = phase_point.q, phase_point.v
-        s = _restore_symbols(n_legs, phase_constants)
-        if tilt := phase_constants[N_SYMBOL_CONSTANTS:]:
+        s = _restore_symbols(n_legs, leg_force_structure, phase_constants)
+        if tilt := phase_constants[n_constants:]:
             theta = theta - tilt[0]
         return PhasePoint((), transitions.resolve_two_foot_landing(s, theta, dtheta, dL1), ())
 
@@ -144,17 +206,19 @@ between phases and of the mesh follow.
 
 
 @functools.cache
-def make_post_impact_sequence(n_legs: int, stop_at_lift_off: bool = True) -> PhaseSequence:
+def make_post_impact_sequence(
+    n_legs: int, stop_at_lift_off: bool = True, leg_force_structure: Any = NO_LEG_FORCE
+) -> PhaseSequence:
     """Build the sequence DLS, SLS-I and SLS-II on the plane section (theta+, dtheta+) after the
     impact.
     """
     collocation_phases = tuple(
-        _make_collocation_phase(n_legs, stop_at_lift_off, phase_index)
+        _make_collocation_phase(n_legs, stop_at_lift_off, leg_force_structure, phase_index)
         for phase_index in range(len(PAPER_PHASES))
     )
 
     def make_start_point(phase_constants: PhaseConstants, section_state: Vector) -> PhasePoint:
-        s = _restore_symbols(n_legs, phase_constants)
+        s = _restore_symbols(n_legs, leg_force_structure, phase_constants)
         sine, cosine = compute_sine_cosine(section_state[0])
         foot_distance = s.L0 * s.sin_alpha / rotate_to_rear_leg(s, sine, cosine).cos
         return PhasePoint((foot_distance,), section_state[:1], section_state[1:])
@@ -170,7 +234,7 @@ def make_post_impact_sequence(n_legs: int, stop_at_lift_off: bool = True) -> Pha
         )
         (theta, _), (dtheta, dL1) = sls2_points.phase_end_point.q, sls2_points.phase_end_point.v
         landing_result = transitions.resolve_landing(
-            _restore_symbols(n_legs, phase_constants), theta, dtheta, dL1
+            _restore_symbols(n_legs, leg_force_structure, phase_constants), theta, dtheta, dL1
         )
         return (
             jnp.where(is_phase_active[0], lift_off_guard, -lift_off_guard),

@@ -106,7 +106,7 @@ def sensitivities(
             ),
             "parameter_unit": (
                 "parameter",
-                [MEASURES[parameter_name].unit for parameter_name in parameter_names],
+                [x.unit for x in gait_finder.model.parameter_domains.values()],
             ),
             "parameter_value": ("parameter", np.asarray(parameter_values)),
         },

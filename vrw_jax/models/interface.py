@@ -4,19 +4,21 @@ import abc
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
 from vrw_jax.models.capabilities import ModelCapabilities
 from vrw_jax.models.step_results import AdvanceResult, SectionState
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import (
-    FRICTION_NAME,
+    PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     WheelParams,
     WheelUnits,
@@ -46,10 +48,6 @@ class AbstractWheel(eqx.Module):
     """Name of the model that results report."""
     capabilities: eqx.AbstractClassVar[ModelCapabilities]
     """Features of the library that the model supports."""
-    parameter_names: eqx.AbstractClassVar[tuple[str, ...]]
-    """Names of the inputs on which the motion depends: the wheel's parameters and, for some models,
-    friction.
-    """
     reports_contacts: eqx.AbstractClassVar[bool]
     """Whether trajectories report the contact mode of every leg instead of the paper's phases."""
     batch_kernel: ClassVar[str] = ""
@@ -64,13 +62,17 @@ class AbstractWheel(eqx.Module):
     def __repr__(self) -> str:
         if has_traced_leaf(self):
             return eqx.tree_pformat(self)
-        number_formatter = lambda x: repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
-        field_value_formatter = lambda x: number_formatter(x) if eqx.is_array(x) else repr(x)
-        field_texts = ", ".join(
-            f"{field_name}={field_value_formatter(field_value)}"
-            for field_name, field_value in vars(self).items()
-        )
-        return f"{type(self).__name__}({field_texts})"
+
+        def format_module(module: eqx.Module) -> str:
+            field_texts = ", ".join(f"{name}={format_field(x)}" for name, x in vars(module).items())
+            return f"{type(module).__name__}({field_texts})"
+
+        def format_field(x: Any) -> str:
+            if eqx.is_array(x):
+                return repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
+            return format_module(x) if isinstance(x, eqx.Module) else repr(x)
+
+        return format_module(self)
 
     @property
     def fallback_model(self) -> "AbstractWheel":
@@ -85,14 +87,40 @@ class AbstractWheel(eqx.Module):
         ground.
         """
         return jnp.stack(
-            [jnp.asarray(x, params.damping.dtype) for x in self._list_parameter_values(params)]
+            [jnp.asarray(x, params.damping.dtype) for x in self.list_parameter_values(params)]
         )
 
-    def _list_parameter_values(self, params: WheelParams) -> list[Any]:
-        return [
-            getattr(self if parameter_name == FRICTION_NAME else params, parameter_name)
-            for parameter_name in self.parameter_names
-        ]
+    @property
+    def own_parameters(self) -> Any:
+        """Return the part of the model whose leaves are its own parameters."""
+        return None
+
+    @property
+    def own_parameter_domains(self) -> dict[str, ParameterDomain]:
+        """Return the domains of these parameters by name: friction, or those of a leg force."""
+        return {}
+
+    @property
+    def parameter_domains(self) -> dict[str, ParameterDomain]:
+        """Return the domains of the inputs on which the motion depends, by name.
+
+        The parameters of the wheel come first.
+        """
+        return PARAMETER_DOMAINS | self.own_parameter_domains
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Return the names of `parameter_domains`."""
+        return (*PARAMETER_NAMES, *self.own_parameter_domains)
+
+    def attach_leg_force(self, params: WheelParams) -> WheelParams:
+        """Return the parameters with the leg force of this model, unless they have one already."""
+        return params
+
+    def list_parameter_values(self, params: WheelParams) -> list[Any]:
+        """Return the value of each parameter in `parameter_names`, for one wheel or a batch."""
+        wheel_values = [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES]
+        return [*wheel_values, *jax.tree.leaves(self.own_parameters)]
 
     def collect_batch_parameter_values(
         self, params: WheelParams
@@ -101,7 +129,7 @@ class AbstractWheel(eqx.Module):
 
         JAX would compile a program for each batch size.
         """
-        parameter_columns = map(np.asarray, self._list_parameter_values(params))
+        parameter_columns = map(np.asarray, self.list_parameter_values(params))
         return np.stack(np.broadcast_arrays(*parameter_columns), -1)
 
     def from_parameter_values(
@@ -112,12 +140,14 @@ class AbstractWheel(eqx.Module):
         This function is the inverse of `collect_parameter_values`. The values may be tracers.
         """
         n = len(PARAMETER_NAMES)
-        model_with_friction = self
-        if FRICTION_NAME in self.parameter_names:
-            model_with_friction = eqx.tree_at(
-                lambda ground: ground.friction, self, parameter_values[n]
-            )
-        return model_with_friction, make_wheel_from_parameters(parameter_values[:n], n_legs)
+        model = self._replace_own_parameters(parameter_values[n:])
+        return model, make_wheel_from_parameters(parameter_values[:n], n_legs)
+
+    def _replace_own_parameters(self, values: Any) -> "AbstractWheel":
+        if self.own_parameters is None:
+            return self
+        own_parameters = jax.tree.unflatten(jax.tree.structure(self.own_parameters), list(values))
+        return eqx.tree_at(lambda model: model.own_parameters, self, own_parameters)
 
     def with_parameter(
         self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
@@ -126,8 +156,10 @@ class AbstractWheel(eqx.Module):
 
         The parameter is one of `parameter_names`, and the value may be a tracer.
         """
-        if parameter_name == FRICTION_NAME:
-            return eqx.tree_at(lambda ground: ground.friction, self, parameter_value), params
+        if parameter_name not in PARAMETER_NAMES:
+            own_values = jax.tree.leaves(self.own_parameters)
+            own_values[list(self.own_parameter_domains).index(parameter_name)] = parameter_value
+            return self._replace_own_parameters(own_values), params
         return self, eqx.tree_at(
             lambda wheel: getattr(wheel, parameter_name), params, parameter_value
         )

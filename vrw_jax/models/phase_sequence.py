@@ -542,7 +542,7 @@ def replace_invalid_inputs(
             is_valid_start, given_value, jnp.asarray(valid_input_value, given_value.dtype)
         ),
         (params, x),
-        (type(params)(n_legs=params.n_legs), fallback_state),
+        (params.make_table_1_wheel(), fallback_state),
     )
 
 

@@ -40,7 +40,7 @@ def list_model_config_names(
         model_class.capabilities.config_name
         for model_class in REGISTERED_MODEL_CLASSES
         if (command_name is None or command_name in model_class.capabilities.accepted_cli_commands)
-        and (parameter_name is None or parameter_name in model_class.parameter_names)
+        and (parameter_name is None or parameter_name in model_class().parameter_names)
     )
 
 

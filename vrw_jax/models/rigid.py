@@ -33,7 +33,7 @@ from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Motion, compute_rear_foot_height
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import PARAMETER_NAMES, Symbols, WheelParams, require_known_friction
+from vrw_jax.wheel.params import Symbols, WheelParams, require_known_friction
 
 # Number of angles that each round of the search for minima of margins samples. The value is chosen
 # because forces are smooth over the 45 degrees of a step.
@@ -71,7 +71,6 @@ class RigidWheel(AbstractWheel):
         passage_method=PassageMethod.QUADRATURE,
         can_start_within_gait_step=True,
     )
-    parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     is_compliant: ClassVar[bool] = False
 

@@ -64,6 +64,7 @@ from vrw_jax.models.walk_batch import (
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
+    NO_LEG_FORCE,
     PARAMETER_NAMES,
     WheelParams,
     make_wheel_from_parameters,
@@ -72,17 +73,12 @@ from vrw_jax.wheel.params import (
 BatchEngineName = Literal["auto", "lanes", "diffrax"]
 BATCH_ENGINE_NAMES: tuple[str, ...] = get_args(BatchEngineName)
 
-PAPER_STEP_INPUT_NAMES = (START_INPUT_NAME, *PARAMETER_NAMES)
-"""Names of the inputs of a gait step with respect to which the paper's model has derivatives."""
-
 SLOPE_INPUT_INDEX = PARAMETER_NAMES.index("slope")
 """Index of the slope among the inputs of a gait step.
 
 The inputs are the parameters, the section state and, on uneven ground, the slope of the ground
 after the next landing or two rises (see `models.select_stance_line`).
 """
-GROUND_INPUT_INDEX = len(PARAMETER_NAMES) + 3
-"""Index, among the inputs of a gait step, of the first value of uneven ground."""
 
 
 @announce_wait("batches of gait steps", "10 s")
@@ -176,7 +172,11 @@ def step_batch(
             )
         element_heights = element_heights.astype(dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
-    known_input_names = CONTACT_STEP_INPUT_NAMES if has_contact_kernel else PAPER_STEP_INPUT_NAMES
+    known_input_names = (
+        CONTACT_STEP_INPUT_NAMES
+        if has_contact_kernel
+        else (START_INPUT_NAME, *checked_model.parameter_names)
+    )
     known_input_names += ("heights",) * (element_heights is not None)
     for derivative_name in derivatives:
         if derivative_name not in known_input_names:
@@ -207,7 +207,7 @@ def _check_parameter_shapes(
     n_steps: int,
 ) -> list[np.ndarray]:
     """Return each parameter as a scalar or an array over the batch, in the order of
-    `PARAMETER_NAMES`.
+    `PARAMETER_NAMES`, and after them those of a leg force.
 
     The slope, and with unilateral contact the friction, may have a second axis over gait steps.
     Raise ValueError if the shapes of states and parameters do not fit.
@@ -220,15 +220,14 @@ def _check_parameter_shapes(
             f"{' or '.join(map(str, allowed_section_sizes))}): write states[None] for a single one."
         )
     n_section_states = len(section_states)
-    values_by_parameter = [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES]
+    values_by_parameter = model.list_parameter_values(params)
+    n_parameters = len(values_by_parameter) - (FRICTION_NAME in model.parameter_names)
     parameter_dtype = np.result_type(
-        *(parameter_values.dtype for parameter_values in values_by_parameter)
+        *(parameter_values.dtype for parameter_values in values_by_parameter[:n_parameters])
     )
     StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
     for parameter_name, parameter_values in zip(
-        (*PARAMETER_NAMES, FRICTION_NAME),
-        (*values_by_parameter, getattr(model, FRICTION_NAME, np.zeros(()))),
-        strict=True,
+        model.parameter_names, values_by_parameter, strict=True
     ):
         is_parameter_stepwise = (
             parameter_name in ("slope", FRICTION_NAME) and np.ndim(parameter_values) == 2
@@ -246,7 +245,7 @@ def _check_parameter_shapes(
                 f"{stepwise_advice * is_parameter_stepwise}."
             )
     common_dtype = np.promote_types(parameter_dtype, section_states.dtype)
-    return [np.asarray(parameter_values, common_dtype) for parameter_values in values_by_parameter]
+    return [np.asarray(x, common_dtype) for x in values_by_parameter[:n_parameters]]
 
 
 def _step_batch_without_contact(
@@ -265,17 +264,18 @@ def _step_batch_without_contact(
     ground_slopes: Any = [element_slopes]
     rises = None
     stepwise_parameters = {}
+    ground_input_index = len(values_by_parameter) + 3
     is_ground_uneven = element_slopes.ndim == 2
     if element_heights is not None:
         rises = compute_rises_over_steps(element_heights, n_steps)
         stepwise_parameters["heights"] = make_height_terms(
-            (GROUND_INPUT_INDEX, GROUND_INPUT_INDEX + 1), element_heights.shape[1], n_steps
+            (ground_input_index, ground_input_index + 1), element_heights.shape[1], n_steps
         )
     if is_ground_uneven:
         ground_slopes = complete_slopes_over_steps(element_slopes, n_steps)
         n_slopes = element_slopes.shape[1]
         stepwise_parameters["slope"] = StepwiseParameter(
-            (SLOPE_INPUT_INDEX, GROUND_INPUT_INDEX),
+            (SLOPE_INPUT_INDEX, ground_input_index),
             n_slopes,
             lambda k: ((0, k, 1.0), (1, min(k + 1, n_slopes - 1), 1.0)),
         )
@@ -291,7 +291,7 @@ def _step_batch_without_contact(
     walk_batch = WalkBatch(
         section_states.T.take(wheel_order, -1),
         derivative_names,
-        PARAMETER_NAMES,
+        model.parameter_names[: len(values_by_parameter)],
         stepwise_parameters,
     )
     select_engine = functools.partial(_select_batch_engine, model, n_legs, walk_batch.input_indices)
@@ -354,7 +354,7 @@ def order_wheels_by_work(
     """
     with np.errstate(all="ignore"):
         float32_values = [np.asarray(x, np.float32) for x in values_by_parameter]
-        p = dict(zip(PARAMETER_NAMES, float32_values, strict=True))
+        p = dict(zip(PARAMETER_NAMES, float32_values, strict=False))
         theta, dtheta = section_states.T[:2].astype(np.float32)
         log_solver_work = (
             np.log(p["damping"] / p["leg_mass"])
@@ -370,9 +370,9 @@ def order_wheels_by_work(
 LaneStepFunction = Callable[..., tuple[np.ndarray, ...]]
 """Function that computes one gait step for any number of lanes, which are on the last axis.
 
-Its arguments are parameters, section states and, on uneven ground, the inputs from
-`GROUND_INPUT_INDEX`. It returns section states, durations, outcomes, numbers of solver steps and,
-if derivatives are requested, Jacobians.
+Its arguments are parameters, section states and, on uneven ground, the values of the ground. It
+returns section states, durations, outcomes, numbers of solver steps and, if derivatives are
+requested, Jacobians.
 """
 
 
@@ -404,7 +404,11 @@ def _select_batch_engine(
         parameter_matrix: np.ndarray, section_states: np.ndarray, *ground_inputs: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         compiled_step = _compile_lane_step(
-            model.stop_at_lift_off, n_legs, input_indices, len(ground_inputs)
+            model.stop_at_lift_off,
+            jax.tree.structure(model.leg_force),
+            n_legs,
+            input_indices,
+            len(ground_inputs),
         )
         _, step_outcomes, n_solver_steps, step_outputs, *step_jacobian = compiled_step.run(
             jax.tree.map(lambda x: np.asarray(x, parameter_matrix.dtype), options),
@@ -417,10 +421,15 @@ def _select_batch_engine(
 
 @functools.cache
 def _compile_lane_step(
-    stop_at_lift_off: bool, n_legs: int, input_indices: tuple[int, ...], n_ground_inputs: int
+    stop_at_lift_off: bool,
+    leg_force_structure: Any,
+    n_legs: int,
+    input_indices: tuple[int, ...],
+    n_ground_inputs: int,
 ) -> CompiledBatchFunction:
     """Return a compiled gait step of lanes, a function of options and inputs."""
-    n_parameters = len(PARAMETER_NAMES)
+    n_law_parameters = leg_force_structure.num_leaves
+    n_parameters = len(PARAMETER_NAMES) + n_law_parameters
 
     def step_lanes(
         options: StepOptions, lane_step_inputs: Any, straggler_count: Array | None = None
@@ -431,9 +440,12 @@ def _compile_lane_step(
 
         def compute_step_outputs(*lane_step_inputs: Array) -> tuple:
             params = make_wheel_from_parameters(
-                lane_step_inputs[:n_parameters], n_legs, *lane_step_inputs[GROUND_INPUT_INDEX:]
+                lane_step_inputs[:n_parameters],
+                n_legs,
+                *lane_step_inputs[n_parameters + 3 :],
+                leg_force_structure=leg_force_structure,
             )
-            x = lane_step_inputs[n_parameters:GROUND_INPUT_INDEX]
+            x = lane_step_inputs[n_parameters : n_parameters + 3]
             step_result, is_unfinished = advance_gait_step(
                 params, x, options, tableau, stop_at_lift_off, straggler_count
             )
@@ -443,9 +455,10 @@ def _compile_lane_step(
         if not input_indices:
             step_outputs, step_diagnostics = compute_step_outputs(*lane_step_inputs)
             return (*step_diagnostics, step_outputs)
-        # With respect to all inputs, two columns follow from the units.
+        # With respect to all inputs, two columns follow from the units, which a law may not have.
         differentiates_all_inputs = (
-            len(input_indices) == len(lane_step_inputs) <= GROUND_INPUT_INDEX + 1
+            len(input_indices) == len(lane_step_inputs) <= N_STEP_INPUTS + 1
+            and leg_force_structure == NO_LEG_FORCE
         )
         compute_jacobian_of_columns = (
             complete_jacobian_columns if differentiates_all_inputs else compute_jacobian_columns
@@ -455,7 +468,7 @@ def _compile_lane_step(
         )
         return (*step_diagnostics, step_outputs, step_jacobian)
 
-    n_kernel_inputs = N_STEP_INPUTS + n_ground_inputs
+    n_kernel_inputs = N_STEP_INPUTS + n_law_parameters + n_ground_inputs
     return compile_batch_function(
         step_lanes,
         batch_sizes.XLA_LANE_BATCH_SIZE,
@@ -549,7 +562,8 @@ def _step_elements_by_vmap(
     - `step_input_matrix`: inputs of the step, shape (elements, inputs);
     - `input_indices`: indices of the inputs with respect to which the Jacobian is computed.
     """
-    n_parameters = len(PARAMETER_NAMES)
+    leg_force_structure: Any = jax.tree.structure(getattr(model, "leg_force", None))
+    n_parameters = len(PARAMETER_NAMES) + leg_force_structure.num_leaves
 
     def step_one_element(step_inputs: Array) -> tuple[Array, ...]:
         def step_with_varied_inputs(varied_inputs: Array) -> tuple[Array, tuple[Array, ...]]:
@@ -557,9 +571,10 @@ def _step_elements_by_vmap(
             params = make_wheel_from_parameters(
                 updated_step_inputs[:n_parameters],
                 n_legs,
-                *updated_step_inputs[GROUND_INPUT_INDEX:],
+                *updated_step_inputs[n_parameters + 3 :],
+                leg_force_structure=leg_force_structure,
             )
-            x = updated_step_inputs[n_parameters:GROUND_INPUT_INDEX]
+            x = updated_step_inputs[n_parameters : n_parameters + 3]
             step_result = model.advance(params, x, options)
             return jnp.concatenate([step_result.section_state, step_result.durations]), (
                 step_result.section_state,

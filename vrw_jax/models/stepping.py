@@ -19,6 +19,7 @@ from jaxtyping import Array, Int
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_int, check_reals, check_type, format_value
 from vrw_jax.base.options import EngineName, StepOptions
+from vrw_jax.base.parameters import list_parameters
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -89,6 +90,13 @@ def convert_model_argument(
             "number, or vary it in a design of vrw.scan; vrw.step_batch takes one for each "
             "element, vrw.walk one for each of its steps."
         )
+    for law_parameter in list_parameters(getattr(model, "leg_force", None), "leg"):
+        if jnp.ndim(law_parameter.value) and not allows_friction_arrays:
+            raise ValueError(
+                f"{law_parameter.name} has shape {jnp.shape(law_parameter.value)}, but this call "
+                "is for one law of the legs: give one number; vrw.step_batch and vrw.limit_cycles "
+                "take one for each element."
+            )
     return model
 
 

@@ -321,6 +321,7 @@ def specify_phase_trajectory(
     def sample_phase_step(x: Array, k: int) -> SampledStep:
         step_model, step_params = models_and_wheels[k]
         trajectory = _sample_step(step_model, step_params, x, options, n_samples)
+        step_params = step_model.attach_leg_force(step_params)
         s = jax.tree.map(float, select_stance_line(step_params, x)[0]).symbols()
         phase_durations = np.asarray(trajectory.durations)
         state, energies, foot_forces = (
@@ -340,7 +341,7 @@ def specify_phase_trajectory(
             **{f"lambda_{i + 1}": foot_force for i, foot_force in enumerate(foot_forces)},
             **dict(zip(ENERGY_NAMES, energies, strict=True)),
             "total_energy": sum(energies),
-            "damping_power": compute_damping_power(s, motion),
+            "damping_power": np.asarray(compute_damping_power(s, motion)),
             "foot_2_x": hub_x - motion.L2 * rear_leg_direction.sin,
             "foot_2_z": hub_z - motion.L2 * rear_leg_direction.cos,
             "hub_x": hub_x,

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_choice, check_int, check_reals, check_type
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_record import UnilateralStep
@@ -42,8 +43,8 @@ from vrw_jax.models.interface import (
 from vrw_jax.models.step_results import PAPER_START_STATE, AdvanceResult
 from vrw_jax.models.viscoelastic import can_use_batch_kernel
 from vrw_jax.wheel.params import (
+    FRICTION_DOMAIN,
     FRICTION_NAME,
-    PARAMETER_NAMES,
     WheelParams,
     WheelUnits,
     convert_friction,
@@ -107,8 +108,15 @@ class AbstractContactWheel(AbstractWheel):
     """Model whose section state is the full section state, with a contact mode for each leg."""
 
     friction: eqx.AbstractVar[Scalar]
-    parameter_names: ClassVar[tuple[str, ...]] = (*PARAMETER_NAMES, FRICTION_NAME)
     reports_contacts: ClassVar[bool] = True
+
+    @property
+    def own_parameters(self) -> Scalar:
+        return self.friction
+
+    @property
+    def own_parameter_domains(self) -> dict[str, ParameterDomain]:
+        return {FRICTION_NAME: FRICTION_DOMAIN}
 
     def explain_impossible_gait(self, params: WheelParams) -> str:
         """Return a sentence that states why one wheel can't have a gait, or "" if it may have one.

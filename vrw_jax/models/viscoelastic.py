@@ -22,6 +22,7 @@ from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import ParameterDomain, list_parameters
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
 from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
@@ -58,6 +59,7 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import Motion
+from vrw_jax.wheel.leg_force import convert_leg_force
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
     WheelParams,
@@ -80,6 +82,9 @@ class ViscoelasticWheel(AbstractWheel):
 
     - `friction`: friction coefficient of the ground. It affects the friction margins, but not the
       motion;
+    - `leg_force`: force along a leg in N, as a function `f(L, dL, params)` of its length in m, its
+      rate in m/s and the parameters of the wheel. A positive force pushes the hub away from the
+      foot. None means the paper's force, k (L* - L) - c dL. See docs/howto/own_leg.md;
     - `stop_at_lift_off`: whether a step fails if the ground would have to pull on Leg 1, because
       the model does not describe bouncing. If False, the step continues formally, as the paper's
       steps do after scuffing, and the margins report the violation.
@@ -98,7 +103,6 @@ class ViscoelasticWheel(AbstractWheel):
         accepted_cli_commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
         can_start_within_gait_step=True,
     )
-    parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
     reports_contacts: ClassVar[bool] = False
     batch_kernel: ClassVar[str] = "phases"
 
@@ -106,6 +110,26 @@ class ViscoelasticWheel(AbstractWheel):
     stop_at_lift_off: bool = eqx.field(
         static=True, converter=functools.partial(check_bool, "stop_at_lift_off"), default=True
     )
+    leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
+
+    @property
+    def own_parameters(self) -> Any:
+        return self.leg_force
+
+    @property
+    def own_parameter_domains(self) -> dict[str, ParameterDomain]:
+        return {x.name: x.domain for x in list_parameters(self.leg_force, "leg")}
+
+    def attach_leg_force(self, params: WheelParams) -> WheelParams:
+        if self.leg_force is None or params.leg_force is not None:
+            return params
+        return params.attach_leg_force(self.leg_force)
+
+    def with_leg_force_of(self, params: WheelParams) -> "ViscoelasticWheel":
+        """Return the model with the leg force that `attach_leg_force` has added to parameters."""
+        return eqx.tree_at(
+            lambda model: model.leg_force, self, params.leg_force, is_leaf=lambda x: x is None
+        )
 
     def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return a section state near the gait of Table 1 of the paper, inside its basin of
@@ -114,14 +138,15 @@ class ViscoelasticWheel(AbstractWheel):
         return jnp.asarray(PAPER_START_STATE, params.damping.dtype)
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        return _compile_step(self, _select_engine(options), False)(params, x, options)
+        return _compute_step(self, params, x, options, False)
 
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
-        return _compile_step(self, _select_engine(options), True)(params, x, options)
+        return _compute_step(self, params, x, options, True)
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
+        params = self.attach_leg_force(params)
         if can_use_batch_kernel(options):
             sample_lane_steps = functools.partial(
                 _sample_lane_steps, self.stop_at_lift_off, n_samples
@@ -163,6 +188,7 @@ class ViscoelasticWheel(AbstractWheel):
         phase_state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
+        params = self.attach_leg_force(params)
         if can_use_batch_kernel(options):
             finish_lane_steps = functools.partial(
                 _finish_lane_steps, self.stop_at_lift_off, phase_index
@@ -180,6 +206,20 @@ class ViscoelasticWheel(AbstractWheel):
             self.stop_at_lift_off,
             "diffrax",
         )
+
+
+def _compute_step(
+    model: ViscoelasticWheel,
+    params: WheelParams,
+    x: SectionState,
+    options: StepOptions,
+    records_margins: bool,
+) -> Any:
+    if model.leg_force is not None:
+        # Programs take the numbers of the leg force as part of the parameters.
+        params = model.attach_leg_force(params)
+        model = dataclasses.replace(model, leg_force=None)
+    return _compile_step(model, _select_engine(options), records_margins)(params, x, options)
 
 
 def _select_engine(options: StepOptions) -> str:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.wheel.leg_force import compute_leg_potential, evaluate_leg_force
 from vrw_jax.wheel.params import Symbols
 
 
@@ -196,11 +197,27 @@ def _compute_hub_fixed_mass_moment(s: Symbols, L2: Elementwise) -> Elementwise:
     return s.m * (s.c0 + s.cos_alpha * s.L0) - s.m * s.cos_alpha * L2
 
 
+def compute_leg_forces(s: Symbols, motion: Motion) -> tuple[Elementwise, Elementwise]:
+    """Return the forces along Leg 1 and Leg 2, which push the hub off the feet if positive, N.
+
+    They are the forces of springs and dampers (eq. 3 of the paper), or those of a user's law.
+    """
+    if s.leg_force is not None:
+        return (
+            evaluate_leg_force(s, motion.L1, motion.dL1),
+            evaluate_leg_force(s, motion.L2, motion.dL2),
+        )
+    spring_preload = s.k * s.Ls
+    return (
+        (spring_preload - s.k * motion.L1) - s.c * motion.dL1,
+        (spring_preload - s.k * motion.L2) - s.c * motion.dL2,
+    )
+
+
 def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     """Return the mass matrix and the applied forces for a motion.
 
-    The applied forces are gravity, the forces of springs and dampers (eq. 3 of the paper), and the
-    inertial forces.
+    The applied forces are gravity, the forces along the legs, and the inertial forces.
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     mass_matrix = compute_mass_matrix(s, L1, L2)
@@ -211,19 +228,17 @@ def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     coriolis_factor = 2.0 * s.m * s.sin_alpha * dtheta
     fore_gravity_moment = s.g * s.m * s.L0 + s.g * s.Mh * L1
     rear_gravity_moment = s.g * s.m * s.L0 - s.g * s.m * L2
-    spring_preload = s.k * s.Ls
+    leg_force_1, leg_force_2 = compute_leg_forces(s, motion)
     return EquationTerms(
         mass_matrix=mass_matrix,
         applied_moment_theta=fore_gravity_moment * fore_leg.sin
         + rear_gravity_moment * rear_leg.sin
         - 2.0 * (half_dM11_dL1 * dL1 + half_dM11_dL2 * dL2) * dtheta,
-        applied_force_L1=(spring_preload - s.k * L1)
-        - s.c * dL1
+        applied_force_L1=leg_force_1
         + half_dM11_dL1 * dtheta * dtheta
         - coriolis_factor * dL2
         - s.g * s.Mh * fore_leg.cos,
-        applied_force_L2=(spring_preload - s.k * L2)
-        - s.c * dL2
+        applied_force_L2=leg_force_2
         + half_dM11_dL2 * dtheta * dtheta
         + coriolis_factor * dL1
         + s.g * s.m * rear_leg.cos,
@@ -311,14 +326,17 @@ def compute_double_support_equation(
     paper). The sine and cosine of the bisector of the two legs are proportional to the sums of the
     legs' sines and cosines. Every term is a trigonometric polynomial in the angle of the bisector,
     with coefficients that depend only on the wheel. This form halves the cost of the restriction.
+    The forces of a user's law are not among these terms, but are projected on the circle.
     """
+    has_own_law = s.leg_force is not None
+    k, c = (0.0, 0.0) if has_own_law else (s.k, s.c)
     hub_circle_diameter = foot_distance / s.sin_alpha
     squared_bisector_factor = 1.0 / (1.0 + s.cos_alpha)
     weight_factor = s.g * (s.Mh - s.m) * hub_circle_diameter
     sin_squared_rate_coefficient = s.m * s.c0 * hub_circle_diameter
     leg_weight_moment = s.g * s.m * s.L0
-    spring_factor = s.k * hub_circle_diameter
-    damping_factor = s.c * hub_circle_diameter * hub_circle_diameter
+    spring_factor = k * hub_circle_diameter
+    damping_factor = c * hub_circle_diameter * hub_circle_diameter
     constant_inertia = hub_circle_diameter * hub_circle_diameter * (s.Mh - s.m) + s.m * (
         2.0 * s.a * s.a + (s.n - 2) * s.c0 * s.c0
     )
@@ -340,9 +358,14 @@ def compute_double_support_equation(
     damping_coefficient = (
         1.0 - s.cos_alpha
     ) * damping_factor + squared_bisector_factor * s.cos_alpha * damping_factor * (sin * sin)
+    generalized_force = slope_torque + sin * sin_torque_factor - damping_coefficient * dtheta
+    if has_own_law:
+        leg_force_1, leg_force_2 = compute_leg_forces(s, motion)
+        generalized_force = generalized_force - hub_circle_diameter * (
+            leg_force_1 * rear_leg.sin + leg_force_2 * motion.sin_theta
+        )
     return SingleDofEquation(
-        constant_inertia + 2.0 * sin_squared_rate_coefficient * cos,
-        slope_torque + sin * sin_torque_factor - damping_coefficient * dtheta,
+        constant_inertia + 2.0 * sin_squared_rate_coefficient * cos, generalized_force
     )
 
 
@@ -482,9 +505,12 @@ def compute_stopper_force(
     """Return the force that the stopper exerts on each leg of `leg_numbers`, N.
 
     Each of these legs has the length L0. The force is negative if the leg would leave its stopper.
-    The spring presses the leg against the stopper with the force k (L* - L0). The weight and the
-    acceleration of the leg's mass reduce the force.
+    The spring presses the leg against the stopper with the force k (L* - L0), or that of a user's
+    law at rest. The weight and the acceleration of the leg's mass reduce the force.
     """
+    spring_force = (
+        s.k * (s.Ls - s.L0) if s.leg_force is None else evaluate_leg_force(s, s.L0, 0.0 * s.L0)
+    )
     leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
     fore_leg = rotate_to_vertical(s, motion.sin_theta, motion.cos_theta)
     # Gravity is subtracted from the acceleration of the hub, in the frame of Leg 1.
@@ -498,7 +524,7 @@ def compute_stopper_force(
         leg_angles
     ) + tangential_hub_acceleration * np.sin(leg_angles)
     centrifugal_acceleration = s.c0 * motion.dtheta * motion.dtheta
-    return s.k * (s.Ls - s.L0) + s.m * centrifugal_acceleration + s.m * leg_acceleration
+    return spring_force + s.m * centrifugal_acceleration + s.m * leg_acceleration
 
 
 class Energy(NamedTuple):
@@ -532,11 +558,27 @@ def compute_mechanical_energy(s: Symbols, motion: Motion) -> Energy:
     mass_height_moment = (s.Mh * motion.L1 + s.m * s.L0) * fore_leg.cos + s.m * (
         s.L0 - motion.L2
     ) * rotate_to_rear_leg(s, *fore_leg).cos
-    stretch_1, stretch_2, locked_stretch = motion.L1 - s.Ls, motion.L2 - s.Ls, s.L0 - s.Ls
-    elastic_energy = 0.5 * s.k * (stretch_1**2 + stretch_2**2 + (s.n - 2) * locked_stretch**2)
+    if s.leg_force is None:
+        stretch_1, stretch_2, locked_stretch = motion.L1 - s.Ls, motion.L2 - s.Ls, s.L0 - s.Ls
+        elastic_energy = 0.5 * s.k * (stretch_1**2 + stretch_2**2 + (s.n - 2) * locked_stretch**2)
+    else:
+        elastic_energy = (
+            compute_leg_potential(s, motion.L1)
+            + compute_leg_potential(s, motion.L2)
+            + (s.n - 2) * compute_leg_potential(s, s.L0)
+        )
     return Energy(compute_kinetic_energy(s, motion), s.g * mass_height_moment, elastic_energy)
 
 
 def compute_damping_power(s: Symbols, motion: Motion) -> Elementwise:
-    """Return the power c (dL1^2 + dL2^2) that the dampers dissipate, W (eq. 29 of the paper)."""
-    return s.c * (motion.dL1 * motion.dL1 + motion.dL2 * motion.dL2)
+    """Return the power c (dL1^2 + dL2^2) that the dampers dissipate, W (eq. 29 of the paper).
+
+    For a user's law, it is the power of the force at rest minus that of the force.
+    """
+    if s.leg_force is None:
+        return s.c * (motion.dL1 * motion.dL1 + motion.dL2 * motion.dL2)
+    force_1, force_2 = compute_leg_forces(s, motion)
+    rest_force_1, rest_force_2 = compute_leg_forces(
+        s, motion._replace(dL1=0.0 * motion.dL1, dL2=0.0 * motion.dL2)
+    )
+    return (rest_force_1 - force_1) * motion.dL1 + (rest_force_2 - force_2) * motion.dL2

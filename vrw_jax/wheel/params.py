@@ -15,41 +15,9 @@ from jaxtyping import Array, Bool
 from vrw_jax.base.checks import check_int, check_reals, format_value, require_known_name
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.options import StepOptions, make_real_field
+from vrw_jax.base.parameters import ParameterDomain, list_parameters
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
-
-
-class ParameterDomain(NamedTuple):
-    """Symbol, unit and allowed range of one parameter."""
-
-    symbol: str
-    unit: str
-    lower_bound: float
-    upper_bound: float
-    description: str
-    is_lower_bound_allowed: bool = True
-
-    def contains_parameter_value(self, parameter_value: Any) -> Any:
-        """Return whether a value lies in the allowed range. NaN gives False."""
-        is_above_lower_bound = (
-            parameter_value >= self.lower_bound
-            if self.is_lower_bound_allowed
-            else parameter_value > self.lower_bound
-        )
-        return is_above_lower_bound & (parameter_value < self.upper_bound)
-
-    def require_value_in_domain(self, parameter_name: str, parameter_value: float) -> None:
-        """Raise a `ValueError` if the value of a parameter lies outside the allowed range."""
-        if not self.contains_parameter_value(parameter_value):
-            raise ValueError(
-                f"{parameter_name} is {parameter_value:g}, but {self.description} must lie in "
-                f"{self}: give a value in that range."
-            )
-
-    def __str__(self) -> str:
-        opening_bracket = "[" if self.is_lower_bound_allowed else "("
-        return f"{opening_bracket}{self.lower_bound:g}, {self.upper_bound:g}) {self.unit}"
-
 
 MIN_SI_VALUE = 1e-15
 """Smallest value of a positive parameter in SI units, chosen because quotients of smaller values
@@ -117,6 +85,8 @@ class Symbols(NamedTuple):
     sin_alpha: float
     cos_alpha: float
     alpha: float
+    leg_force: Any = None
+    """Force along a leg as a function of its length and rate; None for the paper's force."""
 
 
 _check_n_legs = functools.partial(
@@ -165,6 +135,10 @@ class WheelParams(AbstractPrintable):
     slope: Scalar = make_real_field("slope", 0.30)
     gravity: Scalar = make_real_field("gravity", 9.81)
     n_legs: int = eqx.field(static=True, converter=_check_n_legs, default=8)
+    leg_force: Any = eqx.field(init=False, default_factory=lambda: None)
+    """Force along a leg of the model that computes with these parameters, see `attach_leg_force`.
+    None means the paper's force.
+    """
 
     def __new__(cls, *_: Any, **given_parameters: Any) -> "WheelParams":
         """Raise a `TypeError` for keywords that are not parameters, before an instance is
@@ -172,9 +146,8 @@ class WheelParams(AbstractPrintable):
         """
         for parameter_name in given_parameters:
             try:
-                check_parameter_name(
-                    parameter_name, tuple(cls.__dataclass_fields__), "parameter of the wheel"
-                )
+                parameter_names = (*PARAMETER_DOMAINS, "n_legs")
+                check_parameter_name(parameter_name, parameter_names, "parameter of the wheel")
             except ValueError as error:
                 raise TypeError(str(error)) from None
         return super().__new__(cls)
@@ -312,7 +285,26 @@ class WheelParams(AbstractPrintable):
         relative_values = _square_relative_parameters(value_by_parameter, self.n_legs)
         for squared_relative_value in relative_values.values():
             is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
+        for law_parameter in list_parameters(self.leg_force, "leg"):
+            is_in_all_domains &= law_parameter.domain.contains_parameter_value(law_parameter.value)
         return is_in_all_domains
+
+    def attach_leg_force(self, leg_force: Any) -> "WheelParams":
+        """Return these parameters with the force of a model, so that all equations contain it."""
+        if leg_force is self.leg_force:  # Neither has a law.
+            return self
+        return eqx.tree_at(lambda p: p.leg_force, self, leg_force, is_leaf=lambda x: x is None)
+
+    def make_table_1_wheel(self) -> "WheelParams":
+        """Return the wheel in Table 1 of the paper with as many legs.
+
+        The parameters of its leg force have their defaults.
+        """
+        law_defaults = [x.default for x in list_parameters(self.leg_force, "leg")]
+        default_law = jax.tree.unflatten(
+            jax.tree.structure(self.leg_force), list(map(jnp.asarray, law_defaults))
+        )
+        return WheelParams(n_legs=self.n_legs).attach_leg_force(default_law)
 
     def scaled(
         self,
@@ -365,7 +357,7 @@ class WheelParams(AbstractPrintable):
         """Return the parameters by their symbols in the paper, and quantities that several formulas
         share.
         """
-        return compute_symbols(self.n_legs, **self._parameters)
+        return compute_symbols(self.n_legs, **self._parameters)._replace(leg_force=self.leg_force)
 
 
 def _square_relative_parameters(
@@ -425,6 +417,7 @@ def compute_symbols(
 PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETER_DOMAINS)
 FRICTION_NAME = "friction"
 """Name of the friction coefficient of the ground, which designs and branches may also vary."""
+FRICTION_DOMAIN = ParameterDomain("mu", "1", 0.0, math.inf, "friction coefficient of the ground")
 
 PARAMETER_BY_SYMBOL: dict[str, str] = {
     **{parameter_domain.symbol: name for name, parameter_domain in PARAMETER_DOMAINS.items()},
@@ -485,24 +478,35 @@ def require_known_friction(given_friction: Any) -> float:
     return float(given_friction)
 
 
+NO_LEG_FORCE = jax.tree.structure(None)
+"""Structure of the leg force of wheels with the paper's force."""
+
+
 def stack_parameters(params: WheelParams) -> Array:
     """Return the floating-point parameters of a wheel as one array.
 
-    The first axis has the order of `PARAMETER_NAMES`.
+    The first axis has the order of `PARAMETER_NAMES`, with the parameters of the leg force after
+    them.
     """
-    return jnp.stack([getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES])
+    wheel_values = [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES]
+    return jnp.stack([*wheel_values, *jax.tree.leaves(params.leg_force)])
 
 
 def make_wheel_from_parameters(
-    parameter_values: Array | tuple[Array, ...], n_legs: int, *ground: Elementwise
+    parameter_values: Array | tuple[Array, ...],
+    n_legs: int,
+    *ground: Elementwise,
+    leg_force_structure: Any = NO_LEG_FORCE,
 ) -> WheelParams:
-    """Return a wheel from its floating-point parameters in the order of `PARAMETER_NAMES`.
+    """Return a wheel from its floating-point parameters in the order of `stack_parameters`.
 
     - `ground`: values that describe uneven ground in addition to the slope. The parameter `slope`
-      then has all of them on a leading axis, see `models.phase_sequence.select_stance_line`.
+      then has all of them on a leading axis, see `models.phase_sequence.select_stance_line`;
+    - `leg_force_structure`: structure of the leg force as a pytree.
     """
-    wheel_params = WheelParams(
-        **dict(zip(PARAMETER_NAMES, parameter_values, strict=True)), n_legs=n_legs
+    value_by_name = dict(zip(PARAMETER_NAMES, parameter_values, strict=False))
+    wheel_params = WheelParams(**value_by_name, n_legs=n_legs).attach_leg_force(
+        jax.tree.unflatten(leg_force_structure, list(parameter_values[len(PARAMETER_NAMES) :]))
     )
     if not ground:
         return wheel_params

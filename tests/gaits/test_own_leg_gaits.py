@@ -1,0 +1,135 @@
+"""Gaits of wheels with a law of the legs that a user gives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from reference_code import five_coordinates
+from support.leg_laws import (
+    PaperLeg,
+    ProgressiveLeg,
+    QuadraticDamper,
+    make_reference_params,
+    make_wheel,
+)
+
+import vrw_jax as vrw
+
+PARAMS = vrw.WheelParams(damping=150.0)
+SPRING = ProgressiveLeg(1000.0, 300.0)
+DAMPER_PERIOD_S = 0.764078073
+DAMPER_DLS_FRACTION = 0.541628603
+DAMPER_SPEED_M_PER_S = 0.929798465
+DAMPER_MULTIPLIERS = (0.329805884, 0.023678)
+"""Values of two independent codes, for a quadratic damper of 60 N s^2/m^2."""
+
+
+def find_gait(law, params=PARAMS, **options):
+    return vrw.limit_cycle(params, model=make_wheel(law), **options)
+
+
+def measure_period(c2, damping=150.0):
+    return find_gait(QuadraticDamper(c2), vrw.WheelParams(damping=damping)).period
+
+
+def test_the_gait_with_a_quadratic_damper_is_that_of_two_other_codes():
+    cycle = find_gait(QuadraticDamper())
+    assert abs(cycle.period - DAMPER_PERIOD_S) < 1e-9
+    assert abs(cycle.dls_fraction - DAMPER_DLS_FRACTION) < 1e-9
+    assert abs(cycle.speed - DAMPER_SPEED_M_PER_S) < 2e-9  # The other codes agree to this digit.
+    np.testing.assert_allclose(cycle.multipliers.real, DAMPER_MULTIPLIERS, atol=1e-6)
+
+
+def test_the_papers_law_as_a_law_gives_the_papers_gait():
+    options = vrw.CycleOptions()
+    expected, cycle = (
+        vrw.limit_cycle(PARAMS, options=options),
+        find_gait(PaperLeg(), options=options),
+    )
+    for name in ("section_state", "durations", "multipliers"):
+        np.testing.assert_allclose(getattr(cycle, name), getattr(expected, name), atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("law", "damping"), [(QuadraticDamper(), 150.0), (SPRING, 120.0)], ids=["damper", "spring"]
+)
+def test_a_gait_is_a_fixed_point_of_five_coordinates(law, damping):
+    cycle = find_gait(law, vrw.WheelParams(damping=damping))
+    reference_params = make_reference_params(law, damping=damping)
+    reference = five_coordinates.step(reference_params, np.asarray(cycle.section_state))
+    np.testing.assert_allclose(reference["section_state"], cycle.section_state, atol=1e-11)
+    np.testing.assert_allclose(reference["durations"], cycle.durations, atol=1e-10)
+
+
+def test_derivatives_by_parameters_of_law_and_wheel_are_differences_of_gaits():
+    gradient = jax.grad(measure_period, (0, 1))(60.0, 150.0)
+    differences = (
+        (measure_period(60.1) - measure_period(59.9)) / 0.2,
+        (measure_period(60.0, 150.1) - measure_period(60.0, 149.9)) / 0.2,
+    )
+    np.testing.assert_allclose(gradient, differences, rtol=1e-7)
+    np.testing.assert_allclose(jax.jacfwd(measure_period)(60.0), gradient[0], rtol=1e-12)
+    values = jax.vmap(measure_period)(jnp.array([60.0, 90.0]))
+    np.testing.assert_allclose(values[0], DAMPER_PERIOD_S, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_gaits_and_multipliers_are_differences_of_first_ones():
+    differentiate = jax.grad(measure_period)
+    difference = (differentiate(60.1) - differentiate(59.9)) / 0.2
+    np.testing.assert_allclose(jax.hessian(measure_period)(60.0), difference, rtol=1e-5)
+
+    def measure_radius(c2):
+        return find_gait(QuadraticDamper(c2)).spectral_radius
+
+    difference = (measure_radius(60.1) - measure_radius(59.9)) / 0.2
+    np.testing.assert_allclose(jax.grad(measure_radius)(60.0), difference, rtol=1e-6)
+
+
+def test_similar_wheels_with_similar_laws_have_similar_gaits():
+    mass, length = 0.05, 0.1  # a wheel for a desk
+    small = PARAMS.scaled(mass=mass, length=length, time=length**0.5)
+    cycle = find_gait(QuadraticDamper(60.0 * mass / length), small)
+    assert abs(cycle.period / length**0.5 - DAMPER_PERIOD_S) < 1e-9
+    np.testing.assert_allclose(cycle.multipliers.real, DAMPER_MULTIPLIERS, atol=1e-6)
+
+
+def test_a_batch_has_a_law_for_each_wheel():
+    damping, c2 = np.array([100.0, 150.0, 150.0]), np.array([0.0, 60.0, 2000.0])
+    cycles = vrw.limit_cycles(
+        vrw.WheelParams(damping=damping), model=make_wheel(QuadraticDamper(c2))
+    )
+    assert cycles.found.tolist() == [True, True, False]
+    paper_period = vrw.limit_cycle(vrw.WheelParams(damping=100.0)).period
+    np.testing.assert_allclose(cycles.period[:2], [paper_period, DAMPER_PERIOD_S], atol=1e-9)
+    assert "pull on the rear foot" in cycles.ending[2]
+
+
+def test_a_gait_far_from_the_papers_law_is_found_by_homotopy():
+    # Without its own spring, the wheel would collapse: the predicted gait is no start.
+    params = vrw.WheelParams(stiffness=1.0, damping=1.0)
+
+    def leg(L, dL, p):
+        return 500.0 * (p.natural_length - L) - 149.0 * dL
+
+    cycle = vrw.limit_cycle(params, model=make_wheel(lambda L, dL, p: leg(L, dL, p) - 1.0 * dL))
+    np.testing.assert_allclose(cycle.period, vrw.limit_cycle(PARAMS).period, atol=1e-9)
+
+
+def test_force_peaks_and_margins_are_those_of_a_sampled_walk():
+    cycle = find_gait(SPRING, vrw.WheelParams(damping=120.0))
+    walk = vrw.simulate(
+        vrw.WheelParams(damping=120.0), cycle.section_state, 1, model=make_wheel(SPRING)
+    )
+    peaks = vrw.force_peaks(walk)
+    measures = cycle.measures(["peak_force", "n_force_peaks"])
+    assert abs(measures["peak_force"] - float(peaks.peak_force[0])) < 1e-6
+    assert int(measures["n_force_peaks"]) == int(peaks.n_force_peaks[0])
+    assert abs(cycle.margins.fore_foot_force - float(walk.lambda_2.min())) < 0.01
+
+
+def test_sensitivities_name_the_parameters_of_the_law():
+    table = vrw.sensitivities(PARAMS, measures=["period"], model=make_wheel(QuadraticDamper()))
+    derivative = table.derivative.sel(measure="period", parameter="leg.c2")
+    np.testing.assert_allclose(derivative, jax.grad(measure_period)(60.0), rtol=1e-9)
+    assert str(table.parameter_unit.sel(parameter="leg.c2").values) == "N s^2/m^2"
