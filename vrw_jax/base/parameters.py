@@ -33,8 +33,8 @@ class ParameterDomain(NamedTuple):
         """Raise a `ValueError` if the value of a parameter lies outside the allowed range."""
         if not self.contains_parameter_value(parameter_value):
             raise ValueError(
-                f"{parameter_name} is {parameter_value:g}, but {self.description} must lie in "
-                f"{self}: give a value in that range."
+                f"{parameter_name} is {parameter_value:g}, but {self.description or 'it'} must lie "
+                f"in {self}: give a value in that range."
             )
 
     def __str__(self) -> str:
@@ -109,8 +109,6 @@ def list_parameters(module: eqx.Module | None, prefix: str) -> Iterator[ModulePa
             yield from list_parameters(value, name)
         elif not field.metadata.get("static") and value is not None:
             domain = field.metadata.get("domain", _UNDECLARED_DOMAIN)
-            domain = domain._replace(
-                symbol=domain.symbol or field.name, description=domain.description or "it"
-            )
+            domain = domain._replace(symbol=domain.symbol or field.name)
             default = 1.0 if field.default is dataclasses.MISSING else field.default
             yield ModuleParameter(name, value, domain, default)

@@ -15,7 +15,6 @@ import numpy as np
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.printing import format_html_table
 from vrw_jax.gaits import floquet
-from vrw_jax.models.measures import MEASURES
 from vrw_jax.wheel.outcomes import Outcome
 
 MAX_PRINTED_SPECIAL_POINTS = 20
@@ -172,10 +171,8 @@ class Branch:
         values = self.values
         if not values.size:
             return f"Branch along {self.parameter}: none. {self.ending}"
-        has_parameter_unit = self.parameter in MEASURES
-        parameter_unit = (
-            f" {MEASURES[self.parameter].display_unit}".rstrip() if has_parameter_unit else ""
-        )
+        parameter_unit = self.dataset[self.parameter].attrs.get("units", "1")
+        parameter_unit = "" if parameter_unit == "1" else f" {parameter_unit}"
         is_gait_stable = self.stable
         text_lines = [
             f"Branch along {self.parameter}: {values.size} gaits from "

@@ -74,9 +74,9 @@ from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     STEP_MEASURES,
     UNILATERAL_STEP_MEASURES,
+    describe_parameter,
     make_labeled_variables,
     make_locked_leg_coordinate,
-    make_measure_attributes,
 )
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.stepping import (
@@ -319,6 +319,7 @@ def continue_branches(
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
     check_parameter_name(name, model.parameter_names, "parameter")
+    params = model.attach_leg_force(params)
     if check_int("period_n", period_n) > 1 and cycle is None:
         raise ValueError(
             f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
@@ -352,7 +353,7 @@ def continue_branches(
     batch_padder = lambda parameter_values_of_field: np.broadcast_to(
         np.asarray(parameter_values_of_field), batch_shape
     )[wheel_indices]
-    start_parameter_values = batch_padder(getattr(model if name == FRICTION_NAME else params, name))
+    start_parameter_values = batch_padder(model.get_parameter(params, name))
     params, parameter_values = jax.device_put(
         (
             jax.tree.map(batch_padder, params),
@@ -499,7 +500,13 @@ def _make_labeled_gait_branch(
         ]
         component_names = ["theta", "dtheta", "vx", "vz", *leg_names]
     branch_coordinates = {
-        parameter_name: xr.Variable("point", points.p, make_measure_attributes(parameter_name)),
+        parameter_name: xr.Variable(
+            "point",
+            points.p,
+            describe_parameter(
+                parameter_name, model.parameter_domains[parameter_name]
+            ).variable_attributes,
+        ),
         "component": component_names,
         "leg": make_locked_leg_coordinate(params.n_legs),
     }

@@ -41,9 +41,7 @@ from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_ME
 from vrw_jax.models.step_results import AbstractStep, AnySectionState
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
-    PARAMETER_NAMES,
     WheelParams,
-    make_wheel_from_parameters,
     stack_parameters,
 )
 
@@ -145,7 +143,7 @@ class CollocationProblem(AbstractGaitProblem):
 
     def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
         linearize_trial = make_trial_linearizer(
-            self.collocation_system, (PARAMETER_NAMES.index(self.parameter_name),)
+            self.collocation_system, (self.model.parameter_names.index(self.parameter_name),)
         )
         newton_correction, parameter_tangents, monodromy_matrix, *_ = linearize_trial(
             self._stack_parameters_at(wheel, p), wheel.is_phase_active, z
@@ -178,7 +176,7 @@ class CollocationProblem(AbstractGaitProblem):
         """
         collocation_system = self.collocation_system
         parameters = self._stack_parameters_at(wheel, p)
-        wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
+        wheel_symbols = collocation_system.make_wheel(parameters).symbols()
         phase_points_by_step = collocation_system.evaluate_phase_points(parameters, z)
         last_end_point, min_durations = (
             phase_points_by_step[-1][-1].phase_end_point,

@@ -55,7 +55,7 @@ from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import WheelParams, make_wheel_from_parameters
+from vrw_jax.wheel.params import WheelParams
 
 RANGE_EDGE_COLUMN = "edge of the box"
 """Name of the quantity that vanishes if the second parameter is at an end of its range."""
@@ -257,13 +257,16 @@ class CurveTracer(NamedTuple):
             if not can_continue_special_point(special_point.name):
                 continue
             limit_cycle = special_point.cycle
-            params = make_wheel_from_parameters(limit_cycle.parameters, limit_cycle.system.n_legs)
+            params = limit_cycle.system.make_wheel(limit_cycle.parameters)
             branch_wheel = BranchWheel(params, limit_cycle.collocation_state.is_phase_active)
             z = limit_cycle.collocation_state.solution
             curve_seeds.append(
                 CurveSeed(
                     choose_continued_special_point_name(special_point.name, branch_wheel, z),
-                    tuple(float(getattr(params, name)) for name in self.parameter_names),
+                    tuple(
+                        float(self.model.get_parameter(params, name))
+                        for name in self.parameter_names
+                    ),
                     limit_cycle.system,
                     branch_wheel,
                     z,

@@ -40,9 +40,7 @@ from vrw_jax.models.measures import MARGIN_MEASURES
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.params import (
-    PARAMETER_NAMES,
     Symbols,
-    make_wheel_from_parameters,
     stack_parameters,
 )
 from vrw_jax.wheel.phases import PhaseInstant, make_paper_phases
@@ -160,7 +158,8 @@ class GaitTestFunction(AbstractTestFunction):
     ) -> TestFunctionNewtonStep:
         branch_wheel = wheel.branch_wheel
         parameter_indices = tuple(
-            PARAMETER_NAMES.index(parameter_name) for parameter_name in self.parameter_names
+            self.model.parameter_names.index(parameter_name)
+            for parameter_name in self.parameter_names
         )
         linearize_trial = make_trial_linearizer(
             self.collocation_system,
@@ -247,8 +246,10 @@ class GaitTestFunction(AbstractTestFunction):
 
     def with_parameters(self, branch_wheel: BranchWheel, p: Array) -> BranchWheel:
         """Return the wheel with the two parameters replaced by the components of p."""
-        get_values = lambda params: [getattr(params, name) for name in self.parameter_names]
-        return branch_wheel._replace(params=eqx.tree_at(get_values, branch_wheel.params, [*p]))
+        params = branch_wheel.params
+        for parameter_name, parameter_value in zip(self.parameter_names, p, strict=True):
+            _, params = self.model.with_parameter(params, parameter_name, parameter_value)
+        return branch_wheel._replace(params=params)
 
     @property
     def gait_problem(self) -> CollocationProblem:
@@ -376,7 +377,7 @@ def _stack_continued_quantities(
     z: CollocationSolution,
 ) -> Array:
     """Return the values of `CONTINUED_QUANTITIES` for a collocated gait, in their order."""
-    wheel_symbols = make_wheel_from_parameters(parameters, collocation_system.n_legs).symbols()
+    wheel_symbols = collocation_system.make_wheel(parameters).symbols()
     (phase_points,) = collocation_system.evaluate_phase_points(parameters, z)
     return jnp.stack(list(_compute_continued_quantities(wheel_symbols, phase_points, z).values()))
 

@@ -1,6 +1,6 @@
 """Continue special points of gaits as curves in two parameters."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from vrw_jax.branches.gait_test_functions import FORCE_QUANTITY_NAMES
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.wheel.params import PARAMETER_DOMAINS, check_parameter_name, make_wheel_from_parameters
+from vrw_jax.wheel.params import PARAMETER_NAMES, check_parameter_name
 
 ParameterBounds = Mapping[str, tuple[float, float]]
 
@@ -77,7 +77,9 @@ def continue_special_point(
     return curve
 
 
-def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str], np.ndarray]:
+def _check_parameter_plane(
+    parameters: Any, bounds: Any, known_names: Sequence[str] = PARAMETER_NAMES
+) -> tuple[tuple[str, str], np.ndarray]:
     """Check the names and bounds of two parameters.
 
     Return the names, and the bounds as an array of shape (2, 2). Raise TypeError or ValueError if
@@ -87,7 +89,7 @@ def _check_parameter_plane(parameters: Any, bounds: Any) -> tuple[tuple[str, str
     bounds_by_parameter = {**DEFAULT_PARAMETER_BOUNDS, **(bounds or {})}
     parameter_names = check_names("parameters", parameters)
     for parameter_name, bounds_of_parameter in bounds_by_parameter.items():
-        check_parameter_name(parameter_name, tuple(PARAMETER_DOMAINS), "parameter that has bounds")
+        check_parameter_name(parameter_name, known_names, "parameter that has bounds")
         bounds_by_parameter[parameter_name] = check_range(
             f"bounds[{parameter_name!r}]", bounds_of_parameter
         )
@@ -116,9 +118,11 @@ def continue_special_points(
     """Continue several special points as curves in two parameters, as
     `continue_special_point` does.
     """
-    parameters, parameter_ranges = _check_parameter_plane(parameters, bounds)
-    first_parameter_name, second_parameter_name = parameters
     check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
+    parameters, parameter_ranges = _check_parameter_plane(
+        parameters, bounds, cycle.model.parameter_names
+    )
+    first_parameter_name, second_parameter_name = parameters
     if cycle.period_n != 1:
         raise ValueError(
             f"the gait has {cycle.period_n} steps, but a curve needs a gait of one step: give one."
@@ -135,14 +139,14 @@ def continue_special_points(
         step_options,
         measures_force_peaks=not set(names).isdisjoint(FORCE_QUANTITY_NAMES),
     )
-    params = make_wheel_from_parameters(cycle.parameters, cycle.system.n_legs)
+    params = cycle.system.make_wheel(cycle.parameters)
     seeds_by_name: dict[str, CurveSeed] = {}
     for parameter_index, parameter_name in enumerate(parameters):
         if set(names) - set(seeds_by_name):
             curve_seeds = curve_tracer.find_seeds(
                 parameter_index, *select_tree_rows((params, cycle), None)
             )
-            start_value = float(getattr(params, parameter_name))
+            start_value = float(cycle.model.get_parameter(params, parameter_name))
             compute_distance = lambda seed, index=parameter_index, start_value=start_value: abs(
                 seed.parameter_values[index] - start_value
             )

@@ -70,7 +70,11 @@ class AbstractWheel(eqx.Module):
         def format_field(x: Any) -> str:
             if eqx.is_array(x):
                 return repr(float(x)) if x.ndim == 0 else format_quantity(x, "")
-            return format_module(x) if isinstance(x, eqx.Module) else repr(x)
+            return (
+                format_module(x)
+                if isinstance(x, eqx.Module)
+                else getattr(x, "__qualname__", repr(x))
+            )
 
         return format_module(self)
 
@@ -120,7 +124,17 @@ class AbstractWheel(eqx.Module):
     def list_parameter_values(self, params: WheelParams) -> list[Any]:
         """Return the value of each parameter in `parameter_names`, for one wheel or a batch."""
         wheel_values = [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES]
-        return [*wheel_values, *jax.tree.leaves(self.own_parameters)]
+        return [*wheel_values, *self._list_own_values(params)]
+
+    def _list_own_values(self, params: WheelParams) -> list[Any]:
+        """Return the values of the own parameters, which are those of an attached leg force."""
+        return jax.tree.leaves(
+            self.own_parameters if params.leg_force is None else params.leg_force
+        )
+
+    def get_parameter(self, params: WheelParams, parameter_name: str) -> Any:
+        """Return the value of one parameter of `parameter_names`."""
+        return self.list_parameter_values(params)[self.parameter_names.index(parameter_name)]
 
     def collect_batch_parameter_values(
         self, params: WheelParams
@@ -149,6 +163,10 @@ class AbstractWheel(eqx.Module):
         own_parameters = jax.tree.unflatten(jax.tree.structure(self.own_parameters), list(values))
         return eqx.tree_at(lambda model: model.own_parameters, self, own_parameters)
 
+    def without_values(self) -> "AbstractWheel":
+        """Return the model with 1 as the value of each parameter of its leg force."""
+        return self
+
     def with_parameter(
         self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
     ) -> tuple["AbstractWheel", WheelParams]:
@@ -157,9 +175,12 @@ class AbstractWheel(eqx.Module):
         The parameter is one of `parameter_names`, and the value may be a tracer.
         """
         if parameter_name not in PARAMETER_NAMES:
-            own_values = jax.tree.leaves(self.own_parameters)
+            own_values = self._list_own_values(params)
             own_values[list(self.own_parameter_domains).index(parameter_name)] = parameter_value
-            return self._replace_own_parameters(own_values), params
+            model = self._replace_own_parameters(own_values)
+            if params.leg_force is not None:
+                params = params.attach_leg_force(model.own_parameters)
+            return model, params
         return self, eqx.tree_at(
             lambda wheel: getattr(wheel, parameter_name), params, parameter_value
         )

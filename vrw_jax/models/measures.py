@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.printing import format_mathtext
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_DOMAINS
@@ -417,7 +418,21 @@ PARAMETER_MEASURES = _index_measures_by_name(
 )
 """Parameters of the wheel as measures, for the axes of a scan."""
 
-MEASURES: dict[str, Measure] = (
+
+LEG_PREFIX = "leg."
+"""Beginning of the names of the parameters of a leg force."""
+
+
+class _MeasureTable(dict[str, Measure]):
+    """Table of measures that also describes the parameters of leg forces, without their units."""
+
+    def __missing__(self, name: str) -> Measure:
+        if not name.startswith(LEG_PREFIX):
+            raise KeyError(name)
+        return Measure(name, "1", name.rpartition(".")[2], name, "Parameter of the leg force.")
+
+
+MEASURES: dict[str, Measure] = _MeasureTable(
     STEP_MEASURES
     | MARGIN_MEASURES
     | UNILATERAL_STEP_MEASURES
@@ -492,6 +507,12 @@ def describe_violation(margin_name: str) -> str:
     symbol_text = f"{measure.symbol} = 0: " if is_step_measure else ""
     leg_text = f", leg {leg_suffix[:-1]}" if leg_suffix else ""
     return symbol_text + measure.violation_text + leg_text
+
+
+def describe_parameter(name: str, domain: ParameterDomain) -> Measure:
+    """Return the parameter of a wheel, its ground or its leg force as a measure."""
+    description = domain.description or "Parameter of the leg force."
+    return MEASURES.get(name, Measure(name, domain.unit, domain.symbol, name, description))
 
 
 def make_measure_attributes(variable_name: str) -> dict[str, object]:

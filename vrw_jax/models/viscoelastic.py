@@ -125,6 +125,14 @@ class ViscoelasticWheel(AbstractWheel):
             return params
         return params.attach_leg_force(self.leg_force)
 
+    def without_values(self) -> "ViscoelasticWheel":
+        return eqx.tree_at(
+            lambda model: model.leg_force,
+            self,
+            jax.tree.map(jnp.ones_like, self.leg_force),
+            is_leaf=lambda x: x is None,
+        )
+
     def with_leg_force_of(self, params: WheelParams) -> "ViscoelasticWheel":
         """Return the model with the leg force that `attach_leg_force` has added to parameters."""
         return eqx.tree_at(

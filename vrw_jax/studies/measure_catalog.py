@@ -132,6 +132,12 @@ def select_measure_catalog(
     measure_catalog = MEASURE_CATALOGS.get(
         wheel_model.capabilities.gait_method, PAPER_MEASURE_CATALOG
     )
+    if isinstance(wheel_model, AbstractWheel) and wheel_model.own_parameter_domains.keys() - {
+        FRICTION_NAME
+    }:
+        measure_catalog = measure_catalog._replace(
+            differentiation_parameters=wheel_model.parameter_names
+        )
     if slope_standard_deviation is None:
         return measure_catalog
     # The measures of such walks take about one second per sample.
@@ -147,7 +153,7 @@ def make_error_variable_name(measure_name: str) -> str:
     return measure_name + ERROR_VARIABLE_SUFFIX
 
 
-_DERIVATIVE_NAME_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)(\w+)")
+_DERIVATIVE_NAME_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)([\w.]+)")
 
 
 class MeasureDerivative(NamedTuple):

@@ -44,7 +44,7 @@ from vrw_jax.studies.measure_catalog import (
 )
 from vrw_jax.studies.scan_design import ParameterSamples
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, make_wheel_from_parameters
+from vrw_jax.wheel.params import WheelParams
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]
 """Outcome of a gait step, section state at its end, and measures of the step by name."""
@@ -108,9 +108,10 @@ class CollocationScanEngine:
             dict.fromkeys(derivative.parameter_name for derivative in requested_derivatives)
         )
         differentiated_parameter_indices = np.asarray(
-            list(map(PARAMETER_NAMES.index, differentiation_parameters)), int
+            list(map(wheel_model.parameter_names.index, differentiation_parameters)), int
         )
-        n_legs = base_wheel.n_legs
+        # The values of a law are in the rows, so that its programs do not depend on them.
+        wheel_model, n_legs = wheel_model.without_values(), base_wheel.n_legs
         gait_finder: Any = make_finder(
             wheel_model, n_legs, cycle_options=cycle_options, step_options=step_options
         )
@@ -169,9 +170,8 @@ class CollocationScanEngine:
             """Return outcome, end state and measures of one gait step from a limit cycle's section
             state.
             """
-            step_result = wheel_model.take_step(
-                make_wheel_from_parameters(parameter_values, n_legs), section_state, step_options
-            )
+            step_model, params = wheel_model.from_parameter_values(parameter_values, n_legs)
+            step_result = step_model.take_step(params, section_state, step_options)
             step_measures = {
                 measure_name: measure_value
                 for measure_name, measure_value in step_result.measures().items()
@@ -206,17 +206,18 @@ class CollocationScanEngine:
             *self._map_in_threads(self._run_cycle_program, self._batch_size, parameter_rows)
         )
         cycle_outcomes, gaits = np.array(first_search.outcome), first_search.gaits
+        default_finder: Any = make_finder(self._gait_finder.model, self._gait_finder.n_legs)
+        model, params = self._gait_finder.model.from_parameter_values(
+            tuple(jax.device_put(list(parameter_rows.T))), self._gait_finder.n_legs
+        )
         for _, sample_indices, mesh_search in search_further(
             self._find_gaits_from_starts,
             self._gait_finder,
-            make_wheel_from_parameters(
-                tuple(jax.device_put(list(parameter_rows.T))),
-                self._evaluation_request.base_wheel.n_legs,
-            ),
+            model.attach_leg_force(params),
             first_search,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
             # A mesh that the user has chosen is fixed.
-            can_refine_mesh=self._gait_finder.cycle_options == CycleOptions(),
+            can_refine_mesh=self._gait_finder.cycle_options == default_finder.cycle_options,
         ):
             cycle_outcomes[sample_indices] = mesh_search.outcome
             gaits = replace_rows(gaits, sample_indices, mesh_search.gaits)
@@ -266,7 +267,7 @@ class CollocationScanEngine:
         self, gait_finder: Any, params: WheelParams, starts: CollocationState
     ) -> MeshSearch:
         """Search for gaits on the mesh of `gait_finder` from the given starts."""
-        parameter_rows = np.stack([getattr(params, name) for name in PARAMETER_NAMES], -1)
+        parameter_rows = gait_finder.model.collect_batch_parameter_values(params)
         batch_size = batch_sizes.GAIT_READ_BATCH_SIZE
         with self._compilation_lock:
             cycle_program = self._programs_by_mesh.get(gait_finder.cycle_options)
@@ -288,9 +289,10 @@ class CollocationScanEngine:
         All cores of a CPU use the same programs.
         """
         local_devices = jax.local_devices()
+        parameter_count = len(self._evaluation_request.wheel_model.parameter_names)
         parameter_dtype = np.dtype(self._evaluation_request.base_wheel.damping.dtype)
         parameter_rows_shape = jax.ShapeDtypeStruct(
-            (self._batch_size, len(PARAMETER_NAMES)), parameter_dtype
+            (self._batch_size, parameter_count), parameter_dtype
         )
         section_states_shape = jax.ShapeDtypeStruct((self._batch_size, 3), parameter_dtype)
         # Threads have separate settings.

@@ -21,7 +21,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.printing import format_quantity
-from vrw_jax.models.measures import make_measure_attributes
+from vrw_jax.models.measures import LEG_PREFIX, make_measure_attributes
 from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, check_parameter_name
 
 ParameterSamples = dict[str, np.ndarray]
@@ -202,7 +202,11 @@ def _merge_mapping_and_keywords(
             f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
         )
     for parameter_name in parameter_mapping:
-        check_parameter_name(parameter_name, SWEEPABLE_PARAMETERS, "parameter that can be swept")
+        # Only the model of the scan knows the parameters of a leg force.
+        if not str(parameter_name).startswith(LEG_PREFIX):
+            check_parameter_name(
+                parameter_name, SWEEPABLE_PARAMETERS, "parameter that can be swept"
+            )
     return parameter_mapping
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import platform
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,8 +22,14 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.lanes.disk_cache import compute_source_digest
+from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.models.capabilities import ModelCapabilities
-from vrw_jax.models.measures import MARGIN_MEASURES, make_locked_leg_coordinate
+from vrw_jax.models.measures import (
+    LEG_PREFIX,
+    MARGIN_MEASURES,
+    describe_parameter,
+    make_locked_leg_coordinate,
+)
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.registry import describe_accepted_models
 from vrw_jax.models.stepping import (
@@ -51,7 +58,7 @@ from vrw_jax.studies.scan_store import (
     choose_chunk_shape,
 )
 from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE, JsonObject
-from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, check_parameter_name
 
 MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples in a scan.
@@ -128,9 +135,9 @@ class ScanPlan:
         scan_settings: JsonObject = {
             "design": self.design.describe_design(),
             "wheel": {
-                parameter_name: float(getattr(base_wheel, parameter_name))
-                for parameter_name in PARAMETER_NAMES
-                if parameter_name not in self.design.swept_parameters
+                parameter_name: float(request.wheel_model.get_parameter(base_wheel, parameter_name))
+                for parameter_name in request.wheel_model.parameter_names
+                if parameter_name not in (FRICTION_NAME, *self.design.swept_parameters)
             }
             | {"n_legs": base_wheel.n_legs},
             "measures": list(request.measure_names),
@@ -212,6 +219,9 @@ def plan_scan(
             "the design sweeps friction, which does not affect the paper's wheel: give "
             f"model={describe_accepted_models('scan', FRICTION_NAME)}."
         )
+    for parameter_name in design.swept_parameters:
+        if parameter_name.startswith(LEG_PREFIX):
+            check_parameter_name(parameter_name, model.parameter_names, "parameter of this model")
     if tol is not None:
         tol = check_positive("tol", tol)
         model_fields: dict[str, Any] = type(model).__dataclass_fields__
@@ -243,11 +253,11 @@ def plan_scan(
         if tol is not None:
             variable_names.append(make_error_variable_name(requested_measure))
     variable_names += measure_catalog.always_included_variables
-    cycle_options = CycleOptions() if cycle_options is None else cycle_options
+    cycle_options = getattr(gait_finder, "cycle_options", cycle_options or CycleOptions())
     evaluation_request = EvaluationRequest(
         measure_names, base, model, options, cycle_options, tol, slope_sd
     )
-    result_layout = _make_result_layout(design, variable_names, base, chunk)
+    result_layout = _make_result_layout(design, variable_names, base, model, chunk)
     return ScanPlan(
         design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
     )
@@ -273,6 +283,17 @@ def describe_computing_environment() -> JsonObject:
         "versions": provenance_record["versions"],
         "device": f"{jax.default_backend()}: {provenance_record['device']}, {processor_text}",
     }
+
+
+def _identify_code(leg_force: Any) -> str:
+    """Return the key of a law's code, without its parameters.
+
+    The key of a law that cannot be identified is new in each scan, which therefore never resumes.
+    """
+    try:
+        return make_key(jax.tree.structure(leg_force))
+    except UnresolvableFunctionError as error:
+        return f"{uuid.uuid4()}: {error}"
 
 
 VECTOR_INSTRUCTION_SETS = ("avx", "fma", "avx2", "avx512f", "avx512dq", "neon", "sve")
@@ -302,6 +323,8 @@ def describe_settings_difference(
         return ""
     if setting_name == "design.digest":
         return "the values of the swept parameters differ"
+    if setting_name == "model.leg_force":
+        return "the code of leg_force differs"
     if setting_name == "code":
         return "the library's code differs"
     return f"{setting_name} is {stored_settings!r} there and {current_settings!r} here"
@@ -311,6 +334,7 @@ def _make_result_layout(
     design: AbstractSampleDesign,
     variable_names: Iterable[str],
     base_wheel: WheelParams,
+    model: Any,
     chunk_size: int,
 ) -> ResultLayout:
     """Return the layout of a scan's variables over the axes of a design.
@@ -333,13 +357,18 @@ def _make_result_layout(
             get_variable_attributes(variable_name),
         )
 
+    result_coordinates = design.make_result_coordinates() | {"leg": locked_leg_coordinate}
+    for parameter_name in design.swept_parameters:
+        result_coordinates[parameter_name].attrs |= describe_parameter(
+            parameter_name, model.parameter_domains[parameter_name]
+        ).variable_attributes
     return ResultLayout(
         sample_shape=design.shape,
         chunk_shape=choose_chunk_shape(design.shape, chunk_size),
         empty_variables={
             variable_name: make_empty_variable(variable_name) for variable_name in variable_names
         },
-        result_coordinates=design.make_result_coordinates() | {"leg": locked_leg_coordinate},
+        result_coordinates=result_coordinates,
     )
 
 
@@ -363,7 +392,11 @@ def _convert_settings_to_json(settings_object: object) -> JsonObject:
         field_value = getattr(settings_object, field_name)
         if isinstance(field_value, StepOptions | ModelCapabilities):
             continue  # Options are recorded separately, and capabilities are code.
-        if isinstance(field_value, tuple):
+        if field_name == "leg_force":
+            if field_value is None:
+                continue
+            field_value = _identify_code(field_value)
+        elif isinstance(field_value, tuple):
             field_value = list(field_value)
         elif field_value is not None and not isinstance(field_value, bool | int | str):
             field_value = float(field_value)

@@ -1,0 +1,71 @@
+"""Scans of gaits over parameters of a law of the legs that a user gives."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from support.leg_laws import PaperLeg, QuadraticDamper, make_wheel
+
+import vrw_jax as vrw
+
+PARAMS = vrw.WheelParams(damping=150.0)
+MODEL = make_wheel(QuadraticDamper())
+DESIGN = vrw.grid({"leg.c2": [0.0, 60.0], "damping": [140.0, 150.0]})
+
+
+class CubicDamper(eqx.Module):
+    """Another law with a parameter of the same name."""
+
+    c2: float = 60.0
+
+    def __call__(self, L, dL, params):
+        spring = params.stiffness * (params.natural_length - L)
+        return spring - params.damping * dL - self.c2 * dL**3
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return tmp_path_factory.mktemp("laws") / "scan.zarr"
+
+
+@pytest.fixture(scope="module")
+def scan(store):
+    return vrw.scan(DESIGN, ["period"], base=PARAMS, model=MODEL, store=store)
+
+
+def test_samples_are_gaits_of_their_laws(scan):
+    for c2 in (0.0, 60.0):
+        cycle = vrw.limit_cycle(PARAMS, model=make_wheel(QuadraticDamper(c2)))
+        sample = scan.period.sel({"leg.c2": c2, "damping": 150.0})
+        assert abs(float(sample) - cycle.period) < 1e-12
+    assert scan["leg.c2"].attrs["units"] == "N s^2/m^2"
+
+
+def test_a_scan_resumes_with_the_same_code_only(scan, store):
+    resumed = vrw.scan(DESIGN, ["period"], base=PARAMS, model=MODEL, store=store)
+    np.testing.assert_array_equal(resumed.period, scan.period)
+    with pytest.raises(ValueError, match="the code of leg_force differs"):
+        vrw.scan(DESIGN, ["period"], base=PARAMS, model=make_wheel(CubicDamper()), store=store)
+
+
+def test_another_value_of_a_parameter_that_is_not_swept_is_another_scan(tmp_path):
+    design = vrw.grid(damping=[150.0])
+    measure = lambda model: vrw.scan(
+        design, ["period"], base=PARAMS, model=model, store=tmp_path / "scan.zarr"
+    )
+    measure(MODEL)
+    with pytest.raises(ValueError, match=r"wheel.leg.c2 is 60.0 there and 61.0 here"):
+        measure(make_wheel(QuadraticDamper(61.0)))
+
+
+def test_a_parameter_that_the_law_does_not_have_is_refused():
+    with pytest.raises(ValueError, match=r"'leg.c2' is no parameter of this model.*leg.k"):
+        vrw.scan(DESIGN, ["period"], base=PARAMS, model=make_wheel(PaperLeg()))
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_scan_by_a_parameter_of_the_law_are_differences():
+    design = vrw.samples({"leg.c2": np.array([59.9, 60.0, 60.1])})
+    names = ["period", "d period / d leg.c2"]
+    scan = vrw.scan(design, names, base=PARAMS, model=MODEL)
+    difference = float(scan.period[2] - scan.period[0]) / 0.2
+    np.testing.assert_allclose(scan["d period / d leg.c2"][1], difference, rtol=1e-6)
