@@ -85,3 +85,44 @@ def test_random_samples_are_reproduced_by_their_seed_and_stay_in_their_box(kind:
 def test_an_assignment_changes_one_parameter() -> None:
     assert parse_assignment("damping = 150") == ("damping", 150.0)
     assert parse_assignment("n_legs=10") == ("n_legs", 10)
+
+
+LEG_FILE = """
+import equinox as eqx
+import vrw_jax as vrw
+
+class SoftLeg(eqx.Module):
+    k: float = vrw.parameter(450.0, unit="N/m")
+
+    def __call__(self, L, dL, params):
+        return self.k * (params.natural_length - L) - params.damping * dL
+
+stiff_leg = SoftLeg(600.0)
+"""
+
+
+def test_a_config_takes_a_law_of_the_legs_from_a_python_file(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my_leg.py").write_text(LEG_FILE)
+    config_text = '[model]\nleg_force = "my_leg.py:{}"\n[grid]\n"leg.k" = [450.0, 500.0]\n'
+    config = parse_config(config_text.format("SoftLeg"))
+    assert config.design.swept_parameters == ("leg.k",)
+    assert float(config.make_model().leg_force.k) == 450.0
+    stiff_config = parse_config(config_text.format("stiff_leg"))
+    assert float(stiff_config.make_model().leg_force.k) == 600.0
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ('"my_leg"', 'a Python file and a name in it, as "my_leg.py:leg"'),
+        ('"my_leg.py:leg"', "my_leg.py does not define leg"),
+        ('"other.py:leg"', "names the file other.py, which"),
+        ("3", "a Python file and a name in it"),
+    ],
+)
+def test_a_wrong_place_of_a_law_is_one_sentence(setting, message, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my_leg.py").write_text(LEG_FILE)
+    with pytest.raises(ValueError, match=message):
+        parse_config(f"[model]\nleg_force = {setting}\n")

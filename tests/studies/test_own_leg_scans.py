@@ -69,3 +69,14 @@ def test_derivatives_of_a_scan_by_a_parameter_of_the_law_are_differences():
     scan = vrw.scan(design, names, base=PARAMS, model=MODEL)
     difference = float(scan.period[2] - scan.period[0]) / 0.2
     np.testing.assert_allclose(scan["d period / d leg.c2"][1], difference, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_tuning_moves_a_parameter_of_the_law_to_its_bound():
+    bounds = {"leg.c2": (50.0, 70.0)}
+    tuned = vrw.tune(PARAMS, "dls_fraction", ["leg.c2"], bounds, {}, model=MODEL)
+    assert float(tuned.model.leg_force.c2) == 70.0
+    cycle = vrw.limit_cycle(PARAMS, model=tuned.model)
+    assert abs(tuned.value - cycle.dls_fraction) < 1e-10
+    assert "leg.c2 70 N s^2/m^2" in str(tuned)
+    assert tuned.params.leg_force is None

@@ -4,7 +4,7 @@
 
 import textwrap
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,7 @@ from vrw_jax.app.figure_style import (
     typeset_greek_symbols,
 )
 from vrw_jax.branches.branch import SpecialPointCurve
-from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, describe_violation
+from vrw_jax.models.measures import LEG_PREFIX, MARGIN_MEASURES, MEASURES, describe_violation
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
 from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS
 from vrw_jax.studies.sensitivity_indices import sobol_indices
@@ -55,6 +55,16 @@ PARAMETER_AXIS_ORDER = dict.fromkeys(
 """Parameters in the order in which figures assign them to the horizontal axis, the vertical axis
 and the panel columns.
 """
+
+
+def _list_swept_parameters(
+    names: Iterable[Hashable], parameter_order: Iterable[str] = PARAMETER_AXIS_ORDER
+) -> list[str]:
+    """Return the parameters among the names in an order, and then those of leg forces."""
+    texts = list(map(str, names))
+    law_names = [name for name in texts if name.startswith(LEG_PREFIX)]
+    return [name for name in parameter_order if name in texts] + law_names
+
 
 DRAWN_MARGIN_NAMES = (
     "fore_foot_force", "takeoff_acceleration", "clearance_sls1", "clearance_sls2",
@@ -115,9 +125,7 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
         ['scan']
     """
     require_dataset_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
-    swept_parameters = [
-        parameter_name for parameter_name in PARAMETER_AXIS_ORDER if parameter_name in scan.coords
-    ]
+    swept_parameters = _list_swept_parameters(scan.coords)
     varied_parameters = [
         parameter_name
         for parameter_name in swept_parameters
@@ -161,8 +169,8 @@ def draw_scan_slices(
     """
     slice_indices = {
         parameter_name: scan.sizes[parameter_name] // 2
-        for parameter_name in SWEEPABLE_PARAMETERS
-        if parameter_name in scan.dims and parameter_name not in (x, y, panel_column_parameter)
+        for parameter_name in _list_swept_parameters(scan.dims)
+        if parameter_name not in (x, y, panel_column_parameter)
     }
     panel_column_datasets = [scan.isel(slice_indices).transpose(y, x, ...)]
     width_inches = find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES)
@@ -422,8 +430,8 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
     scan = scan.isel(
         {
             parameter_name: 0
-            for parameter_name in SWEEPABLE_PARAMETERS
-            if parameter_name in scan.dims and parameter_name != x
+            for parameter_name in _list_swept_parameters(scan.dims)
+            if parameter_name != x
         }
     ).sortby(x)
     measure_names = _list_shown_measures(scan) or ["fore_foot_force"]
@@ -590,11 +598,7 @@ def map_figure(
         "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
     )
     x, y = (
-        curves[0].parameters
-        if curves
-        else (
-            parameter_name for parameter_name in SWEEPABLE_PARAMETERS if parameter_name in scan.dims
-        )
+        curves[0].parameters if curves else _list_swept_parameters(scan.dims, SWEEPABLE_PARAMETERS)
     )
     width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
     figure = StyledFigure(figsize=(width_inches, 0.62 * width_inches))

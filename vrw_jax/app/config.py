@@ -5,6 +5,7 @@ the remedy.
 """
 
 import contextlib
+import importlib.util
 import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -92,9 +93,7 @@ class ScanConfig:
     mesh_intervals: tuple[int, int, int] | None = None
 
     @classmethod
-    def from_table(
-        cls, config_table: ConfigTable, model_class: type[AbstractWheel]
-    ) -> "ScanConfig":
+    def from_table(cls, config_table: ConfigTable, model: AbstractWheel) -> "ScanConfig":
         """Read the settings of the table `[scan]`.
 
         Raise a ValueError if the model does not have a requested measure.
@@ -112,7 +111,7 @@ class ScanConfig:
         )
         check_measure_names(
             scan_config.measures or (),
-            select_measure_catalog(model_class, scan_config.tol, scan_config.slope_sd),
+            select_measure_catalog(model, scan_config.tol, scan_config.slope_sd),
         )
         return scan_config
 
@@ -440,9 +439,13 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
     model_settings = {
         setting_name: setting_value
         for setting_name, setting_value in tables["model"].items()
-        if setting_name != "name"
+        if setting_name not in ("name", LEG_FORCE_KEY)
     }
-    parameter_names = model_class().parameter_names
+    leg_settings = {}
+    if LEG_FORCE_KEY in tables["model"]:
+        leg_settings[LEG_FORCE_KEY] = _load_leg_force(tables["model"][LEG_FORCE_KEY])
+    default_model = model_class(**leg_settings)
+    parameter_names = default_model.parameter_names
     sample_design = None
     if design_kinds:
         design_kind = design_kinds[0]
@@ -458,9 +461,9 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
     checked_config = Config(
         wheel_values=_parse_wheel_table(tables["wheel"]),
         model_name=model_name,
-        model_settings=_parse_with_default_types(model_settings, default_settings),
+        model_settings=leg_settings | _parse_with_default_types(model_settings, default_settings),
         step_option_values=_parse_with_default_types(tables["options"], default_options),
-        scan=ScanConfig.from_table(tables["scan"], model_class),
+        scan=ScanConfig.from_table(tables["scan"], default_model),
         gait=GaitConfig.from_table(tables["gait"]),
         tune=TuneConfig.from_table(tables["tune"]) if "tune" in config_tables else None,
         branch=BranchConfig.from_table(tables["branch"], parameter_names)
@@ -515,6 +518,36 @@ def _parse_wheel_table(config_table: ConfigTable) -> dict[str, float | int]:
         else:
             parameter_values[parameter_name] = _parse_parameter_value(parameter_name, config_value)
     return parameter_values
+
+
+LEG_FORCE_KEY = "leg_force"
+"""Key of a law of the legs in the table `[model]`."""
+
+
+def _load_leg_force(location: object) -> Any:
+    """Return the law that a text such as "my_leg.py:leg" names, from the Python file."""
+    file_name, _, law_name = str(location).rpartition(":")
+    if not isinstance(location, str) or not file_name.endswith(".py") or not law_name:
+        raise _make_value_error(
+            LEG_FORCE_KEY, location, 'a Python file and a name in it, as "my_leg.py:leg"'
+        )
+    if not Path(file_name).is_file():
+        raise ValueError(
+            f"{LEG_FORCE_KEY} names the file {file_name}, which {Path.cwd()} does not contain: "
+            "give its path from the current folder."
+        )
+    module_spec = importlib.util.spec_from_file_location(Path(file_name).stem, file_name)
+    assert module_spec is not None
+    assert module_spec.loader is not None  # The name of the file ends in .py.
+    module = importlib.util.module_from_spec(module_spec)
+    module_spec.loader.exec_module(module)
+    if not hasattr(module, law_name):
+        raise ValueError(
+            f"{LEG_FORCE_KEY} is {location}, but {file_name} does not define {law_name}: write "
+            f"{law_name} = ... there."
+        )
+    law = getattr(module, law_name)
+    return law() if isinstance(law, type) else law
 
 
 def _parse_with_default_types(
@@ -654,7 +687,9 @@ def _parse_parameter_value(parameter_name: str, config_value: object) -> float:
     if parameter_name == FRICTION_NAME:
         return _parse_positive_number(parameter_name, config_value)
     parameter_value = _parse_finite_number(parameter_name, config_value)
-    PARAMETER_DOMAINS[parameter_name].require_value_in_domain(parameter_name, parameter_value)
+    # A sample outside the domain of a leg force is BAD_INPUT.
+    if parameter_name in PARAMETER_DOMAINS:
+        PARAMETER_DOMAINS[parameter_name].require_value_in_domain(parameter_name, parameter_value)
     return parameter_value
 
 

@@ -10,7 +10,6 @@ import functools
 import math
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -26,13 +25,11 @@ from vrw_jax.gaits.phase_collocation import (
 )
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import rotate_to_rear_leg
-from vrw_jax.wheel.leg_force import LegParameters
+from vrw_jax.wheel.leg_force import ScaledLegForce
 from vrw_jax.wheel.params import (
     NO_LEG_FORCE,
-    PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     Symbols,
-    WheelUnits,
     compute_symbols,
 )
 from vrw_jax.wheel.phases import PAPER_PHASES, TRANSITION_ASSUMPTIONS, Assumption, PhaseInstant
@@ -42,31 +39,6 @@ N_SYMBOL_CONSTANTS = 12
 
 The other fields follow from the number of legs.
 """
-
-
-class _ScaledLegForce(eqx.Module):
-    """User's law of a leg in other units of length and time, on the way from the paper's force.
-
-    A search continues gaits with the paper's force to gaits with the law, whose share grows to 1.
-    """
-
-    leg_force: Any  # in SI units
-    share: Elementwise
-    length_unit: Elementwise
-    time_unit: Elementwise
-
-    def __call__(self, L: Elementwise, dL: Elementwise, params: LegParameters) -> Elementwise:
-        units = WheelUnits(self.length_unit, self.time_unit, 1.0)
-        si_params = params._replace(
-            **{
-                name: getattr(params, name) * units.compute_unit_in_si(PARAMETER_DOMAINS[name].unit)
-                for name in params._fields
-                if name != "n_legs"
-            }
-        )
-        si_force = self.leg_force(L * units.length_unit, dL * units.velocity_unit, si_params)
-        paper_force = params.stiffness * (params.natural_length - L) - params.damping * dL
-        return self.share * (si_force / units.acceleration_unit) + (1.0 - self.share) * paper_force
 
 
 N_LAW_SCALES = 3
@@ -86,7 +58,7 @@ def compute_phase_constants(
     """Return the combinations of parameters that occur in the formulas of all phases.
 
     The arguments are the parameters in the order of `stack_parameters`. In a search, the values of
-    `_ScaledLegForce` follow those of a law.
+    `ScaledLegForce` follow those of a law.
     """
     n_wheel_parameters = len(PARAMETER_NAMES)
     wheel_symbols: tuple[Any, ...] = compute_symbols(n_legs, *parameters[:n_wheel_parameters])
@@ -104,7 +76,7 @@ def _restore_symbols(
         n_constants = count_phase_constants(leg_force_structure)
         *law_values, share, length_unit, time_unit = phase_constants[N_SYMBOL_CONSTANTS:n_constants]
         law = jax.tree.unflatten(leg_force_structure, law_values)
-        leg_force = _ScaledLegForce(law, share, length_unit, time_unit)
+        leg_force = ScaledLegForce(law, share, length_unit, time_unit)
     leg_angle = 2.0 * math.pi / n_legs
     symbol_values: tuple[Any, ...] = (
         *phase_constants[:N_SYMBOL_CONSTANTS],

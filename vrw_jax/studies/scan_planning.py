@@ -401,4 +401,6 @@ def _convert_settings_to_json(settings_object: object) -> JsonObject:
         elif field_value is not None and not isinstance(field_value, bool | int | str):
             field_value = float(field_value)
         field_value_by_name[stored_name_by_field.get(field_name, field_name)] = field_value
+    if hasattr(settings_object, "parameter_names"):
+        field_value_by_name["parameter_names"] = list(settings_object.parameter_names)
     return field_value_by_name

@@ -47,6 +47,7 @@ from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     MEASURES,
     SELECTION_MARGIN_NAMES,
+    describe_parameter,
     get_measure,
     make_flag_attributes,
     make_labeled_variables,
@@ -84,7 +85,7 @@ from vrw_jax.studies.tune_objective import (
 from vrw_jax.studies.tune_result import ActiveConstraint, TuneResult, WalkValidation
 from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
-    PARAMETER_DOMAINS,
+    FRICTION_NAME,
     PARAMETER_NAMES,
     WheelParams,
     check_parameter_name,
@@ -232,8 +233,8 @@ class TuneProblem:
 
     @property
     def free_parameter_indices(self) -> list[int]:
-        """Return the index of each free parameter in `PARAMETER_NAMES`."""
-        return [PARAMETER_NAMES.index(parameter_name) for parameter_name in self.free_parameters]
+        """Return the index of each free parameter among those of the model."""
+        return [self.gait_finder.model.parameter_names.index(x) for x in self.free_parameters]
 
     @property
     def constraint_limits(self) -> dict[str, float]:
@@ -276,16 +277,20 @@ class TuneProblem:
         return parameter_values
 
     def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
-        """Return the wheel with these normalized free parameters."""
-        return self.gait_finder.model.from_parameter_values(
+        """Return the wheel with these normalized free parameters, and with its leg force."""
+        model, params = self.gait_finder.model.from_parameter_values(
             jnp.asarray(self.denormalize_parameters(normalized_parameters)), self.params.n_legs
-        )[1]
+        )
+        return model.attach_leg_force(params)
 
     @property
     def normalized_start(self) -> np.ndarray:
         """Return the normalized free parameters of the start wheel, shape (free,)."""
         start_parameter_values = np.array(
-            [float(getattr(self.params, parameter_name)) for parameter_name in self.free_parameters]
+            [
+                float(self.gait_finder.model.get_parameter(self.params, x))
+                for x in self.free_parameters
+            ]
         )
         return np.clip((start_parameter_values - self.lower_bounds) / self.bound_widths, 0.0, 1.0)
 
@@ -421,6 +426,10 @@ class TuneProblem:
         best_trial = maximization_result.best_trial
         best_gait = best_trial.gait_evaluation.gait
         params = self.make_wheel(best_trial.normalized_parameters)
+        model: Any = self.gait_finder.model
+        if params.leg_force is not None:
+            model = model.with_leg_force_of(params)
+        unit_by_parameter = {name: x.unit for name, x in model.parameter_domains.items()}
         conditions = compute_optimality_conditions(
             best_trial,
             [trial for trial in maximization_result.evaluated_trials if trial.is_usable_trial],
@@ -435,7 +444,7 @@ class TuneProblem:
             ActiveConstraint(
                 limited_name.removeprefix(UPPER_BOUND_PREFIX),
                 restore_sign_of_bound(limited_name, limit),
-                get_measure(limited_name).unit,
+                unit_by_parameter.get(limited_name) or get_measure(limited_name).unit,
                 low if low == high else np.nan,
                 (low, high),
             )
@@ -452,7 +461,8 @@ class TuneProblem:
         walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
         step_measures = best_gait.step.measures()
         return TuneResult(
-            params=params,
+            params=params.attach_leg_force(None),
+            model=model,
             status=maximization_result.status,
             objective=self.objective_label,
             value=float(best_trial.objective),
@@ -535,6 +545,11 @@ class TuneProblem:
         path_dataset_variables: dict[str, Any] = make_labeled_variables(
             dict(zip(self.free_parameters, parameter_values.T, strict=True)), "evaluation"
         )
+        domains = self.gait_finder.model.parameter_domains
+        for parameter_name in self.free_parameters:
+            path_dataset_variables[parameter_name].attrs |= describe_parameter(
+                parameter_name, domains[parameter_name]
+            ).variable_attributes
         path_dataset_variables |= {
             "objective": (
                 "evaluation",
@@ -610,8 +625,15 @@ def make_tune_problem(
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
     """
     require_single_wheel(params, "tune one after the other")
-    free_parameters, lower_bounds, upper_bounds = _check_parameter_bounds(params, free, bounds)
     checked_model = convert_model_argument(model)
+    free_parameters, lower_bounds, upper_bounds = _check_parameter_bounds(
+        params, free, bounds, checked_model
+    )
+    if isinstance(objective, WheelObjective) and not set(free_parameters) <= set(PARAMETER_NAMES):
+        raise ValueError(
+            f"free is {free_parameters}, but a WheelObjective is a function of WheelParams, which "
+            "do not contain a leg force: give a measure, or a function of the cycle."
+        )
     gait_finder = make_finder(
         convert_model_argument(resolve_model(params, checked_model)),
         params.n_legs,
@@ -703,9 +725,11 @@ def _parse_objective_function(
 
 
 def _check_parameter_bounds(
-    params: WheelParams, free: Sequence[str], bounds: ParameterBounds
+    params: WheelParams, free: Sequence[str], bounds: ParameterBounds, model: Any
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Return the names of the free parameters, and the arrays of their lower and upper bounds."""
+    domain_by_parameter = model.parameter_domains
+    domain_by_parameter.pop(FRICTION_NAME, None)
     free_parameters = check_names("free", free)
     check_type("bounds", bounds, Mapping, "write {'damping': (100.0, 200.0)}")
     if len(set(free_parameters)) < len(free_parameters):
@@ -713,10 +737,10 @@ def _check_parameter_bounds(
     if not free_parameters:
         raise ValueError(
             f"free names no parameter, but at least one must move: choose from "
-            f"{', '.join(PARAMETER_NAMES)}."
+            f"{', '.join(domain_by_parameter)}."
         )
     for parameter_name in (*free_parameters, *bounds):
-        check_parameter_name(parameter_name, PARAMETER_NAMES, "parameter of the wheel")
+        check_parameter_name(parameter_name, tuple(domain_by_parameter), "parameter of the wheel")
     for parameter_name in bounds:
         if parameter_name not in free_parameters:
             raise ValueError(
@@ -730,15 +754,15 @@ def _check_parameter_bounds(
         lower_bound, upper_bound = check_range(
             f"the range of {parameter_name}", bounds[parameter_name]
         )
-        parameter_domain = PARAMETER_DOMAINS[parameter_name]
+        parameter_domain = domain_by_parameter[parameter_name]
         for bound_value in (lower_bound, upper_bound):
             if not parameter_domain.contains_parameter_value(bound_value):
                 raise ValueError(
                     f"the bounds of {parameter_name} reach {bound_value:g}, but "
-                    f"{parameter_domain.description} must lie "
+                    f"{parameter_domain.description or 'it'} must lie "
                     f"in {parameter_domain}: keep them inside."
                 )
-        start_parameter_value = float(getattr(params, parameter_name))
+        start_parameter_value = float(model.get_parameter(params, parameter_name))
         if not lower_bound <= start_parameter_value <= upper_bound:
             raise ValueError(
                 f"the start has {parameter_name} {start_parameter_value:g}, outside its bounds "

@@ -6,7 +6,11 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.printing import format_heading_and_rows, format_html_table
+from vrw_jax.base.printing import (
+    format_heading_and_rows,
+    format_html_table,
+    format_quantity,
+)
 from vrw_jax.models.measures import MEASURES, get_measure
 from vrw_jax.studies.tune_exploration import ExplorationResult
 from vrw_jax.studies.tune_maximization import TuneStatus
@@ -92,7 +96,8 @@ class TuneResult:
       finite;
     - `seconds`: total time, s;
     - `compile_seconds`: time of compilation, and of the exploration if there are many starts, s;
-    - `exploration`: results of many starts before the maximization.
+    - `exploration`: results of many starts before the maximization;
+    - `model`: the model with the tuned leg force, if it has one.
 
     Examples:
         >>> bounds = {"damping": (100.0, 215.0)}
@@ -119,6 +124,7 @@ class TuneResult:
     compile_seconds: float
     exploration: ExplorationResult | None = None
     kinks: tuple[str, ...] = ()
+    model: Any = None
 
     @property
     def converged(self) -> bool:
@@ -133,11 +139,14 @@ class TuneResult:
     def describe(self) -> dict[str, str]:
         """Return the printed texts that summarize the result, by label."""
         free_parameter_names = self.path.attrs["free"].split()
-        parameter_texts = [
-            f"{parameter_name} "
-            f"{MEASURES[parameter_name].format_with_unit(getattr(self.params, parameter_name))}"
-            for parameter_name in free_parameter_names
-        ]
+
+        def describe_value(name: str) -> str:
+            if name in MEASURES:
+                return MEASURES[name].format_with_unit(getattr(self.params, name))
+            value = self.model.get_parameter(self.params, name)
+            return format_quantity(value, self.path[name].attrs["units"])
+
+        parameter_texts = [f"{name} {describe_value(name)}" for name in free_parameter_names]
         feasibility_text = (
             "every constraint kept" if self.validation.is_feasible else "a constraint broken"
         )

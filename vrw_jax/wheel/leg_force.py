@@ -15,7 +15,7 @@ import numpy as np
 from vrw_jax.base.checks import check_reals, format_value
 from vrw_jax.base.parameters import list_parameters
 from vrw_jax.base.types import Elementwise
-from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.params import PARAMETER_DOMAINS, Symbols, WheelUnits
 
 
 class LegParameters(NamedTuple):
@@ -39,6 +39,31 @@ class FunctionLegForce(eqx.Module):
 
     def __call__(self, L: Any, dL: Any, params: LegParameters) -> Any:
         return self.function(L, dL, params)
+
+
+class ScaledLegForce(eqx.Module):
+    """User's law of a leg in other units of length and time, on the way from the paper's force.
+
+    A search continues gaits with the paper's force to gaits with the law, whose share grows to 1.
+    """
+
+    leg_force: Any  # in SI units
+    share: Elementwise
+    length_unit: Elementwise
+    time_unit: Elementwise
+
+    def __call__(self, L: Elementwise, dL: Elementwise, params: LegParameters) -> Elementwise:
+        units = WheelUnits(self.length_unit, self.time_unit, 1.0)
+        si_params = params._replace(
+            **{
+                name: getattr(params, name) * units.compute_unit_in_si(PARAMETER_DOMAINS[name].unit)
+                for name in params._fields
+                if name != "n_legs"
+            }
+        )
+        si_force = self.leg_force(L * units.length_unit, dL * units.velocity_unit, si_params)
+        paper_force = params.stiffness * (params.natural_length - L) - params.damping * dL
+        return self.share * (si_force / units.acceleration_unit) + (1.0 - self.share) * paper_force
 
 
 def _collect_leg_parameters(s: Symbols) -> LegParameters:

@@ -290,8 +290,11 @@ class WheelParams(AbstractPrintable):
         return is_in_all_domains
 
     def attach_leg_force(self, leg_force: Any) -> "WheelParams":
-        """Return these parameters with the force of a model, so that all equations contain it."""
-        if leg_force is self.leg_force:  # Neither has a law.
+        """Return these parameters with the force of a model, so that all equations contain it.
+
+        None is the paper's force.
+        """
+        if leg_force is self.leg_force:
             return self
         return eqx.tree_at(lambda p: p.leg_force, self, leg_force, is_leaf=lambda x: x is None)
 
