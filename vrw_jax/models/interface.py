@@ -59,6 +59,15 @@ class AbstractWheel(eqx.Module):
     parameters.
     """
 
+    def __new__(cls, *_: Any, **settings: Any) -> "AbstractWheel":
+        """Raise a `TypeError` if a model with the paper's legs is given a leg force."""
+        if "leg_force" in settings and "leg_force" not in cls.__dataclass_fields__:
+            raise TypeError(
+                f"leg_force is given, but a {cls.__name__} has no law of its own for the legs: "
+                "give vrw.ViscoelasticWheel(leg_force=...)."
+            )
+        return super().__new__(cls)
+
     def __repr__(self) -> str:
         if has_traced_leaf(self):
             return eqx.tree_pformat(self)
