@@ -37,7 +37,7 @@ N_COEFFICIENTS = 80
 
 
 def reference_step(params: vrw.WheelParams, x: np.ndarray) -> dict:
-    fields = {f.name: getattr(params, f.name) for f in dataclasses.fields(params)}
+    fields = {f.name: getattr(params, f.name) for f in dataclasses.fields(params) if f.init}
     numbers = {name: float(value) for name, value in fields.items()} | {"n_legs": params.n_legs}
     return five_coordinates.step(numbers, x)
 

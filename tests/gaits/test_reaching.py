@@ -8,7 +8,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.gaits import gait_search
-from vrw_jax.gaits.gait_search import MAX_UNREFINED_MESH_ERROR
+from vrw_jax.gaits.further_search import MAX_UNREFINED_MESH_ERROR
 
 WHEELS_OUTSIDE_BOX = vrw.WheelParams(
     damping=[224.5, 214.0, 119.3, 200.0],

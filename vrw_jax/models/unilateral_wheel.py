@@ -111,7 +111,7 @@ class AbstractContactWheel(AbstractWheel):
     reports_contacts: ClassVar[bool] = True
 
     @property
-    def own_parameters(self) -> Scalar:
+    def own_parameters(self) -> Any:
         return self.friction
 
     @property
