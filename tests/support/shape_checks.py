@@ -68,6 +68,10 @@ def import_with_checks(packages: list[str]) -> None:
     ):
         from vrw_jax.lanes import keys
 
-    # What a checked function computes is what the function itself computes.
-    checked = check_first_calls(typechecker=lambda target: target)(lambda: None)
-    keys.transparent_wrapper_codes.add(checked.__code__)
+    # What a checked function computes is what the function itself computes. Functions inside others
+    # are decorated when these run, by jaxtyping itself.
+    def compute_nothing() -> None: ...
+
+    for decorate in (check_first_calls, _check_every_call):
+        checked = decorate(typechecker=lambda target: target)(compute_nothing)
+        keys.transparent_wrapper_codes.add(checked.__code__)
