@@ -118,11 +118,10 @@ def continue_special_points(
     """Continue several special points as curves in two parameters, as
     `continue_special_point` does.
     """
-    check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
-    parameters, parameter_ranges = _check_parameter_plane(
-        parameters, bounds, cycle.model.parameter_names
-    )
+    known_names = cycle.model.parameter_names if isinstance(cycle, LimitCycle) else PARAMETER_NAMES
+    parameters, parameter_ranges = _check_parameter_plane(parameters, bounds, known_names)
     first_parameter_name, second_parameter_name = parameters
+    check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
     if cycle.period_n != 1:
         raise ValueError(
             f"the gait has {cycle.period_n} steps, but a curve needs a gait of one step: give one."
