@@ -292,6 +292,8 @@ def change_settings(value):
                 yield make([*value[:i], changed, *value[i + 1 :]])
     elif isinstance(value, np.ndarray | jax.Array):
         yield value + 1
+    elif isinstance(value, jax.tree_util.PyTreeDef):
+        yield jax.tree.structure([0.0] * (value.num_leaves + 1))
     else:
         for name in vars(value):
             for changed in change_settings(vars(value)[name]):
