@@ -1,10 +1,10 @@
-"""Integrate one phase with diffrax from its start to its earliest event.
+"""Integrate one phase from its start to its earliest event, for one element.
 
-The solvers and the step-size controller of diffrax are called for one solver step at a time. The
-state at an event therefore has the accuracy of the integrator and not of an interpolant. An
-accepted solver step that brackets an event is repeated. Newton's method corrects the length of the
-repeated step until the step ends at the event. Derivatives of the event's state and time follow
-from the implicit function theorem, so they are accurate to the order of the solver.
+A stepper of `solver_steps` takes one solver step at a time. The state at an event therefore has the
+accuracy of the integrator and not of an interpolant. An accepted solver step that brackets an event
+is repeated. Newton's method corrects the length of the repeated step until the step ends at the
+event. Derivatives of the event's state and time follow from the implicit function theorem, so they
+are accurate to the order of the solver.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,9 +39,6 @@ from vrw_jax.flow.diffrax_minima import (
 )
 from vrw_jax.flow.minima import evaluate_cubic, find_cubic_minimum
 from vrw_jax.flow.solver_steps import AbstractStepper, VectorField, make_stepper
-
-if TYPE_CHECKING:
-    pass
 
 
 class PhaseEnd(NamedTuple):
