@@ -7,10 +7,11 @@ parameters compile nothing anew.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -74,7 +75,8 @@ class HybridStep(NamedTuple):
         return describe_step_ending(self.termination, Termination)
 
 
-class HybridSystem(eqx.Module):
+@dataclasses.dataclass(frozen=True, eq=False)
+class HybridSystem:
     """A walker, or another hybrid system, defined by its modes, guards and resets.
 
     Use it for your own legs and walkers: one step in a batch of thousands takes microseconds, and
@@ -108,19 +110,15 @@ class HybridSystem(eqx.Module):
         1.000
     """
 
-    modes: Mapping[str, Mode] = eqx.field(static=True)
-    section: str = eqx.field(static=True)
-    state: tuple[str, ...] = eqx.field(static=True, converter=tuple)
-    project: Callable[[StateArray, Any], Array] = eqx.field(
-        static=True, default=lambda y, params: y
-    )
-    embed: Callable[[Array, Any], StateArray] = eqx.field(static=True, default=lambda x, params: x)
-    invariants: Sequence[Callable[[StateArray, Any], Scalar]] = eqx.field(
-        static=True, converter=tuple, default=()
-    )
-    max_events: int = eqx.field(static=True, default=MAX_EVENTS_PER_STEP)
+    modes: Mapping[str, Mode]
+    section: str
+    state: Sequence[str]
+    project: Callable[[StateArray, Any], Array] = lambda y, params: y
+    embed: Callable[[Array, Any], StateArray] = lambda x, params: x
+    invariants: Sequence[Callable[[StateArray, Any], Scalar]] = ()
+    max_events: int = MAX_EVENTS_PER_STEP
 
-    def __check_init__(self) -> None:
+    def __post_init__(self) -> None:
         check_type("modes", self.modes, Mapping, "give a dictionary of Modes by name")
         check_int("max_events", self.max_events)
         if not self.state or not all(isinstance(name, str) for name in self.state):
@@ -259,7 +257,7 @@ class HybridSystem(eqx.Module):
             TypeError, ValueError: if an argument is invalid, or a function returns a wrong shape.
         """
         params, x, options = self._check_arguments(params, x, options, 1)
-        return lanes.jit(self._take_step)(params, x, options)
+        return _compile_step(self)(params, x, options)
 
     def step_batch(self, params: Any, x: Any, options: StepOptions | None = None) -> HybridStep:
         """Return one step of each element of a batch, as NumPy arrays, computed on all cores.
@@ -279,7 +277,7 @@ class HybridSystem(eqx.Module):
             TypeError, ValueError: as for `step`, or if batches have different lengths.
         """
         params, x, options = self._check_arguments(params, x, options, 2)
-        return lanes.jit(self._take_step).batch(
+        return _compile_step(self).batch(
             params, x, options, in_axes=self._find_batch_axes(params, x)
         )
 
@@ -309,7 +307,9 @@ class HybridSystem(eqx.Module):
             TypeError, ValueError: if an argument is invalid, or a function returns a wrong shape.
         """
         params, start, options = self._check_arguments(params, start, options, 1, "start")
-        return lanes.jit(self._make_simulation(events, mode))(params, start, options)
+        return _compile_simulation(self, check_int("events", events), self._find_mode(mode))(
+            params, start, options
+        )
 
     def simulate_batch(
         self,
@@ -326,18 +326,8 @@ class HybridSystem(eqx.Module):
         first axis, and `start` has the shape (batch, dim), or (dim,) for all elements.
         """
         params, start, options = self._check_arguments(params, start, options, 2, "start")
-        return lanes.jit(self._make_simulation(events, mode)).batch(
-            params, start, options, in_axes=self._find_batch_axes(params, start)
-        )
-
-    def _make_simulation(self, events: int, mode_name: str | None) -> Callable:
-        events, mode = check_int("events", events), self._find_mode(mode_name)
-
-        def simulate(params: Any, start: Array, options: StepOptions) -> HybridSolution:
-            first_mode = jnp.asarray(mode, jnp.int32)
-            return simulate_modes((self._bind_modes(params), events), options, start, first_mode)
-
-        return simulate
+        simulate = _compile_simulation(self, check_int("events", events), self._find_mode(mode))
+        return simulate.batch(params, start, options, in_axes=self._find_batch_axes(params, start))
 
     def _find_batch_axes(self, params: Any, x: Array) -> tuple:
         axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, params)
@@ -397,3 +387,18 @@ class HybridSystem(eqx.Module):
                 f"{function_name} gives {getattr(result, 'shape', type(result).__name__)}, but the "
                 f"coordinates of the state are {self.state}: give an array of shape {shape}."
             )
+
+
+@functools.lru_cache
+def _compile_step(system: HybridSystem) -> Any:
+    """Return the compiled step, the same for each call, so that JAX traces it once."""
+    return lanes.jit(system._take_step)
+
+
+@functools.lru_cache
+def _compile_simulation(system: HybridSystem, events: int, mode: int) -> Any:
+    def simulate(params: Any, start: Array, options: StepOptions) -> HybridSolution:
+        first_mode = jnp.asarray(mode, jnp.int32)
+        return simulate_modes((system._bind_modes(params), events), options, start, first_mode)
+
+    return lanes.jit(simulate)

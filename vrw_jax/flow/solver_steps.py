@@ -20,7 +20,12 @@ from jaxtyping import Array, Bool
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.diffrax_minima import StateArray
-from vrw_jax.flow.tableaus import ButcherTableau, load_explicit_tableau
+from vrw_jax.flow.tableaus import (
+    MIN_STEP_LENGTH_RATIO,
+    STEP_LENGTH_SAFETY_FACTOR,
+    ButcherTableau,
+    load_explicit_tableau,
+)
 from vrw_jax.lanes.lowering import mark_noinline
 
 if TYPE_CHECKING:
@@ -36,11 +41,6 @@ The error estimate for a solver step far shorter than needed is round-off. A len
 that estimate would grow without bound. The result for a batch element would then differ by
 1e-12 from the result for the same system alone. The value is chosen to avoid this difference,
 which is more than a hundred times the round-off.
-"""
-STEP_SAFETY = 0.9
-MIN_STEP_RATIO = 0.2
-"""Smallest ratio of successive step lengths; usual for explicit methods (Hairer, Norsett and
-Wanner, Solving Ordinary Differential Equations I, Section II.4), as is `STEP_SAFETY`.
 """
 
 
@@ -115,10 +115,12 @@ class ExplicitStepper(AbstractStepper):
         mean_square = jnp.mean(scaled * scaled)
         mean_square = jnp.where(jnp.isfinite(mean_square), mean_square, jnp.inf)
         power = -0.5 / self.tableau.convergence_order
-        factor = STEP_SAFETY * jnp.exp(jnp.log(jnp.clip(mean_square, 1e-30, 1e30)) * power)
+        factor = STEP_LENGTH_SAFETY_FACTOR * jnp.exp(
+            jnp.log(jnp.clip(mean_square, 1e-30, 1e30)) * power
+        )
         is_accepted = mean_square <= 1.0
         limit = jnp.where(is_accepted, MAX_STEP_GROWTH, 1.0)
-        return is_accepted, h * jnp.clip(factor, MIN_STEP_RATIO, limit), ()
+        return is_accepted, h * jnp.clip(factor, MIN_STEP_LENGTH_RATIO, limit), ()
 
 
 @dataclass(frozen=True)
