@@ -2,7 +2,6 @@
 
 import pickle
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,10 +12,9 @@ import vrw_jax as vrw
 from vrw_jax.app._branch_figures import branch_figure
 from vrw_jax.app.config import FigureConfig
 from vrw_jax.app.reports import write_branch_report
-from vrw_jax.branches.arclength import AbstractContinuationProblem, FixedPointProblem, continue_from
-from vrw_jax.branches.branch_location import continue_and_locate_special_points
-from vrw_jax.branches.continuation import MapContinuation
-from vrw_jax.branches.sign_changes import locate_function_roots
+from vrw_jax.branches.arclength import ArclengthDriver, run_together
+from vrw_jax.branches.continuation_problems import MapProblem
+from vrw_jax.branches.roots import locate_function_roots
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins
 from vrw_jax.flow.phase_integration import integrate_phase
 
@@ -47,73 +45,26 @@ def evaluate_stretched_map(_, x, p):
     return jnp.stack([x[0] + p - x[0] ** 2, 0.5 * x[1] + x[0], -0.3 * x[2]])
 
 
-@eqx.filter_jit
-def linearize_together(inside, *points):
-    return jax.vmap(inside.linearize)(*points)
-
-
-class ExternallyLinearizedProblem(AbstractContinuationProblem):
-    """The fold of `stretched`, linearised for many points at once outside of compiled code."""
-
-    inner_problem: FixedPointProblem
-    is_traceable = False
-
-    def linearize(self, wheels, z, p):
-        return jax.tree.map(np.asarray, linearize_together(self.inner_problem, wheels, z, p))
-
-    def section_state(self, z):
-        return z
-
-
-@pytest.mark.slow
-def test_a_branch_linearized_outside_of_compiled_programs_is_the_same():
-    def followed(options_used):
-        given = jnp.zeros(1), np.array([-0.5, 1.0])
-        run = MapContinuation(options_used, vrw.ArclengthOptions(max_ds=0.1), *given)
-        begin = jnp.array([[-1.0, -2.0, 0.0]]), jnp.array([1.0])
-        (strand,) = continue_and_locate_special_points(
-            run, *begin, np.array([True]), lambda owner, point: None
-        )
-        return strand
-
-    inside = FixedPointProblem(evaluate_stretched_map)
-    one, other = followed(inside), followed(ExternallyLinearizedProblem(inside))
-    np.testing.assert_allclose(other.points.p, one.points.p, rtol=0, atol=1e-12)
-    assert [border.name for border in other.special_points] == [
-        border.name for border in one.special_points
-    ]
-    (fold,) = (border.value for border in other.special_points if border.kind == "fold")
-    assert fold == pytest.approx(0.0, abs=1e-9)
-    assert other.end_reasons == one.end_reasons
-
-
 def test_branches_continued_together_equal_single_ones_with_two_iterations_per_point():
-    """Eleven, of which the third is none: more than go side by side, and of each length.
-
-    Newton's method ends with a correction of nothing: from the tangent alone three would be needed.
-    """
+    """Eleven of different lengths. From the tangent alone, three iterations would be needed."""
     b, a = np.linspace(-0.4, 0.5, 11), np.linspace(1.0, 0.4, 11)
-    z = np.stack([0.6 + 0.0 * b, 0.6 * b], 1)
-    options = vrw.ArclengthOptions()
+    driver = ArclengthDriver(
+        MapProblem(evaluate_henon, (1.0, 1.0)), vrw.ArclengthOptions(), np.array([-1.0, 2.0])
+    )
 
-    def tracks(selection, wanted):
-        given = map(
-            jnp.asarray,
-            (b[selection], z[selection], a[selection], (-1.0, 2.0), 0.0 * a[selection] + 1.0),
-        )
-        return continue_from(
-            FixedPointProblem(evaluate_henon), options, *given, jnp.asarray(wanted)
-        )
+    def trace(owners):
+        tasks = [driver.trace(b[i], np.array([0.6, 0.6 * b[i]]), a[i], 1.0) for i in owners]
+        return run_together(driver.problem, b, owners, tasks)
 
-    every = tracks(np.arange(11), np.arange(11) != 2)
-    assert every.n_points[2] == 0
-    assert np.ptp(every.n_points[3:]) > 10
+    every = trace(range(11))
+    n_points = [len(track.points) for track in every]
+    assert np.ptp(n_points) > 10
     for i in (0, 5, 10):
-        single_branch = tracks(np.array([i]), np.array([True]))
-        np.testing.assert_array_equal(every.n_points[i], single_branch.n_points[0])
-        # One program is for one branch, the other for eight: last digits may differ.
-        np.testing.assert_allclose(every.points.p[i], single_branch.points.p[0], rtol=0, atol=1e-10)
-    assert every.n_linearizations.sum() < 2.3 * every.n_points.sum()
+        (single,) = trace([i])
+        assert len(single.points) == n_points[i]
+        single_values, values = ([point.p for point in x.points] for x in (single, every[i]))
+        np.testing.assert_allclose(single_values, values, rtol=0, atol=1e-10)
+    assert sum(track.n_linearizations for track in every) < 2.3 * sum(n_points)
 
 
 def special_points_by_kind(branch):

@@ -1,9 +1,8 @@
 """Curves of special points in two parameters: turning points, closed curves and intersections."""
 
-import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,54 +13,49 @@ from experiments.gaits.both_sides import judge_curve
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationStatus
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation import MapContinuation
-from vrw_jax.branches.special_point_curves import _check_parameter_plane, continue_special_points
-from vrw_jax.branches.test_functions import (
-    AbstractTestFunction,
-    TestFunctionCurve,
-    TestFunctionNewtonStep,
-    TestFunctionPoint,
-    compute_offset_bifurcation_margins,
+from vrw_jax.branches.curve_problems import (
+    FOLD_MARGIN_OFFSET,
+    AbstractCurveProblem,
+    TwoParameterStep,
 )
+from vrw_jax.branches.special_point_curves import _check_parameter_plane, continue_special_points
+from vrw_jax.gaits.floquet import compute_bifurcation_margins
 
 CURVE_OPTIONS = ArclengthOptions(max_points=400, max_ds=0.05)
 
 
-class MapTestFunction(AbstractTestFunction):
-    """Of any map x -> `function(wheel, x, p)`: `quantity(jacobian, x, p)` is zero."""
+@dataclass(frozen=True, kw_only=True)
+class MapCurveProblem(AbstractCurveProblem):
+    """Of any map x -> `function(x, p)`: `quantity(jacobian, x, p)` is zero."""
 
-    function: Callable = eqx.field(static=True)
-    quantity: Callable = eqx.field(static=True)
+    function: Callable
+    quantity: Callable
 
-    def linearize(self, wheel, z, p):
-        image = functools.partial(self.function, wheel)
-        by_x, by_p = jax.jacfwd(image, argnums=(0, 1))(z, p)
-        right = jnp.concatenate([(image(z, p) - z)[:, None], by_p], 1)
-        solved = jnp.linalg.solve(jnp.eye(len(z)) - by_x, right)
-        value = lambda z, p: self.quantity(jax.jacfwd(image)(z, p), z, p)
-        gz, gp = jax.jacfwd(value, argnums=(0, 1))(z, p)
-        result = value(z, p) + gz @ solved[:, 0]
-        columns = solved[:, 1:].T
-        return TestFunctionNewtonStep(solved[:, 0], columns, by_x, result, gp + gz @ solved[:, 1:])
+    def linearize_in_two_parameters(self, args, z, p):
+        def linearize(z, p):
+            by_x, by_p = jax.jacfwd(self.function, argnums=(0, 1))(z, p)
+            right = jnp.concatenate([(self.function(z, p) - z)[:, None], by_p], 1)
+            solved = jnp.linalg.solve(jnp.eye(len(z)) - by_x, right)
+            value = lambda z, p: self.quantity(jax.jacfwd(self.function)(z, p), z, p)
+            gz, gp = jax.jacfwd(value, argnums=(0, 1))(z, p)
+            result = value(z, p) + gz @ solved[:, 0]
+            return solved[:, 0], solved[:, 1:].T, by_x, result, gp + gz @ solved[:, 1:]
 
-    def section_state(self, z):
-        return z
+        return TwoParameterStep(*map(np.asarray, jax.vmap(linearize)(z, p)))
 
 
 def trace_curve(function, quantity, z, p, bounds, seconds, second):
     """The curve through (p, second), as `continue_special_point` does for a gait."""
-    level = TestFunctionCurve(MapTestFunction(function, quantity), seconds)
-    share = (second - seconds[0]) / (seconds[1] - seconds[0])
-    lead = lambda x: jnp.asarray(x, float)[None]
-    start = TestFunctionPoint(lead(z), lead(share))
-    run = MapContinuation(level, CURVE_OPTIONS, jnp.zeros(1), np.array(bounds))
+    problem = MapCurveProblem(second_bounds=seconds, function=function, quantity=quantity)
+    start = np.array([(second - seconds[0]) / (seconds[1] - seconds[0]), *z])
+    run = MapContinuation(problem, CURVE_OPTIONS, np.zeros(1), np.array(bounds))
     (strand,) = continue_and_locate_special_points(
-        run, start, lead(p), np.array([True]), lambda owner, point: None
+        run, start[None], np.array([p]), np.array([True]), lambda owner, point: None
     )
-    second = level.compute_second_parameter(jax.tree.map(jnp.asarray, strand.points.z))
-    return strand.points.p, np.asarray(second), strand
+    return strand.points.p, problem.compute_second_parameter(strand.points.z), strand
 
 
-def evaluate_bowl(_, x, p):
+def evaluate_bowl(x, p):
     """Return a map whose fixed point is the squared distance of p from the origin."""
     return 0.5 * x + 0.5 * (p @ p)
 
@@ -77,7 +71,7 @@ def test_a_closed_curve_is_continued_until_it_closes():
     assert 2.0 * np.pi < np.ptp(angle) < 2.2 * np.pi
 
 
-def evaluate_henon(_, x, p):
+def evaluate_henon(x, p):
     """x -> 1 - a x^2 + y, y -> b x over p = (a, b)."""
     return jnp.stack([1.0 - p[0] * x[0] ** 2 + x[1], p[1] * x[0]])
 
@@ -88,7 +82,8 @@ def find_fixed_point(a, b):
 
 
 def compute_jury_margin(place):
-    return lambda jacobian, x, p: compute_offset_bifurcation_margins(jacobian)[place]
+    offset = FOLD_MARGIN_OFFSET if place == 0 else 0.0
+    return lambda jacobian, x, p: compute_bifurcation_margins(jacobian)[place] - offset
 
 
 def test_period_doublings_of_henon_are_on_their_parabola():

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -25,6 +26,7 @@ from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.gait_search import limit_cycles
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.interface import AbstractWheel
@@ -43,6 +45,22 @@ class BranchRequest(NamedTuple):
     cycle_options: CycleOptions | None
     step_options: StepOptions
     measures_force_peaks: bool = False  # whether points have the measures of the gait's force
+
+    def describe_problem(self) -> dict[str, Any]:
+        """Return the fields of an `AbstractGaitProblem`."""
+        return {
+            "model": self.model,
+            "step_options": self.step_options,
+            "n_legs": self.params.n_legs,
+            "parameter_name": self.parameter_name,
+            "period_n": self.period_n,
+            "measures_force_peaks": self.measures_force_peaks,
+        }
+
+    def make_wheels(self, is_phase_active: Any = ()) -> BranchWheel:
+        """Return the wheels with the parameters as rows of numbers."""
+        values = self.model.collect_batch_parameter_values(self.params)
+        return BranchWheel(values, is_phase_active)
 
 
 class BranchStart(NamedTuple):
@@ -63,7 +81,8 @@ def find_special_cycle(
     parameter_name: str,
     start_params: WheelParams,
     start_cycle: LimitCycle,
-    point_beside_special_point: ContinuationPoint,
+    solution: CollocationSolution,
+    p: float,
 ) -> LimitCycle:
     """Find the limit cycle at a special point, from the collocation solution at the point next to
     it.
@@ -72,15 +91,13 @@ def find_special_cycle(
     - `parameter_name`: name of the continued parameter;
     - `start_params`, `start_cycle`: wheel and gait at the start of the branch.
     """
-    params, guess_cycle, branch_point = jax.device_put(
-        (start_params, start_cycle, point_beside_special_point)
-    )
+    params, guess_cycle, solution, p = jax.device_put((start_params, start_cycle, solution, p))
     guess_cycle = dataclasses.replace(
         guess_cycle,
-        collocation_state=guess_cycle.collocation_state._replace(solution=branch_point.z),
+        collocation_state=guess_cycle.collocation_state._replace(solution=solution),
         system=gait_finder.collocation_system,
     )
-    _, params = gait_finder.model.with_parameter(params, parameter_name, branch_point.p)
+    _, params = gait_finder.model.with_parameter(params, parameter_name, p)
     return gait_finder.find_cycle(params, guess_cycle)
 
 
@@ -116,37 +133,34 @@ def find_collocation_starts(branch_request: BranchRequest, known_start_cycle: An
     gait_finder: Any = make_finder(
         branch_request.model, params.n_legs, period_n=period_n, cycle_options=cycle_options
     )
-    collocation_system = gait_finder.collocation_system
+    system = gait_finder.collocation_system
+    transfer_to_mesh = lambda x: transfer_solution_to_mesh(start_cycle.system, system, x)
+    solution = jax.vmap(transfer_to_mesh)(start_cycle.collocation_state.solution)
+    problem = CollocationProblem(
+        **branch_request.describe_problem(),
+        collocation_system=system,
+        shapes=tuple(x.shape[1:] for x in jax.tree.leaves(solution)),
+    )
 
     def make_cycle_finder(
         wheel_index: int, branch_point: ContinuationPoint
     ) -> Callable[[], LimitCycle]:
-        start_params, start_cycle_of_wheel = select_tree_rows((params, start_cycle), wheel_index)
+        wheel, cycle = select_tree_rows((params, start_cycle), wheel_index)
         # A partial call can be pickled.
         return functools.partial(
             find_special_cycle,
             gait_finder,
             parameter_name,
-            start_params,
-            start_cycle_of_wheel,
-            branch_point,
+            wheel,
+            cycle,
+            problem.unpack(branch_point.z),
+            float(branch_point.p),
         )
 
     return BranchStart(
-        CollocationProblem(
-            model=branch_request.model,
-            step_options=branch_request.step_options,
-            collocation_system=collocation_system,
-            parameter_name=parameter_name,
-            additional_quantity_function=None,
-            measures_force_peaks=branch_request.measures_force_peaks,
-        ),
-        BranchWheel(params, start_cycle.collocation_state.is_phase_active),
-        jax.vmap(
-            lambda collocation_solution: transfer_solution_to_mesh(
-                start_cycle.system, collocation_system, collocation_solution
-            )
-        )(start_cycle.collocation_state.solution),
+        problem,
+        branch_request.make_wheels(np.asarray(start_cycle.collocation_state.is_phase_active)),
+        problem.pack(solution),
         np.asarray(start_cycle.outcome),
         make_cycle_finder,
         start_cycle,
@@ -175,15 +189,12 @@ def find_return_map_starts(branch_request: BranchRequest, known_start_cycle: Any
         outcomes, section_states = jax.vmap(walk_to_gait)(params, branch_request.parameter_values)
     else:
         outcomes, section_states = known_start_cycle.outcome, known_start_cycle.section_state
-    return_map_problem = ReturnMapProblem(
-        model=model,
-        step_options=step_options,
-        parameter_name=branch_request.parameter_name,
-        period_n=branch_request.period_n,
+    problem = ReturnMapProblem(
+        **branch_request.describe_problem(),
         n_coordinates=model.count_continuous_section_entries(params),
     )
     return BranchStart(
-        return_map_problem, BranchWheel(params), section_states, np.asarray(outcomes)
+        problem, branch_request.make_wheels(), np.asarray(section_states), np.asarray(outcomes)
     )
 
 
@@ -199,25 +210,18 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
     )
     if not gait_finder.is_multistable:  # The model has no batched engine.
         return find_return_map_starts(branch_request, start_cycle)
-    wheels = BranchWheel(params)
-    contact_gait_problem = ContactGaitProblem(
-        model=model,
-        step_options=step_options,
-        parameter_name=branch_request.parameter_name,
-        period_n=branch_request.period_n,
+    wheels = branch_request.make_wheels()
+    problem = ContactGaitProblem(
+        **branch_request.describe_problem(),
         n_coordinates=model.count_continuous_section_entries(params),
-        n_legs=params.n_legs,
-        measures_force_peaks=branch_request.measures_force_peaks,
-    )
-    parameter_values = contact_gait_problem.stack_parameter_values(
-        wheels, branch_request.parameter_values
     )
     if start_cycle is None:
+        values = problem.replace_parameter(wheels, branch_request.parameter_values)
         start_cycle = gait_finder.find_cycles_near(
-            parameter_values, gait_finder.make_initial_guesses(parameter_values)
+            values, gait_finder.make_initial_guesses(jnp.asarray(values))
         )
     return BranchStart(
-        contact_gait_problem, wheels, start_cycle.section_state, np.asarray(start_cycle.outcome)
+        problem, wheels, np.asarray(start_cycle.section_state), np.asarray(start_cycle.outcome)
     )
 
 

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import (
     check_bool,
     check_callable,
@@ -32,25 +31,21 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.branches.arclength import (
-    ArclengthOptions,
-    ContinuationPoint,
-    ContinuationResult,
-    ContinuationSetup,
-    CorrectorPlane,
-    FixedPointProblem,
-)
-from vrw_jax.branches.batched_continuation import solve_on_planes
+from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint, Track, run_together
 from vrw_jax.branches.branch import Branch, FixedPoint
 from vrw_jax.branches.branch_location import (
+    EVENT_ORDER,
+    EVENT_ORDER_CHANGE,
     AbstractContinuation,
     BranchData,
+    PointTable,
+    QuantitiesByName,
     continue_and_locate_special_points,
 )
-from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME, QuantitiesByName
 from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
-from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS_COLUMN_NAME, BranchWheel
+from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS, BranchWheel, MapProblem
 from vrw_jax.branches.hybrid_branch import find_parameter, make_section_map
+from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction, compute_multipliers
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
@@ -61,17 +56,17 @@ from vrw_jax.gaits.fixed_points import (
     estimate_state_units,
     has_unit_multiplier,
 )
-from vrw_jax.gaits.floquet import floquet_multipliers
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
-from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
+from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import (
     FORCE_PEAK_MEASURES,
     MARGIN_MEASURES,
+    MEASURES,
     STEP_MEASURES,
     UNILATERAL_STEP_MEASURES,
     describe_parameter,
@@ -97,6 +92,33 @@ BRANCH_ENDING_QUANTITIES = (
 )
 """Names of the quantities that end a branch if they vanish, because the order of events changes."""
 
+SECOND_PEAK_RATE_NAME = "second_peak_rate"
+"""Name of a measure of the gait's force. If it is zero, a force peak appears inside a phase."""
+FORCE_PEAK_COUNT, FORCE_PEAK_COUNT_CHANGE = "n_force_peaks", "number_of_force_peaks_changes"
+"""Name of the number of force peaks, and of the special point at which a peak appears or
+disappears, at an event or inside a phase.
+"""
+
+_BORDER = "border_collision"
+GAIT_TEST_FUNCTIONS: Mapping[str, TestFunction] = {
+    **BIFURCATIONS,
+    **{name: TestFunction("lost", "A phase vanishes.", True) for name in BRANCH_ENDING_QUANTITIES},
+    FRICTION_SURPLUS: TestFunction("lost", "No contact carries the weight along the slope.", True),
+    **{name: TestFunction(_BORDER, MEASURES[name].description) for name in MARGIN_MEASURES},
+    **{
+        name: TestFunction(_BORDER, "A landing without double support begins.", True)
+        for name in DOUBLE_SUPPORT_INDICATOR_NAMES
+    },
+    SECOND_PEAK_RATE_NAME: TestFunction(
+        _BORDER, "A force peak appears inside a phase.", explains=FORCE_PEAK_COUNT_CHANGE
+    ),
+    EVENT_ORDER: TestFunction(EVENT_ORDER_CHANGE, "Events change their order.", is_stepwise=True),
+    FORCE_PEAK_COUNT: TestFunction(
+        FORCE_PEAK_COUNT_CHANGE, "A force peak appears or disappears.", is_stepwise=True
+    ),
+}
+"""Test functions of gaits by name."""
+
 DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 """Advice in the error message for a caller who differentiates a branch."""
 
@@ -107,19 +129,21 @@ DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 MAX_MEASURE_CHANGE_AT_JUMP = 0.01
 
 
+def split_legs(quantities: QuantitiesByName, n_legs: int) -> QuantitiesByName:
+    """Return quantities with one for each leg, in addition to margins that have a value per leg."""
+    for name, margin in MARGIN_MEASURES.items():
+        if margin.leg_dimension and name in quantities:
+            quantities |= {
+                f"{name}[{leg}]": quantities[name][:, leg - 3] for leg in range(3, n_legs + 1)
+            }
+    return quantities
+
+
 @dataclass(frozen=True)
 class GaitContinuation(AbstractContinuation):
     """Continuation of gaits."""
 
-    branch_ending_quantities: ClassVar[tuple[str, ...]] = (
-        *BRANCH_ENDING_QUANTITIES,
-        FRICTION_SURPLUS_COLUMN_NAME,
-    )
-    border_collision_quantities: ClassVar[tuple[str, ...]] = (
-        *DOUBLE_SUPPORT_INDICATOR_NAMES,
-        *MARGIN_MEASURES,
-        SECOND_PEAK_RATE_NAME,
-    )
+    test_functions: ClassVar[Mapping[str, TestFunction]] = GAIT_TEST_FUNCTIONS
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = {
         "clearance_sls1": "takeoff_acceleration"
     }
@@ -137,32 +161,19 @@ class GaitContinuation(AbstractContinuation):
 
         If a margin has one value per leg, the result contains one quantity for each leg.
         """
-        gait_problem: Any = self.continuation_problem
-        quantity_table = self.map_over_points(
-            gait_problem.measure_gaits, batch_sizes.POINT_BATCH_SIZE, wheels, points
-        )
-        for measure_name, margin_measure in MARGIN_MEASURES.items():
-            if margin_measure.leg_dimension and measure_name in quantity_table:
-                quantity_table |= {
-                    f"{measure_name}[{leg_number}]": quantity_table[measure_name][:, leg_number - 3]
-                    for leg_number in range(3, wheels.params.n_legs + 1)
-                }
-        return quantity_table
+        problem: Any = self.continuation_problem
+        return split_legs(problem.measure_gaits(wheels, points), problem.n_legs)
 
-    def is_same_gait(
-        self, table_before: QuantitiesByName, table_after: QuantitiesByName
-    ) -> np.ndarray:
+    def is_same_gait(self, before: PointTable, after: PointTable) -> np.ndarray:
         """Return whether period and step length are about equal before and after each jump."""
-        is_measure_similar = super().is_same_gait(table_before, table_after)
-        for measure_name in ("period", "step_length"):
-            max_measure_change = MAX_MEASURE_CHANGE_AT_JUMP * np.abs(table_before[measure_name])
-            is_measure_similar &= (
-                np.abs(table_after[measure_name] - table_before[measure_name]) <= max_measure_change
-            )
-        return is_measure_similar
+        is_similar = super().is_same_gait(before, after)
+        for name in ("period", "step_length"):
+            values, new_values = before.quantities[name], after.quantities[name]
+            is_similar &= np.abs(new_values - values) <= MAX_MEASURE_CHANGE_AT_JUMP * np.abs(values)
+        return is_similar
 
     def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
-        if end_name != FRICTION_SURPLUS_COLUMN_NAME:
+        if end_name != FRICTION_SURPLUS:
             return super().describe_branch_end(end_name, parameter_value)
         return (
             f"At {parameter_value:.9g} the friction coefficient is the tangent of the slope: "
@@ -421,7 +432,7 @@ def _continue_gait_branches(
         branch_data_by_wheel = continue_and_locate_special_points(
             branch_continuation,
             branch_start.start_unknowns,
-            branch_request.parameter_values,
+            np.asarray(branch_request.parameter_values),
             has_branch_start,
             branch_start.make_cycle_finder,
             is_finest_mesh,
@@ -511,7 +522,7 @@ def _make_labeled_gait_branch(
         "leg": make_locked_leg_coordinate(params.n_legs),
     }
     branch_dataset = xr.Dataset(
-        branch_variables | _make_stability_variables(np.asarray(points.return_map_jacobian)),
+        branch_variables | _make_stability_variables(points.return_map_jacobian),
         branch_coordinates,
         branch_attrs,
     )
@@ -522,13 +533,11 @@ def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.
     """Build labeled variables with the multipliers and the stability measures at each point of a
     branch.
     """
-    multiplier_values = map_in_numpy_batches(
-        floquet_multipliers, (batch_sizes.POINT_BATCH_SIZE,), return_map_jacobians
-    )
-    spectral_radius = np.max(np.abs(multiplier_values), -1)
+    multipliers = compute_multipliers(return_map_jacobians)
+    spectral_radius = np.max(np.abs(multipliers), -1)
     multiplier_parts = (
-        ("multiplier_real", multiplier_values.real, "real part of a multiplier"),
-        ("multiplier_imag", multiplier_values.imag, "imaginary part"),
+        ("multiplier_real", multipliers.real, "real part of a multiplier"),
+        ("multiplier_imag", multipliers.imag, "imaginary part"),
     )
     multiplier_variables = {
         variable_name: xr.Variable(
@@ -578,32 +587,25 @@ class MapContinuation(AbstractContinuation):
         return FixedPoint(units * section_state, p, units[:, None] * jacobian / units)
 
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
-        section_states = self.map_over_points(
-            jax.vmap(self.continuation_problem.section_state),
-            batch_sizes.POINT_BATCH_SIZE,
-            points.z,
-        )
-        return {"x": self.state_units * section_states}
+        return {"x": self.state_units * self.continuation_problem.section_state(points.z)}
 
     def continue_in_both_directions(
-        self, z: Any, parameter_values: Array, is_branch_requested: np.ndarray
-    ) -> ContinuationResult:
-        """Continue the branch of one map in both directions, and return all points.
+        self, z: np.ndarray, p: np.ndarray, is_requested: np.ndarray
+    ) -> dict[int, list[Track]]:
+        """Continue the branch of one map in both directions.
 
         If the equations are singular at the start, the branch starts at a fixed point next to it.
         """
-        results = super().continue_in_both_directions(z, parameter_values, is_branch_requested)
-        is_start_found = results.n_points.any()
-        if is_start_found and are_equations_regular(
-            np.asarray(results.points.return_map_jacobian)[0, 0, 0]
-        ):
-            return results
-        regular_start = self._find_regular_start(z, parameter_values)
-        if regular_start is None:
-            return jax.tree.map(np.zeros_like, results)
-        return super().continue_in_both_directions(*regular_start, is_branch_requested)
+        tracks = super().continue_in_both_directions(z, p, is_requested)
+        points = tracks[0][0].points
+        if points and are_equations_regular(points[0].return_map_jacobian):
+            return tracks
+        start = self._find_regular_start(z, p)
+        if start is None:
+            return {}
+        return super().continue_in_both_directions(start.z[None], np.array([start.p]), is_requested)
 
-    def _find_regular_start(self, z: Array, parameter_values: Array) -> tuple[Array, Array] | None:
+    def _find_regular_start(self, z: np.ndarray, p: np.ndarray) -> ContinuationPoint | None:
         """Find a fixed point next to a start at which the equations are singular.
 
         Each search is in a plane whose distance from the start is about that of the first
@@ -611,41 +613,28 @@ class MapContinuation(AbstractContinuation):
         if no plane contains a fixed point near the start.
         """
         problem, distance = self.continuation_problem, self.arclength_options.initial_ds
-        setup = ContinuationSetup(
-            problem, self.arclength_options, jnp.asarray(self.parameter_bounds)
-        )
-        jacobian = jax.vmap(problem.linearize)(self.wheels, z, parameter_values).return_map_jacobian
-        singular_direction = np.linalg.svd(np.eye(z.shape[-1]) - np.nan_to_num(jacobian[0]))[2][-1]
+        jacobian = np.asarray(problem.linearize(self.wheels, z, p).return_map_jacobian)[0]
+        singular_direction = np.linalg.svd(np.eye(z.shape[-1]) - np.nan_to_num(jacobian))[2][-1]
+        tasks = []
         # Along one branch through a crossing, the state may be constant.
-        state_parts, parameter_parts = (
-            distance * np.array(list(itertools.product((0.0, 0.5, -0.5), (1.0, -1.0)))).T
-        )
-        normals = state_parts[:, None] * singular_direction
-        start_states, start_fractions = (
-            z + normals,
-            parameter_parts + np.asarray(setup.compute_parameter_fraction(parameter_values)),
-        )
-        points, has_converged = jax.tree.map(
-            np.asarray,
-            solve_on_planes(
-                setup,
-                select_tree_rows(self.wheels, np.zeros(len(normals), int)),
-                start_states,
-                CorrectorPlane(start_states, start_fractions, normals, parameter_parts),
-            ),
-        )
+        for state_part, parameter_part in itertools.product((0.0, 0.5, -0.5), (1.0, -1.0)):
+            normal = distance * self.driver.coordinates(
+                state_part * singular_direction, parameter_part
+            )
+            start = self.driver.coordinates(z[0], self.driver.compute_fraction(p[0])) + normal
+            tasks.append(
+                self.driver.solve_on_plane(self.wheels, start[:-1], start[-1], (start, normal))
+            )
         lower_bound, upper_bound = self.parameter_bounds
-        is_usable = (
-            has_converged
-            & np.isfinite(points.z).all(-1)
-            & (np.abs(points.z - np.asarray(z)).max(-1) <= MAX_START_DISTANCE_FACTOR * distance)
-            & (lower_bound <= points.p)
-            & (points.p <= upper_bound)
-            & [are_equations_regular(jacobian) for jacobian in points.return_map_jacobian]
-        )
-        if not is_usable.any():
-            return None
-        return jax.device_put(select_tree_rows((points.z, points.p), np.flatnonzero(is_usable)[:1]))
+        for point, is_found in run_together(problem, self.wheels, [0] * len(tasks), tasks):
+            if (
+                is_found
+                and np.abs(point.z - z[0]).max() <= MAX_START_DISTANCE_FACTOR * distance
+                and lower_bound <= point.p <= upper_bound
+                and are_equations_regular(point.return_map_jacobian)
+            ):
+                return point
+        return None
 
 
 @announce_wait("the map and its derivatives", "10 s")
@@ -701,9 +690,6 @@ def continue_map(
         )
     options, x = _check_arclength_options(options), check_reals("x", x)
     require_no_masked_entries("constants", jax.tree.leaves(constants))
-    add_batch_axis = lambda tree: jax.tree.map(
-        lambda constant_leaf: jnp.asarray(constant_leaf, float)[None], tree
-    )
     constants = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), constants)
     check_vector_map(lambda x: function(constants, x, jnp.asarray(p, float)), "x", x)
     state_units = (
@@ -711,18 +697,16 @@ def continue_map(
         if units is None
         else np.asarray(check_state_units(units, x))
     )
-    branch_continuation = MapContinuation(
-        FixedPointProblem(function, jnp.asarray(state_units)),
+    units = tuple(np.broadcast_to(state_units, x.shape).tolist())
+    continuation = MapContinuation(
+        MapProblem(function, units),
         options,
-        add_batch_axis(constants),
+        jax.tree.map(lambda leaf: np.asarray(leaf)[None], constants),
         np.array([lower_bound, upper_bound]),
-        state_units,
+        np.array(units),
     )
     (branch_data,) = continue_and_locate_special_points(
-        branch_continuation,
-        add_batch_axis(x / state_units),
-        add_batch_axis(p),
-        np.array([True]),
+        continuation, np.asarray(x / state_units)[None], np.array([p], float), np.array([True])
     )
     if branch_data is None:
         empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))})
@@ -731,8 +715,8 @@ def continue_map(
         reasons = (UNIT_MULTIPLIER_ADVICE if is_singular else "",) * 2
         return Branch(name, empty_dataset, (), reasons, Outcome.NO_CYCLE_FOUND)
     dataset = xr.Dataset(
-        {"x": (("point", "component"), branch_data.quantity_table["x"])}
-        | _make_stability_variables(np.asarray(branch_data.points.return_map_jacobian)),
+        {"x": (("point", "component"), branch_data.quantities["x"])}
+        | _make_stability_variables(branch_data.points.return_map_jacobian),
         {name: ("point", branch_data.points.p)},
         {"title": f"Branch of fixed points along {name}"},
     )

@@ -6,9 +6,10 @@ of gait steps with unilateral contact. `ReturnMapProblem` applies to every model
 gait step of the model and differentiates it in forward mode.
 """
 
-import abc
+import functools
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -16,36 +17,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
+from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Scalar
-from vrw_jax.branches import arclength
-from vrw_jax.branches.arclength import (
-    AbstractContinuationProblem,
-    ContinuationPoint,
-    NewtonStep,
-    ProblemUnknowns,
-    SectionStateVector,
-)
-from vrw_jax.branches.branch_points import CONTACT_ORDER_COLUMN
-from vrw_jax.gaits.collocation_search import CollocationSystem, compute_correction_norm
+from vrw_jax.branches.arclength import AbstractContinuationProblem, ContinuationPoint, NewtonStep
+from vrw_jax.branches.branch_location import EVENT_ORDER, QuantitiesByName
+from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.force_peaks import compute_force_peaks
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.return_map_finder import measure_return_map_force_peaks
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
-from vrw_jax.lanes.batching import unbatch
+from vrw_jax.lanes.autodiff import evaluate_with_jacobian
+from vrw_jax.lanes.batching import map_in_numpy_batches
 from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
-from vrw_jax.models.step_results import AbstractStep, AnySectionState
+from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.wheel.outcomes import Outcome
-from vrw_jax.wheel.params import (
-    WheelParams,
-    stack_parameters,
-)
+from vrw_jax.wheel.params import FRICTION_NAME
 
-FRICTION_SURPLUS_COLUMN_NAME = "friction_above_slope"
+FRICTION_SURPLUS = "friction_above_slope"
 """Name of the difference between the friction coefficient and the slope's tangent.
 
 The tangent is the smallest friction coefficient for which a gait exists.
@@ -58,144 +50,278 @@ The value is chosen to exceed the round-off of friction. If friction equals the 
 every speed repeat.
 """
 
+POINT_BATCH_SIZES = (batch_sizes.LOCATION_BATCH_SIZES[-1],)
+"""Number of points that one call of an XLA program computes, one size so that it compiles once."""
+
 
 class BranchWheel(NamedTuple):
-    """Wheel whose gaits are continued.
+    """Wheels whose gaits are continued, with a leading axis over wheels.
 
-    The continuation problem replaces the continued parameter in `params`.
+    The continuation problem replaces the continued parameter in `values`.
     """
 
-    params: WheelParams
+    values: np.ndarray  # values of the parameters of the model, in their order
     # 1 if the phase occurs in the cycle, else 0, shape (n, n_phases); () without collocation
     is_phase_active: Any = ()
 
 
+@eqx.filter_jit
+def _linearize_map(
+    function: Callable, units: tuple[float, ...], args: Any, z: Array, p: Array
+) -> NewtonStep:
+    """Return the Newton steps of fixed points of a map at many points, see `MapProblem`."""
+    n_continuous = len(units)
+    scale = jnp.asarray([*units, *[1.0] * (z.shape[1] - n_continuous)])
+
+    def linearize(args: Any, z: Array, p: Array) -> NewtonStep:
+        codes = z[n_continuous:]
+        evaluate = lambda x, p: function(args, jnp.concatenate([x, codes]) * scale, p) / scale
+        image, jacobians = evaluate_with_jacobian(evaluate, z[:n_continuous], p)
+        by_z, by_p = (jacobian[:n_continuous] for jacobian in jacobians)
+        defect = image - z
+        right_sides = jnp.stack([defect[:n_continuous], by_p], -1)
+        correction, tangent = jnp.linalg.solve(jnp.eye(n_continuous) - by_z, right_sides).T
+        return NewtonStep(
+            jnp.concatenate([correction, defect[n_continuous:]]),
+            jnp.concatenate([tangent, 0.0 * codes]),
+            by_z,
+        )
+
+    return jax.vmap(linearize)(args, z, p)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AbstractStateProblem(AbstractContinuationProblem):
+    """Base class of problems whose unknowns are section states.
+
+    Components after the first `n_coordinates` are discrete codes, which Newton's method copies from
+    the image under the map. It converges only if state and image have equal codes.
+    """
+
+    n_coordinates: int
+
+    def section_state(self, z: np.ndarray) -> np.ndarray:
+        return z[..., : self.n_coordinates]
+
+    def interpolate(self, left: np.ndarray, right: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+        """Interpolate the coordinates; the discrete codes are those of the nearer state."""
+        nearer = np.where(fraction[:, None] < 0.5, left, right)
+        between, n = super().interpolate(left, right, fraction), self.n_coordinates
+        return np.concatenate([between[:, :n], nearer[:, n:]], 1)
+
+    def is_smooth_between(self, left: np.ndarray, right: np.ndarray) -> bool:
+        return bool(np.all(left[self.n_coordinates :] == right[self.n_coordinates :]))
+
+
+@dataclass(frozen=True, eq=False)
+class MapProblem(AbstractContinuationProblem):
+    """Continuation problem for the fixed points of a map x -> `function(args, x, p)`.
+
+    JAX differentiates the map in forward mode. The map returns NaN where it is undefined. The
+    unknowns are x in the given units.
+    """
+
+    function: Callable[[Any, Array, Array], Array]
+    units: tuple[float, ...]  # one unit for each component
+
+    def linearize(self, args: Any, z: np.ndarray, p: np.ndarray) -> NewtonStep:
+        linearize = functools.partial(_linearize_map, self.function, self.units)
+        return map_in_numpy_batches(linearize, POINT_BATCH_SIZES, args, z, p)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class AbstractGaitProblem(AbstractContinuationProblem):
     """Continuation problem of gaits in one parameter of the wheel.
 
-    Event-driven steps of the model measure the gaits.
+    Event-driven steps of the model measure the gaits. The unknowns are the section state, unless a
+    class defines others.
     """
 
-    model: eqx.AbstractVar[AbstractWheel]
-    step_options: eqx.AbstractVar[StepOptions]
-    parameter_name: eqx.AbstractVar[str]
+    model: AbstractWheel
+    step_options: StepOptions
+    n_legs: int
+    parameter_name: str
+    period_n: int
+    measures_force_peaks: bool
 
     @property
-    @abc.abstractmethod
-    def n_steps(self) -> int:
-        """Return the number of gait steps after which the gaits repeat."""
+    def parameter_index(self) -> int:
+        """Return the index of the continued parameter."""
+        return self.model.parameter_names.index(self.parameter_name)
 
-    def read_gait_state(
-        self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
-    ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state before the first landing, and the continued quantities by name.
+    def replace_parameter(self, wheels: BranchWheel, p: Any) -> np.ndarray:
+        """Return the parameters of wheels, in which the continued parameter has the value p."""
+        values = np.array(wheels.values)
+        values[..., self.parameter_index] = p
+        return values
+
+    def read_gaits(
+        self, wheels: BranchWheel, values: np.ndarray, z: np.ndarray
+    ) -> tuple[np.ndarray, QuantitiesByName]:
+        """Return section states before the first landing, and the continued quantities by name.
 
         A continued quantity is defined on both sides of a special point. By default, z is the
         section state, and all quantities are measures of the event-driven step.
         """
         return z, {}
 
-    @eqx.filter_jit
-    def measure_gaits(self, wheels: BranchWheel, points: ContinuationPoint) -> dict[str, Array]:
-        """Return the measures of the gaits at many points by name, computed by
-        event-driven steps.
-        """
+    def take_steps(self, values: np.ndarray, states: np.ndarray) -> Any:
+        """Return the event-driven steps of one period, on an axis after that of the gaits."""
+        columns = tuple(map(jnp.asarray, values.T))
+        model, params = self.model.from_parameter_values(columns, self.n_legs)
+        steps = []
+        for _ in range(self.period_n):
+            steps.append(model.take_steps(params, states, self.step_options))
+            states = steps[-1].section_state
+        return jax.tree.map(lambda *leaves: np.stack(leaves, 1), *steps)
 
-        def measure_point(wheel: BranchWheel, z: Any, p: Array) -> dict[str, Array]:
-            section_state, continued_quantities = self.read_gait_state(wheel, z, p)
-            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-            gait_measures = measure_gait_period(
-                model, params, section_state, self.step_options, self.n_steps
-            )
-            return gait_measures | continued_quantities | {"section_state": section_state}
+    def measure_steps(
+        self, values: np.ndarray, states: np.ndarray, steps: AbstractStep
+    ) -> QuantitiesByName:
+        """Return further quantities of gaits, which only some models have."""
+        return {}
 
-        return jax.vmap(measure_point)(wheels, points.z, points.p)
+    def measure_gaits(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantitiesByName:
+        """Return the measures of the gaits at many points by name."""
+        values = self.replace_parameter(wheels, points.p)
+        states, quantities = self.read_gaits(wheels, values, points.z)
+        steps = self.take_steps(values, states)
+        return {
+            **map_in_numpy_batches(_combine_period_measures, POINT_BATCH_SIZES, steps, states),
+            **quantities,
+            **self.measure_steps(values, states, steps),
+            "section_state": states,
+        }
 
 
+SolutionShapes = tuple[tuple[int, ...], ...]
+"""Shape of each array of a `CollocationSolution`."""
+
+
+def unpack_solution(shapes: SolutionShapes, z: Any) -> CollocationSolution:
+    """Return the solution of one row of unknowns, or of rows on leading axes."""
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes]).tolist()
+    section_state, durations, *accelerations = (
+        z[..., begin:end].reshape(*z.shape[:-1], *shape)
+        for begin, end, shape in zip([0, *ends[:-1]], ends, shapes, strict=True)
+    )
+    return CollocationSolution(section_state, durations, tuple(accelerations))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class CollocationProblem(AbstractGaitProblem):
-    """Continuation problem of limit cycles by collocation. The unknowns z are a
-    `CollocationSolution`.
+    """Continuation problem of limit cycles by collocation. The unknowns z are those of a
+    `CollocationSolution` in one row.
 
     If an indicator changes its sign, the solution still exists, but the event-driven step does not
     confirm it as a gait.
 
+    - `shapes`: shape of each array of the solution;
     - `additional_quantity_function`: function of the wheel's symbols, the phase points of the first
-      gait step and z, or None;
-    - `measures_force_peaks`: whether the points also have the measures of the gait's force.
+      gait step and the solution, or None.
     """
 
-    model: AbstractWheel
-    step_options: StepOptions
-    collocation_system: CollocationSystem = eqx.field(static=True)
-    parameter_name: str = eqx.field(static=True)
-    additional_quantity_function: Callable | None = eqx.field(static=True)
-    measures_force_peaks: bool = eqx.field(static=True, default=False)
+    collocation_system: CollocationSystem
+    shapes: SolutionShapes
+    additional_quantity_function: Callable | None = None
 
-    @property
-    def n_steps(self) -> int:
-        return self.collocation_system.period_n
+    def pack(self, solution: CollocationSolution) -> np.ndarray:
+        """Return solutions with a leading axis over wheels as rows of unknowns."""
+        leaves = map(np.asarray, jax.tree.leaves(solution))
+        return np.concatenate([x.reshape(len(x), -1) for x in leaves], 1)
 
-    def _stack_parameters_at(self, wheel: BranchWheel, p: Scalar) -> Array:
-        """Return the wheel's parameters as a vector, in which the continued parameter
-        has the value p.
-        """
-        return stack_parameters(self.model.with_parameter(wheel.params, self.parameter_name, p)[1])
+    def unpack(self, z: np.ndarray) -> CollocationSolution:
+        """Return the solution of one row of unknowns, or of rows on leading axes."""
+        return unpack_solution(self.shapes, z)
 
-    def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
-        linearize_trial = make_trial_linearizer(
-            self.collocation_system, (self.model.parameter_names.index(self.parameter_name),)
+    def linearize(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> NewtonStep:
+        linearize_trials = make_trial_linearizer(self.collocation_system, (self.parameter_index,))
+        correction, tangents, monodromy = linearize_trials(
+            self.replace_parameter(wheels, p), wheels.is_phase_active, self.unpack(z)
         )
-        newton_correction, parameter_tangents, monodromy_matrix, *_ = linearize_trial(
-            self._stack_parameters_at(wheel, p), wheel.is_phase_active, z
+        tangent = jax.tree.map(lambda x: x[:, 0], tangents)
+        return NewtonStep(self.pack(correction), self.pack(tangent), monodromy)
+
+    def section_state(self, z: np.ndarray) -> np.ndarray:
+        return z[..., : self.shapes[0][0]]
+
+    def correction_norm(self, z: np.ndarray, correction: np.ndarray) -> float:
+        """Return the largest component; accelerations count by their effect on positions."""
+        durations = np.max(np.abs(self.unpack(z).durations), 0)
+        changes = self.unpack(correction)
+        return max(
+            np.max(np.abs(changes.section_state)),
+            np.max(np.abs(changes.durations)),
+            *(
+                np.max(np.abs(change)) * duration**2
+                for change, duration in zip(changes.accelerations, durations, strict=True)
+            ),
         )
-        return NewtonStep(
-            newton_correction, jax.tree.map(lambda x: x[0], parameter_tangents), monodromy_matrix
-        )
 
-    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
-        return z.section_state
-
-    def correction_norm(self, z: ProblemUnknowns, newton_correction: ProblemUnknowns) -> Scalar:
-        return unbatch(compute_correction_norm)(z, newton_correction)
-
-    def is_admissible(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
+    def is_admissible(self, wheel: BranchWheel, z: np.ndarray, p: float) -> bool:
         """Return whether all durations are positive.
 
         The event-driven step checks all other conditions.
         """
-        return jnp.all((z.durations > 0.0) | (wheel.is_phase_active < 0.5))
+        is_positive = self.unpack(z).durations > 0.0
+        return bool(np.all(is_positive | (wheel.is_phase_active < 0.5)))
 
-    def read_gait_state(
-        self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar
-    ) -> tuple[AnySectionState, dict[str, Array]]:
-        """Return the section state before the first landing, and the continued quantities by name.
+    def read_gaits(
+        self, wheels: BranchWheel, values: np.ndarray, z: np.ndarray
+    ) -> tuple[np.ndarray, QuantitiesByName]:
+        """Return section states before the first landing, and the continued quantities by name.
 
         The continued quantities are the shortest duration of each phase over the gait steps, s, and
         `takeoff_acceleration`, m/s^2. The latter is the lowest acceleration of the rear foot at
         take-off over the gait steps.
         """
-        collocation_system = self.collocation_system
-        parameters = self._stack_parameters_at(wheel, p)
-        wheel_symbols = collocation_system.make_wheel(parameters).symbols()
-        phase_points_by_step = collocation_system.evaluate_phase_points(parameters, z)
-        last_end_point, min_durations = (
-            phase_points_by_step[-1][-1].phase_end_point,
-            jnp.min(z.durations, 0),
+        return map_in_numpy_batches(
+            functools.partial(
+                _read_collocated_gaits,
+                self.collocation_system,
+                self.shapes,
+                self.additional_quantity_function,
+                self.measures_force_peaks,
+            ),
+            POINT_BATCH_SIZES,
+            values,
+            wheels.is_phase_active,
+            z,
         )
-        continued_quantities = {
-            "duration_dls": jnp.where(wheel.is_phase_active[0, 0] > 0.5, min_durations[0], jnp.nan),
-            "duration_sls1": min_durations[1],
-            "duration_sls2": min_durations[2],
-            "takeoff_acceleration": collocation_system.measure_takeoff_acceleration(parameters, z),
-            "mesh_error": collocation_system.estimate_mesh_error(z),
-        }
-        if self.additional_quantity_function is not None:
-            continued_quantities |= self.additional_quantity_function(
-                wheel_symbols, phase_points_by_step[0], z
-            )
-        if self.measures_force_peaks:
-            continued_quantities |= compute_force_peaks(collocation_system, parameters, z)
-        return jnp.stack([last_end_point.q[0], *last_end_point.v]), continued_quantities
+
+
+@functools.partial(jax.jit, static_argnums=range(4))
+@functools.partial(jax.vmap, in_axes=(None, None, None, None, 0, 0, 0))
+def _read_collocated_gaits(
+    system: CollocationSystem,
+    shapes: SolutionShapes,
+    additional_quantity_function: Callable | None,
+    has_force_peaks: bool,
+    parameters: Array,
+    is_phase_active: Array,
+    z: Array,
+) -> tuple[Array, dict[str, Array]]:
+    """Return the result of `CollocationProblem.read_gaits` for one gait."""
+    solution = unpack_solution(shapes, z)
+    phase_points_by_step = system.evaluate_phase_points(parameters, solution)
+    end_point, durations = (
+        phase_points_by_step[-1][-1].phase_end_point,
+        jnp.min(solution.durations, 0),
+    )
+    quantities = {
+        "duration_dls": jnp.where(is_phase_active[0, 0] > 0.5, durations[0], jnp.nan),
+        "duration_sls1": durations[1],
+        "duration_sls2": durations[2],
+        "takeoff_acceleration": system.measure_takeoff_acceleration(parameters, solution),
+        "mesh_error": system.estimate_mesh_error(solution),
+    }
+    if additional_quantity_function is not None:
+        quantities |= additional_quantity_function(
+            system.make_wheel(parameters).symbols(), phase_points_by_step[0], solution
+        )
+    if has_force_peaks:
+        quantities |= compute_force_peaks(system, parameters, solution)
+    return jnp.stack([end_point.q[0], *end_point.v]), quantities
 
 
 GaitQuantityFunction = Callable[[CollocationSystem, Array, Array, CollocationSolution], Array]
@@ -205,18 +331,19 @@ Its arguments are the collocation system, the parameters, `is_phase_active` and 
 """
 
 
+@functools.lru_cache
 def make_trial_linearizer(
     collocation_system: CollocationSystem,
     parameter_indices: tuple[int, ...],
     gait_quantity_function: GaitQuantityFunction | None = None,
-) -> Any:
-    """Return a function that linearizes the collocation equations of one wheel at a trial solution.
+) -> Callable:
+    """Return a function that linearizes the equations of many wheels at trial solutions.
 
-    The arguments of the function are (parameters, is_phase_active, solution), and `jax.vmap` can
-    map it over wheels. It returns Newton's correction, the tangents with respect to the selected
-    parameters and the monodromy matrix. If `gait_quantity_function` is not None, it also returns
-    the computed quantities and their JVPs. The directions of the JVPs are the correction and each
-    tangent.
+    The arguments of the function are (parameters, is_phase_active, solution) as NumPy arrays with
+    the wheels on the first axis, like its results. It returns Newton's correction, the tangents
+    with respect to the selected parameters and the monodromy matrix. If `gait_quantity_function` is
+    not None, it also returns the computed quantities and their JVPs. The directions of the JVPs are
+    the correction and each tangent.
     """
 
     def linearize_trial(parameters: Array, is_phase_active: Array, z: CollocationSolution) -> tuple:
@@ -255,185 +382,130 @@ def make_trial_linearizer(
             lax.map(compute_quantity_tangent, tangent_directions),
         )
 
-    return unbatch(
-        compile_batch_function(linearize_trial, collocation_system.cycle_options.batch_size)
-    )
+    compiled = compile_batch_function(linearize_trial, collocation_system.cycle_options.batch_size)
+
+    def linearize_trials(*arguments: Any) -> Any:
+        to_lanes_last = lambda x: np.ascontiguousarray(np.moveaxis(x, 0, -1))
+        results = compiled.run(*jax.tree.map(to_lanes_last, arguments))
+        return jax.tree.map(lambda x: np.moveaxis(x, -1, 0), results)
+
+    return linearize_trials
 
 
-class AbstractReturnMapProblem(AbstractGaitProblem):
-    """Continuation problem of fixed points of the return map over `period_n` gait steps.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReturnMapProblem(AbstractGaitProblem, AbstractStateProblem):
+    """Continuation problem of fixed points of a model's return map over `period_n` gait steps."""
 
-    The unknowns z are the section state. Its last components are discrete codes (see
-    `AbstractWheel.count_continuous_section_entries`), which are copied from the image under the
-    return map in every Newton iteration. Newton's method converges only if state and image have
-    equal codes.
-    """
-
-    model: AbstractWheel
-    step_options: StepOptions
-    parameter_name: str = eqx.field(static=True)
-    period_n: int = eqx.field(static=True)
-    n_coordinates: int = eqx.field(static=True)
-
-    @property
-    def n_steps(self) -> int:
-        return self.period_n
-
-    def section_state(self, z: ProblemUnknowns) -> SectionStateVector:
-        return z[: self.n_coordinates]
-
-    def interpolate_unknowns(
-        self, left_point: ProblemUnknowns, right_point: ProblemUnknowns, location_fraction: Scalar
-    ) -> ProblemUnknowns:
-        """Interpolate the first components of two section states.
-
-        The discrete codes are those of the nearer section state.
-        """
-        nearer_point = jnp.where(location_fraction < 0.5, left_point, right_point)
-        interpolated_point = left_point + location_fraction * (right_point - left_point)
-        return jnp.concatenate(
-            [interpolated_point[: self.n_coordinates], nearer_point[self.n_coordinates :]]
-        )
-
-    def is_smooth_between(
-        self, left_point: ProblemUnknowns, right_point: ProblemUnknowns
-    ) -> Bool[Array, ""]:
-        """Return whether two neighboring points have equal discrete codes in their
-        section states.
-        """
-        return jnp.all(left_point[self.n_coordinates :] == right_point[self.n_coordinates :])
+    def linearize(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> NewtonStep:
+        units = (1.0,) * self.n_coordinates
+        advance_period = jax.tree_util.Partial(
+            _advance_period, self.model, self.step_options, self.n_legs, self.period_n,
+            self.parameter_index,
+        )  # fmt: skip
+        linearize = functools.partial(_linearize_map, advance_period, units)
+        return map_in_numpy_batches(linearize, POINT_BATCH_SIZES, wheels, z, p)
 
 
-class ReturnMapProblem(AbstractReturnMapProblem):
-    """Continuation problem of the gaits of a model whose gait steps JAX can differentiate."""
+def _advance_period(
+    model: AbstractWheel,
+    options: StepOptions,
+    n_legs: int,
+    period_n: int,
+    parameter_index: int,
+    wheel: BranchWheel,
+    z: Array,
+    p: Array,
+) -> Array:
+    values = jnp.asarray(wheel.values).at[parameter_index].set(p)
+    model, params = model.from_parameter_values(values, n_legs)
+    for _ in range(period_n):
+        result = model.advance(params, z, options)
+        z = jnp.where(result.outcome == Outcome.STEPPED, result.section_state, jnp.nan)
+    return z
 
-    def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> NewtonStep:
-        def return_map(z: Array, p: Scalar) -> Array:
-            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-            for _ in range(self.period_n):
-                advance_result = model.advance(params, z, self.step_options)
-                z = jnp.where(
-                    advance_result.outcome == Outcome.STEPPED, advance_result.section_state, jnp.nan
-                )
-            return z
 
-        return arclength.compute_fixed_point_newton_step(return_map, z, p, self.n_coordinates)
-
-
-class ContactGaitProblem(AbstractReturnMapProblem):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
     """Continuation problem of gaits with unilateral contact, solved by batches of gait steps."""
 
-    n_legs: int = eqx.field(static=True)
-    measures_force_peaks: bool = eqx.field(static=True, default=False)
-
-    is_traceable: ClassVar[bool] = False
     has_kinks: ClassVar[bool] = True
 
-    def stack_parameter_values(self, wheels: BranchWheel, p: Array) -> Array:
-        """Return the parameter values of many wheels, in which the continued parameter has the
-        value p.
-        """
+    def _evaluate_period(self, values: np.ndarray, states: np.ndarray, *differentiated: Any) -> Any:
+        period_map = PeriodMap(self.model, self.n_legs, self.period_n, values)
+        return period_map.evaluate_period(self.step_options, states, *differentiated)
 
-        def select_values(wheel: BranchWheel, p: Array) -> Array:
-            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-            return model.collect_parameter_values(params)
-
-        return jax.vmap(select_values)(wheels, p)
-
-    def _make_period_map(self, wheels: BranchWheel, p: Array) -> PeriodMap:
-        """Return the map that advances the section states of many wheels by one period."""
-        parameter_values = np.asarray(self.stack_parameter_values(wheels, p))
-        return PeriodMap(self.model, self.n_legs, self.period_n, parameter_values)
-
-    def linearize(self, wheel: BranchWheel, z: ProblemUnknowns, p: Array) -> NewtonStep:
+    def linearize(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> NewtonStep:
         """Return the Newton steps of many wheels at their trial points."""
-        section_states, n_coordinates = np.asarray(z), self.n_coordinates
-        is_continued_parameter = np.asarray(self.model.parameter_names) == self.parameter_name
-        period_evaluation = self._make_period_map(wheel, p).evaluate_period(
-            self.step_options, section_states, is_continued_parameter
+        n, is_continued = self.n_coordinates, np.arange(wheels.values.shape[1])
+        is_continued = is_continued == self.parameter_index
+        period = self._evaluate_period(self.replace_parameter(wheels, p), z, is_continued)
+        defects = period.end_states - z
+        defects[~period.is_period_complete] = np.nan
+        jacobian = period.return_map_jacobian[:, :n, :n]
+        right_sides = np.concatenate(
+            [defects[:, :n, None], period.parameter_jacobian[:, :n, is_continued]], -1
         )
-        nan_if_incomplete = np.where(period_evaluation.is_period_complete, 0.0, np.nan)[:, None]
-        period_defects = period_evaluation.end_states - section_states + nan_if_incomplete
-        return_map_jacobian = period_evaluation.return_map_jacobian[
-            :, :n_coordinates, :n_coordinates
-        ]
-        parameter_jacobian = period_evaluation.parameter_jacobian[
-            :, :n_coordinates, is_continued_parameter
-        ]
-        right_hand_sides = np.concatenate(
-            [period_defects[:, :n_coordinates, None], parameter_jacobian], -1
+        solutions = solve_linear_systems(np.eye(n) - jacobian, right_sides)
+        code_changes = defects[:, n:]
+        return NewtonStep(
+            np.concatenate([solutions[..., 0], code_changes], 1),
+            np.concatenate([solutions[..., 1], 0.0 * code_changes], 1),
+            jacobian,
         )
-        linear_system_solutions = solve_linear_systems(
-            np.eye(n_coordinates) - return_map_jacobian, right_hand_sides
-        )
-        contact_code_changes = period_defects[:, n_coordinates:]
-        newton_corrections = np.concatenate(
-            [linear_system_solutions[..., 0], contact_code_changes], 1
-        )
-        parameter_tangents = np.concatenate(
-            [linear_system_solutions[..., 1], 0.0 * contact_code_changes], 1
-        )
-        return NewtonStep(newton_corrections, parameter_tangents, jnp.asarray(return_map_jacobian))
 
-    def measure_gaits(self, wheels: BranchWheel, points: ContinuationPoint) -> dict[str, Array]:
-        period_evaluation = self._make_period_map(wheels, points.p).evaluate_period(
-            self.step_options, np.asarray(points.z), False, False
-        )
-        section_states = jnp.asarray(points.z)
-        additional_quantities = {
-            "section_state": section_states,
-            CONTACT_ORDER_COLUMN: compute_contact_order_numbers(
-                period_evaluation.gait_steps_of_period, self.n_legs
-            ),
-            FRICTION_SURPLUS_COLUMN_NAME: np.asarray(
-                jax.vmap(self._compute_friction_surplus)(wheels, points.p)
-            ),
+    def take_steps(self, values: np.ndarray, states: np.ndarray) -> Any:
+        evaluate = lambda *rows: self._evaluate_period(*rows, False, False).gait_steps_of_period
+        return map_in_numpy_batches(evaluate, batch_sizes.LOCATION_BATCH_SIZES, values, states)
+
+    def measure_steps(
+        self, values: np.ndarray, states: np.ndarray, steps: AbstractStep
+    ) -> QuantitiesByName:
+        quantities = {
+            EVENT_ORDER: compute_contact_order_numbers(steps, self.n_legs),
+            FRICTION_SURPLUS: self._compute_friction_surplus(values),
         }
         if self.measures_force_peaks:
-            additional_quantities |= self._measure_force_peaks(
-                wheels,
-                points.p,
-                section_states,
-                jnp.asarray(period_evaluation.gait_steps_of_period.section_state),
+            quantities |= map_in_numpy_batches(
+                functools.partial(
+                    _measure_contact_force_peaks, self.model, self.n_legs, self.step_options
+                ),
+                POINT_BATCH_SIZES,
+                values,
+                states,
+                steps.section_state,
             )
-        return (
-            _combine_period_measures(period_evaluation.gait_steps_of_period, points.z)
-            | additional_quantities
-        )
+        return quantities
 
-    @eqx.filter_jit
-    def _measure_force_peaks(
-        self, wheels: BranchWheel, p: Array, section_states: Array, step_ends: Array
-    ) -> dict[str, Array]:
-        """Return the `measures.FORCE_PEAK_MEASURES` of many gaits by name.
-
-        The first axis of all arguments is that of the gaits.
-        """
-
-        def measure_gait_force(
-            wheel: BranchWheel, p: Array, section_state: Array, step_ends: Array
-        ) -> dict[str, Array]:
-            model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-            return measure_return_map_force_peaks(
-                model, params, section_state, step_ends, self.step_options
-            )
-
-        return jax.vmap(measure_gait_force)(wheels, p, section_states, step_ends)
-
-    def _compute_friction_surplus(self, wheel: BranchWheel, p: Array) -> Array:
+    def _compute_friction_surplus(self, values: np.ndarray) -> np.ndarray:
         """Return the friction coefficient minus the slope's tangent.
 
         Over a period, the ground's tangential impulse balances the impulse of the weight parallel
         to the slope. The tangential impulse is at most the friction coefficient times the normal
         impulse. Therefore no gait repeats without a surplus.
         """
-        model: Any
-        model, params = self.model.with_parameter(wheel.params, self.parameter_name, p)
-        return model.friction - jnp.tan(params.slope) * (1.0 + MIN_FRICTION_SURPLUS)
+        names = self.model.parameter_names
+        slope, friction = (values[..., names.index(name)] for name in ("slope", FRICTION_NAME))
+        return friction - np.tan(slope) * (1.0 + MIN_FRICTION_SURPLUS)
 
-    def is_admissible(self, wheel: BranchWheel, z: ProblemUnknowns, p: Scalar) -> Bool[Array, ""]:
+    def is_admissible(self, wheel: BranchWheel, z: np.ndarray, p: float) -> bool:
         """Return whether friction can balance the component of the weight parallel to the slope."""
-        return jnp.all(jnp.isfinite(z)) & (self._compute_friction_surplus(wheel, p) > 0.0)
+        surplus = self._compute_friction_surplus(self.replace_parameter(wheel, p))
+        return bool(np.isfinite(z).all() and surplus > 0.0)
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, None, None, 0, 0, 0))
+def _measure_contact_force_peaks(
+    model: AbstractWheel,
+    n_legs: int,
+    options: StepOptions,
+    values: Array,
+    state: Array,
+    step_ends: Array,
+) -> dict[str, Array]:
+    """Return the `measures.FORCE_PEAK_MEASURES` of a gait by name."""
+    model, params = model.from_parameter_values(values, n_legs)
+    return measure_return_map_force_peaks(model, params, state, step_ends, options)
 
 
 def compute_contact_order_numbers(gait_steps_of_period: Any, n_legs: int) -> np.ndarray:
@@ -460,51 +532,15 @@ def compute_contact_order_numbers(gait_steps_of_period: Any, n_legs: int) -> np.
 
 @jax.jit
 @jax.vmap
-def _combine_period_measures(
-    step_results: AbstractStep, section_states: AnySectionState
-) -> dict[str, Array]:
-    """Combine the measures of the gait steps in each period to measures of the period.
-
-    `section_states` contains the first section state of each period.
-    """
-    return combine_step_measures(
-        step_results.section_state[-1],
-        jax.vmap(lambda step_result: step_result.measures())(step_results),
-        section_states,
-    )
-
-
-def measure_gait_period(
-    model: AbstractWheel,
-    params: WheelParams,
-    section_state: AnySectionState,
-    step_options: StepOptions,
-    period_n: int,
-) -> dict[str, Array]:
-    """Return all measures of one period of a gait, which starts at `section_state`.
+def _combine_period_measures(step_results: AbstractStep, section_states: Array) -> dict[str, Array]:
+    """Return all measures of each period of gait steps, which start at `section_states`.
 
     Indicators and margins are minima over the gait steps, required friction coefficients are
     maxima, and durations and energies are sums. The section state is that of the last step, and the
     post-impact state is that of the first step. `outcome` is the first failure of a step, if any.
     `closure` is the largest change of the section state over the period.
     """
-
-    def measure_next_step(
-        section_state: AnySectionState, _: None
-    ) -> tuple[AnySectionState, dict[str, Array]]:
-        step_result = model.take_step(params, section_state, step_options)
-        return step_result.section_state, step_result.measures()
-
-    end_state, step_measures = lax.scan(measure_next_step, section_state, None, length=period_n)
-    return combine_step_measures(end_state, step_measures, section_state)
-
-
-def combine_step_measures(
-    end_state: AnySectionState, step_measures: dict[str, Array], section_state: AnySectionState
-) -> dict[str, Array]:
-    """Return the result of `measure_gait_period`, computed from the measures of each step and
-    the end state.
-    """
+    step_measures = jax.vmap(lambda step_result: step_result.measures())(step_results)
     period_measures = {}
     for measure_name, values_by_step in step_measures.items():
         if measure_name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or measure_name.startswith(
@@ -528,4 +564,5 @@ def combine_step_measures(
     positive_period = jnp.where(period_measures["period"] > 0.0, period_measures["period"], 1.0)
     period_measures["dls_fraction"] = period_measures["duration_dls"] / positive_period
     period_measures["speed"] = period_measures["step_length"] / positive_period
-    return period_measures | {"closure": jnp.max(jnp.abs(end_state - section_state))}
+    closure = jnp.max(jnp.abs(step_results.section_state[-1] - section_states))
+    return period_measures | {"closure": closure}

@@ -23,31 +23,31 @@ from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_location import (
     AbstractContinuation,
     BranchData,
+    QuantitiesByName,
     continue_and_locate_special_points,
 )
-from vrw_jax.branches.branch_points import BRANCH_POINT_KIND, QuantitiesByName
 from vrw_jax.branches.continuation import (
-    BRANCH_ENDING_QUANTITIES,
+    GAIT_TEST_FUNCTIONS,
     MAX_BRANCH_MESH_REFINEMENTS,
-    GaitContinuation,
     continue_branches,
+    split_legs,
 )
-from vrw_jax.branches.continuation_problems import BranchWheel
-from vrw_jax.branches.gait_test_functions import (
+from vrw_jax.branches.continuation_problems import BranchWheel, CollocationProblem
+from vrw_jax.branches.curve_problems import (
     CONTINUED_QUANTITIES,
     DISCONTINUOUS_QUANTITIES,
     DLS_VANISHING_NAME,
     FORCE_QUANTITY_NAMES,
     INITIAL_FORCE_FALL_NAME,
     LINEAR_MARGIN_SUBSTITUTES,
-    GaitTestFunction,
-    TestFunctionWheel,
+    CurveWheel,
+    GaitCurveProblem,
+    compute_continued_quantities,
     find_test_quantity_group,
     locate_jump_onset,
     select_test_quantity,
 )
-from vrw_jax.branches.sign_changes import BIFURCATION_NAMES
-from vrw_jax.branches.test_functions import TestFunctionCurve, TestFunctionPoint
+from vrw_jax.branches.test_functions import BIFURCATIONS, BRANCH_POINT, FOLD, TestFunction
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.phase_collocation import CollocationSolution
@@ -74,52 +74,35 @@ class CurveContinuation(AbstractContinuation):
     the whole curve.
     """
 
-    continuation_problem: TestFunctionCurve
+    continuation_problem: GaitCurveProblem
     special_point_names: tuple[str, ...]  # one name per wheel
 
-    branch_ending_quantities: ClassVar[tuple[str, ...]] = (
-        *BRANCH_ENDING_QUANTITIES,
-        RANGE_EDGE_COLUMN,
-        INITIAL_FORCE_FALL_NAME,
-    )
-    border_collision_quantities: ClassVar[tuple[str, ...]] = (
-        GaitContinuation.border_collision_quantities
-    )
+    test_functions: ClassVar[Mapping[str, TestFunction]] = {
+        **GAIT_TEST_FUNCTIONS,
+        RANGE_EDGE_COLUMN: TestFunction("lost", "The second parameter's range ends.", True),
+        INITIAL_FORCE_FALL_NAME: TestFunction("lost", "The force begins to rise.", True),
+    }
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
 
     def evaluate_point_quantities(
-        self, wheels: TestFunctionWheel, points: ContinuationPoint
+        self, wheels: CurveWheel, points: ContinuationPoint
     ) -> QuantitiesByName:
-        test_function: Any = self.continuation_problem.test_function
-        second_parameter_values = self.continuation_problem.compute_second_parameter(points.z)
-        gait_wheels = test_function.with_parameters(
-            wheels.branch_wheel, (points.p, second_parameter_values)
-        )
-        gait_continuation = GaitContinuation(
-            test_function.gait_problem, self.arclength_options, gait_wheels, self.parameter_bounds
-        )
-        quantity_table = gait_continuation.evaluate_point_quantities(
-            gait_wheels, points._replace(z=points.z.z)
-        )
+        problem = self.continuation_problem
+        quantities = split_legs(problem.measure_gaits(wheels, points), problem.gait_problem.n_legs)
         # Without double support, the rear foot's force must not be positive.
         rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
-        second_parameter_fractions = np.asarray(points.z.second_parameter_fraction)
-        return quantity_table | {
-            "lambda_4_plus": rear_force_sign * quantity_table["lambda_4_plus"],
-            "second": second_parameter_values,
-            RANGE_EDGE_COLUMN: np.minimum(
-                second_parameter_fractions, 1.0 - second_parameter_fractions
-            ),
+        fraction = points.z[:, 0]
+        return quantities | {
+            "lambda_4_plus": rear_force_sign * quantities["lambda_4_plus"],
+            "second": problem.compute_second_parameter(points.z),
+            RANGE_EDGE_COLUMN: np.minimum(fraction, 1.0 - fraction),
         }
 
     def mask_undefined_quantities(
-        self, quantity_table: QuantitiesByName, wheel_indices: np.ndarray
+        self, quantities: QuantitiesByName, owners: np.ndarray
     ) -> QuantitiesByName:
-        """Replace each quantity that is zero or undefined on the whole curve by NaN.
-
-        - `wheel_indices`: index of the curve to which each point belongs.
-        """
-        special_point_names = np.array(self.special_point_names)[wheel_indices]
+        """Replace each quantity that is zero or undefined on the whole curve by NaN."""
+        special_point_names = np.array(self.special_point_names)[owners]
         is_dls_vanishing = special_point_names == DLS_VANISHING_NAME
         is_step_discontinuous = np.isin(
             special_point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
@@ -144,22 +127,20 @@ class CurveContinuation(AbstractContinuation):
         # A transposed array has its points on the last axis.
         masked_quantities = {
             quantity_name: np.where(is_undefined(quantity_name), np.nan, quantity_values.T).T
-            for quantity_name, quantity_values in quantity_table.items()
+            for quantity_name, quantity_values in quantities.items()
         }
         return masked_quantities | {
-            "outcome": np.where(is_step_discontinuous, Outcome.STEPPED, quantity_table["outcome"]),
-            "closure": np.where(is_step_discontinuous, 0.0, quantity_table["closure"]),
+            "outcome": np.where(is_step_discontinuous, Outcome.STEPPED, quantities["outcome"]),
+            "closure": np.where(is_step_discontinuous, 0.0, quantities["closure"]),
         }
 
-    def are_points_admissible(self, quantity_table: QuantitiesByName) -> np.ndarray:
-        are_quantities_positive = np.all(
-            [
-                ~(quantity_table[quantity_name] <= 0.0)
-                for quantity_name in self.branch_ending_quantities
-            ],
-            axis=0,
-        )
-        return are_quantities_positive & super().are_points_admissible(quantity_table)
+    def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
+        are_positive = [
+            ~(values <= 0.0)
+            for name, values in quantities.items()
+            if (test := self.find_test_function(name)) and test.ends_branch
+        ]
+        return np.all(are_positive, axis=0) & super().are_points_admissible(quantities)
 
 
 class CurveSeed(NamedTuple):
@@ -257,14 +238,15 @@ class CurveTracer(NamedTuple):
             if not can_continue_special_point(special_point.name):
                 continue
             limit_cycle = special_point.cycle
-            params = limit_cycle.system.make_wheel(limit_cycle.parameters)
-            branch_wheel = BranchWheel(params, limit_cycle.collocation_state.is_phase_active)
-            z = limit_cycle.collocation_state.solution
+            parameters, state = jax.tree.map(
+                np.asarray, (limit_cycle.parameters, limit_cycle.collocation_state)
+            )
+            branch_wheel, z = BranchWheel(parameters, state.is_phase_active), state.solution
             curve_seeds.append(
                 CurveSeed(
                     choose_continued_special_point_name(special_point.name, branch_wheel, z),
                     tuple(
-                        float(self.model.get_parameter(params, name))
+                        float(parameters[self.model.parameter_names.index(name)])
                         for name in self.parameter_names
                     ),
                     limit_cycle.system,
@@ -374,8 +356,11 @@ class CurveTracer(NamedTuple):
             return curve_seed
         return curve_seed._replace(
             collocation_system=collocation_system,
-            z=transfer_solution_to_mesh(
-                curve_seed.collocation_system, collocation_system, curve_seed.z
+            z=jax.tree.map(
+                np.asarray,
+                transfer_solution_to_mesh(
+                    curve_seed.collocation_system, collocation_system, curve_seed.z
+                ),
             ),
         )
 
@@ -397,74 +382,91 @@ class CurveTracer(NamedTuple):
             *curve_seeds,
             *curve_seeds[-1:] * (-len(curve_seeds) % batch_sizes.CURVE_BATCH_SIZE),
         ]
-        test_function = GaitTestFunction(
-            collocation_system, self.parameter_names, quantity_group, self.model, self.step_options
-        )
-        lower_bound, upper_bound = map(float, self.parameter_ranges[1])
+        problem = self.make_problem(collocation_system, quantity_group, padded_seeds[0].z)
 
-        def make_start(curve_seed: CurveSeed) -> tuple[TestFunctionWheel, TestFunctionPoint, float]:
+        def make_start(curve_seed: CurveSeed) -> tuple[CurveWheel, CollocationSolution, Any, Any]:
             has_double_support = bool(curve_seed.branch_wheel.is_phase_active[0, 0] > 0.5)
-            quantity_name = select_test_quantity(curve_seed.special_point_name, has_double_support)
-            first_parameter_value, second_parameter_value = curve_seed.parameter_values
-            second_fraction = (second_parameter_value - lower_bound) / (upper_bound - lower_bound)
-            return (
-                TestFunctionWheel(
-                    curve_seed.branch_wheel, jnp.asarray(quantity_group.index(quantity_name))
-                ),
-                TestFunctionPoint(curve_seed.z, jnp.asarray(second_fraction)),
-                first_parameter_value,
-            )
+            name = select_test_quantity(curve_seed.special_point_name, has_double_support)
+            index = np.asarray(quantity_group.index(name))
+            fraction = self.compute_parameter_fractions(np.array(curve_seed.parameter_values))[1]
+            first_value = curve_seed.parameter_values[0]
+            return CurveWheel(curve_seed.branch_wheel, index), curve_seed.z, fraction, first_value
 
-        wheels, z, first_parameter_values = jax.tree.map(
+        wheels, z, fractions, first_values = jax.tree.map(
             lambda *leaves: np.stack(leaves), *map(make_start, padded_seeds)
         )
-        branch_continuation = CurveContinuation(
-            TestFunctionCurve(test_function, (lower_bound, upper_bound)),
+        continuation = CurveContinuation(
+            problem,
             self.arclength_options,
             wheels,
             self.parameter_ranges[0],
             tuple(curve_seed.special_point_name for curve_seed in padded_seeds),
         )
         branch_data_by_seed = continue_and_locate_special_points(
-            branch_continuation,
-            z,
-            jnp.asarray(first_parameter_values),
+            continuation,
+            np.column_stack([fractions, problem.gait_problem.pack(z)]),
+            first_values,
             np.arange(len(padded_seeds)) < len(curve_seeds),
             lambda wheel_index, point: lambda: point,
             is_finest_mesh,
         )
         return branch_data_by_seed[: len(curve_seeds)], collocation_system
 
+    def make_problem(
+        self,
+        collocation_system: CollocationSystem,
+        quantity_group: tuple[str, ...],
+        z: CollocationSolution,
+    ) -> GaitCurveProblem:
+        """Return the problem of the curves of a group of quantities, for solutions like z."""
+        gait_problem = CollocationProblem(
+            model=self.model,
+            step_options=self.step_options,
+            n_legs=collocation_system.n_legs,
+            parameter_name=self.parameter_names[0],
+            period_n=1,
+            measures_force_peaks=False,
+            collocation_system=collocation_system,
+            shapes=tuple(x.shape for x in jax.tree.leaves(z)),
+            additional_quantity_function=compute_continued_quantities,
+        )
+        lower_bound, upper_bound = map(float, self.parameter_ranges[1])
+        return GaitCurveProblem(
+            second_bounds=(lower_bound, upper_bound),
+            gait_problem=gait_problem,
+            second_name=self.parameter_names[1],
+            quantity_names=quantity_group,
+        )
+
     def _make_traced_curve(self, curve_seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
         """Build a labeled curve, and seeds at the special points that the curve meets."""
-        parameter_points = np.stack(
-            [branch_data.points.p, branch_data.quantity_table["second"]], -1
-        )
+        parameter_points = np.stack([branch_data.points.p, branch_data.quantities["second"]], -1)
+        gaits = self.make_problem(
+            curve_seed.collocation_system, tuple(BIFURCATIONS), curve_seed.z
+        ).gait_problem
+        rows = branch_data.points.z[:, 1:]
         scaled_vertices = np.column_stack(
-            [
-                branch_data.points.z.z.section_state,
-                self.compute_parameter_fractions(parameter_points),
-            ]
+            [gaits.section_state(rows), self.compute_parameter_fractions(parameter_points)]
         )
         codim2_points, new_seeds, end_reasons = [], [], branch_data.end_reasons
         for special_point in branch_data.special_points:
             if special_point.name == RANGE_EDGE_COLUMN:
                 continue
             point_beside_root = special_point.cycle
-            second_fraction = point_beside_root.z.second_parameter_fraction
+            second_fraction, z = point_beside_root.z[0], gaits.unpack(point_beside_root.z[1:])
             second_parameter_value = float(
                 self.parameter_ranges[1, 0] + np.ptp(self.parameter_ranges[1]) * second_fraction
             )
             meeting_parameter_values = special_point.value, second_parameter_value
             special_point_name = choose_continued_special_point_name(
-                special_point.name, curve_seed.branch_wheel, point_beside_root.z.z
+                special_point.name, curve_seed.branch_wheel, z
             )
             if {special_point_name, curve_seed.special_point_name} == {
                 "lambda_4_plus",
                 DLS_VANISHING_NAME,
             }:
                 meeting_parameter_values = self._locate_jump_onset(
-                    curve_seed, point_beside_root.z.z, meeting_parameter_values
+                    curve_seed, z, meeting_parameter_values
                 )
                 new_seeds.append(
                     self._seed_beyond_meeting(
@@ -472,7 +474,7 @@ class CurveTracer(NamedTuple):
                         curve_seed,
                         scaled_vertices,
                         parameter_points,
-                        branch_data.points.z.z,
+                        gaits.unpack(rows),
                         meeting_parameter_values,
                     )
                 )
@@ -488,7 +490,7 @@ class CurveTracer(NamedTuple):
                     curve_seed._replace(
                         special_point_name=special_point_name,
                         parameter_values=(float(point_beside_root.p), second_parameter_value),
-                        z=point_beside_root.z.z,
+                        z=z,
                     )
                 )
             codim2_points.append(
@@ -506,18 +508,12 @@ class CurveTracer(NamedTuple):
 
         If the onset is not found, return `start_parameter_values`.
         """
-        test_function = GaitTestFunction(
-            curve_seed.collocation_system,
-            self.parameter_names,
-            CONTINUED_QUANTITIES,
-            self.model,
-            self.step_options,
-        )
+        problem = self.make_problem(curve_seed.collocation_system, CONTINUED_QUANTITIES, z)
         onset_parameter_values, last_relative_parameter_change = locate_jump_onset(
-            test_function,
+            problem,
             curve_seed.branch_wheel,
-            jax.device_put(z),
-            jnp.asarray(start_parameter_values),
+            problem.gait_problem.pack(jax.tree.map(lambda x: x[None], z))[0],
+            np.array(start_parameter_values),
         )
         is_onset_found = last_relative_parameter_change < RELATIVE_CODIM2_TOLERANCE
         first_parameter_value, second_parameter_value = (
@@ -559,9 +555,10 @@ class CurveTracer(NamedTuple):
             x[0]
             + CODIM2_OVERRUN_DISTANCE / distances_to_meeting[point_index] * (x[0] - x[point_index])
         )
-        z = jax.tree.map(lambda x: jnp.asarray(extrapolate_from_meeting(x)), z)
-        dls_duration = 0.0 if special_point_name == DLS_VANISHING_NAME else DLS_DURATION_GUESS_S
-        z = z._replace(durations=z.durations.at[0, 0].set(dls_duration))
+        z = jax.tree.map(extrapolate_from_meeting, z)
+        z.durations[0, 0] = (
+            0.0 if special_point_name == DLS_VANISHING_NAME else DLS_DURATION_GUESS_S
+        )
         return curve_seed._replace(
             special_point_name=special_point_name,
             parameter_values=tuple(extrapolate_from_meeting(parameter_points)),
@@ -571,26 +568,26 @@ class CurveTracer(NamedTuple):
     def _make_labeled_curve(
         self, curve_seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
     ) -> SpecialPointCurve:
-        spectral_radius = np.abs(
-            np.linalg.eigvals(np.asarray(branch_data.points.return_map_jacobian))
-        ).max(-1)
-        quantity_table = branch_data.quantity_table | {"spectral_radius": spectral_radius}
+        spectral_radius = np.abs(np.linalg.eigvals(branch_data.points.return_map_jacobian)).max(-1)
+        quantities = branch_data.quantities | {"spectral_radius": spectral_radius}
         column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
         curve_variables: dict[str, Any] = make_labeled_variables(
-            {column_name: quantity_table[column_name] for column_name in column_names}, "point"
+            {column_name: quantities[column_name] for column_name in column_names}, "point"
         )
-        curve_variables["mesh_error"] = ("point", quantity_table["mesh_error"])
-        curve_variables["section_state"] = (("point", "component"), quantity_table["section_state"])
+        curve_variables["mesh_error"] = ("point", quantities["mesh_error"])
+        curve_variables["section_state"] = (("point", "component"), quantities["section_state"])
         first_parameter_name, second_parameter_name = self.parameter_names
         curve_coordinates = make_labeled_variables(
             {
                 first_parameter_name: np.asarray(branch_data.points.p),
-                second_parameter_name: quantity_table["second"],
+                second_parameter_name: quantities["second"],
             },
             "point",
         )
         start_provenance = collect_provenance_attributes(
-            curve_seed.branch_wheel.params, self.model, self.step_options
+            curve_seed.collocation_system.make_wheel(jnp.asarray(curve_seed.branch_wheel.values)),
+            self.model,
+            self.step_options,
         )
         curve_axes_description = " and ".join(self.parameter_names)
         dataset_attrs = {
@@ -643,8 +640,8 @@ def choose_continued_special_point_name(
     foot's force are continued as `DLS_VANISHING_NAME` or "lambda_4_plus".
     """
     # A curve of folds may continue in one direction at its special points.
-    if special_point_name == BRANCH_POINT_KIND:
-        return "fold"
+    if special_point_name == BRANCH_POINT:
+        return FOLD
     if (
         special_point_name not in ("lambda_4_plus", DLS_VANISHING_NAME, INITIAL_FORCE_FALL_NAME)
         or branch_wheel.is_phase_active[0, 0] < 0.5
@@ -660,7 +657,7 @@ def choose_continued_special_point_name(
 def can_continue_special_point(special_point_name: str) -> bool:
     """Return whether `GaitTestFunction` can continue the named special point as a curve."""
     continued_special_point_names = (
-        *BIFURCATION_NAMES,
+        *BIFURCATIONS,
         *DISCONTINUOUS_QUANTITIES,
         DLS_VANISHING_NAME,
         *FORCE_QUANTITY_NAMES,

@@ -5,13 +5,12 @@ effects of two impacts do not commute. No continuation step leads to the gait be
 however short the step is.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
-from vrw_jax.branches.arclength import ContinuationResult, ContinuationStatus
-from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.branches.arclength import ContinuationPoint, ContinuationStatus, Track
 
 # Largest number of jumps in one direction of a branch.
 MAX_JUMPS_PER_DIRECTION = 20
@@ -24,98 +23,64 @@ PARAMETER_CHANGE_FRACTIONS = (
 
 
 def continue_beyond_jumps(
-    branch_continuation: Any,
-    wheels: Any,
-    results_by_direction: ContinuationResult,
-) -> ContinuationResult:
-    """Continue stalled branches beyond jumps, and return the points of all branches.
+    continuation: Any, owners: np.ndarray, tracks: Sequence[Track]
+) -> list[Track]:
+    """Continue stalled branches beyond jumps, and return the tracks of all branches.
 
     The search for the gait beyond a jump starts from the last gait. It uses the smallest change of
     the parameter that leads to a similar gait.
     """
-    branch_indices = np.arange(len(results_by_direction.n_points))
-    lower_bound, upper_bound = branch_continuation.parameter_bounds
-    wheel_indices, has_search_failed = branch_indices // 2, np.zeros(len(branch_indices), bool)
+    tracks, has_search_failed = list(tracks), np.zeros(len(tracks), bool)
+    lower_bound, upper_bound = continuation.parameter_bounds
     for _ in range(MAX_JUMPS_PER_DIRECTION):
-        n_points = np.asarray(results_by_direction.n_points)
-        is_branch_stalled = (
-            (results_by_direction.status == int(ContinuationStatus.STEP_SIZE_UNDERFLOW))
-            & (n_points > 1)
-            & ~has_search_failed
-        )
-        if not is_branch_stalled.any():
+        stalled = [
+            i
+            for i, track in enumerate(tracks)
+            if track.status == ContinuationStatus.STEP_SIZE_UNDERFLOW
+            and len(track.points) > 1
+            and not has_search_failed[i]
+        ]
+        if not stalled:
             break
-        branch_end_points = select_tree_rows(
-            results_by_direction.points, (branch_indices, np.maximum(n_points - 1, 0))
-        )
-        direction_signs = np.sign(branch_end_points.fraction_rate)
-        branch_end_quantities = branch_continuation.make_quantity_table(
-            branch_end_points, wheel_indices
-        )
-        for parameter_change_fraction in PARAMETER_CHANGE_FRACTIONS:
-            parameter_values = branch_end_points.p + direction_signs * parameter_change_fraction * (
-                upper_bound - lower_bound
-            )
-            is_branch_requested = (
-                is_branch_stalled
-                & (parameter_values > lower_bound)
-                & (parameter_values < upper_bound)
-            )
-            if not is_branch_requested.any():
+        has_search_failed[stalled] = True
+        for change_fraction in PARAMETER_CHANGE_FRACTIONS:
+            ends = {i: tracks[i].points[-1] for i in stalled if has_search_failed[i]}
+            values = {
+                i: end.p
+                + np.sign(end.fraction_rate) * change_fraction * (upper_bound - lower_bound)
+                for i, end in ends.items()
+            }
+            searched = [i for i, value in values.items() if lower_bound < value < upper_bound]
+            if not searched:
                 continue
-            new_branch_results = branch_continuation.continue_branches(
-                wheels, branch_end_points.z, parameter_values, direction_signs, is_branch_requested
+            new_tracks = continuation.continue_branches(
+                owners[searched],
+                [ends[i].z for i in searched],
+                [values[i] for i in searched],
+                [np.sign(ends[i].fraction_rate) for i in searched],
             )
-            first_quantities_beyond_jump = branch_continuation.make_quantity_table(
-                select_tree_rows(new_branch_results.points, (branch_indices, 0)), wheel_indices
-            )
-            is_gait_found = (
-                is_branch_requested
-                & (new_branch_results.n_points > 1)
-                & branch_continuation.is_same_gait(
-                    branch_end_quantities, first_quantities_beyond_jump
+            found = [
+                (i, track)
+                for i, track in zip(searched, new_tracks, strict=True)
+                if len(track.points) > 1
+            ]
+            if not found:
+                continue
+            indices = [i for i, _ in found]
+            before, after = (
+                continuation.make_table(
+                    ContinuationPoint(*(np.stack(x) for x in zip(*points, strict=True))),
+                    owners[indices],
                 )
+                for points in ([ends[i] for i in indices], [track.points[0] for _, track in found])
             )
-            results_by_direction = append_branch_results(
-                results_by_direction, new_branch_results, is_gait_found
-            )
-            is_branch_stalled &= ~is_gait_found
-        has_search_failed |= is_branch_stalled
-    return results_by_direction
-
-
-def append_branch_results(
-    results_by_direction: ContinuationResult,
-    new_branch_results: ContinuationResult,
-    is_branch_extended: np.ndarray,
-) -> ContinuationResult:
-    """Append the points in `new_branch_results` to the branches, and return all results.
-
-    - `is_branch_extended`: whether the points of each branch are appended.
-    """
-    if not is_branch_extended.any():
-        return results_by_direction
-    n_old_points, capacity = results_by_direction.n_points, results_by_direction.points.p.shape[1]
-    n_points = n_old_points + np.where(is_branch_extended, new_branch_results.n_points, 0)
-    n_buffer_points = max(int(np.max(n_points)), capacity)
-    # In the joined buffers of a branch, the new points follow the whole buffer of the old points.
-    positions, first_new_position = np.arange(n_buffer_points), n_old_points[:, None]
-    source_positions = np.where(
-        positions < first_new_position, positions, capacity + positions - first_new_position
-    )
-    n_joined_points = capacity + new_branch_results.points.p.shape[1]
-    source_positions = np.minimum(source_positions, n_joined_points - 1)
-    branch_indices = np.arange(len(n_points))[:, None]
-    append_points = lambda points, new_points: np.concatenate([points, new_points], 1)[
-        branch_indices, source_positions
-    ]
-    joined_results: Any = (
-        jax.tree.map(append_points, results_by_direction.points, new_branch_results.points),
-        n_points,
-        np.where(is_branch_extended, new_branch_results.status, results_by_direction.status),
-        results_by_direction.n_linearizations + new_branch_results.n_linearizations,
-    )
-    return ContinuationResult(*joined_results)
+            for (i, track), is_same in zip(
+                found, continuation.is_same_gait(before, after), strict=True
+            ):
+                if is_same:
+                    has_search_failed[i] = False
+                    tracks[i] = track._replace(points=[*tracks[i].points, *track.points])
+    return tracks
 
 
 # Smallest ratio, at a jump, of the steepness of the chord between two points to that of both

@@ -10,8 +10,8 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import SpecialPointCurve
+from vrw_jax.branches.curve_problems import FORCE_QUANTITY_NAMES
 from vrw_jax.branches.curve_tracing import DEFAULT_CURVE_OPTIONS, CurveSeed, CurveTracer
-from vrw_jax.branches.gait_test_functions import FORCE_QUANTITY_NAMES
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.lanes.settings import with_default_jax_settings

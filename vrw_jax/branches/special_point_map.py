@@ -18,8 +18,8 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.branch_location import COARSE_MESH_END_NAME
-from vrw_jax.branches.branch_points import SECOND_PEAK_RATE_NAME
-from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES
+from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES, SECOND_PEAK_RATE_NAME
+from vrw_jax.branches.curve_problems import DLS_VANISHING_NAME, LINEAR_MARGIN_SUBSTITUTES
 from vrw_jax.branches.curve_tracing import (
     DEFAULT_CURVE_OPTIONS,
     CurveSeed,
@@ -27,8 +27,7 @@ from vrw_jax.branches.curve_tracing import (
     TracedCurve,
     compute_distances_to_polyline,
 )
-from vrw_jax.branches.gait_test_functions import DLS_VANISHING_NAME, LINEAR_MARGIN_SUBSTITUTES
-from vrw_jax.branches.sign_changes import BIFURCATION_NAMES
+from vrw_jax.branches.test_functions import BIFURCATIONS
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import MARGIN_MEASURES
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
@@ -47,8 +46,8 @@ margins.
 """
 
 EXPLAINING_CURVE_NAMES: Mapping[str, tuple[str, ...]] = {
-    GAIT_CHANGE_NAME: (*BRANCH_ENDING_QUANTITIES, *BIFURCATION_NAMES),
-    STABILITY_CHANGE_NAME: BIFURCATION_NAMES,
+    GAIT_CHANGE_NAME: (*BRANCH_ENDING_QUANTITIES, *BIFURCATIONS),
+    STABILITY_CHANGE_NAME: tuple(BIFURCATIONS),
     "lambda_4_plus": ("lambda_4_plus", DLS_VANISHING_NAME),
     **{
         substitute_name: (margin_name,)

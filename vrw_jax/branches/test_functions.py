@@ -1,138 +1,154 @@
-"""Continue curves in two parameters on which a test function of fixed points is zero.
+"""Test functions of branches: quantities that vanish, jump or change their value at special points.
 
-Newton's method has the second parameter as an additional unknown, and the test function as an
-additional equation. A curve is then continued by `arclength` in the first parameter. The curve may
-turn back like a branch at a fold.
+`BIFURCATIONS` is the table of the test functions that follow from the Jacobian of the return map.
+Each kind of branch adds test functions for its other quantities, such as margins.
 """
 
-import abc
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
 
-from vrw_jax.base.types import Elementwise, Scalar
-from vrw_jax.branches.arclength import (
-    AbstractContinuationProblem,
-    AbstractSectionStateProblem,
-    NewtonStep,
-    ProblemUnknowns,
-    SectionStateVector,
+from vrw_jax.gaits.floquet import (
+    LOCATED_PAIR_CIRCLE_DISTANCE,
+    MAX_CLOSED_FORM_SIZE,
+    MIN_IMAGINARY_PART,
+    UNIT_CIRCLE_DISTANCE,
+    compute_characteristic_polynomial,
 )
-from vrw_jax.gaits.floquet import compute_bifurcation_margins
-
-ParameterPair = Float[Array, "2"]
-"""Values of the first and the second parameter."""
 
 
-class TestFunctionNewtonStep(NamedTuple):
-    """Newton step at trial unknowns z and trial parameters p, and the value of the test
-    function.
+class TestFunction(NamedTuple):
+    """What it means that a quantity of a branch vanishes or changes, and what follows.
+
+    - `kind`: kind of the `SpecialPoint`;
+    - `meaning`: what happens there;
+    - `ends_branch`: whether the branch ends, because the order of events changes;
+    - `is_stepwise`: whether the quantity has integer values, of which each change is located;
+    - `explains`: kind of a change that is not reported where this quantity vanishes;
+    - `n_multipliers`: number of multipliers that cross the unit circle;
+    - `evaluate`: function of Jacobians (..., n, n), for quantities that follow from them.
     """
 
-    newton_correction: ProblemUnknowns  # of z at fixed p
-    # derivatives dz/dp of the fixed point, with both parameters on a leading axis
-    parameter_tangents: ProblemUnknowns
-    return_map_jacobian: Float[Array, "n n"]  # Jacobian of the return map
-    test_function_value: Scalar  # at the corrected z
-    # total derivatives of the test function with respect to both parameters
-    parameter_gradient: ParameterPair
+    kind: str
+    meaning: str
+    ends_branch: bool = False
+    is_stepwise: bool = False
+    explains: str = ""
+    n_multipliers: int = 0
+    evaluate: Callable[[np.ndarray], np.ndarray] | None = None
 
 
-class AbstractTestFunction(AbstractSectionStateProblem):
-    """Base class of test functions that are evaluated at fixed points, in two parameters.
+def _evaluate_polynomial(jacobians: np.ndarray, argument: float) -> np.ndarray:
+    """Return det(1 - argument * jacobian), by the characteristic polynomial if n is at most 3."""
+    n = jacobians.shape[-1]
+    if n > MAX_CLOSED_FORM_SIZE:
+        return np.linalg.det(np.eye(n) - argument * jacobians)
+    coefficients = compute_characteristic_polynomial(jacobians)
+    return 1.0 + sum(a * argument ** (n - i) for i, a in enumerate(coefficients))
 
-    The argument `z` contains the unknowns of the fixed point. The argument `p` contains the values
-    of the two parameters.
+
+def _evaluate_pair_margin(jacobians: np.ndarray) -> np.ndarray:
+    """Return the product of 1 - z_i z_j over all pairs of multipliers, or NaN if there is none."""
+    n = jacobians.shape[-1]
+    if n == 1:
+        return np.full(jacobians.shape[:-2], np.nan)
+    if n <= MAX_CLOSED_FORM_SIZE:
+        a0, *other_coefficients = compute_characteristic_polynomial(jacobians)
+        if n == 2:
+            return 1.0 - a0
+        a1, a2 = other_coefficients
+        return 1.0 - a0 * a0 - a1 + a0 * a2
+    first, second = np.triu_indices(n, 1)
+    multipliers = compute_multipliers(jacobians)
+    return np.prod(1.0 - multipliers[..., first] * multipliers[..., second], -1).real
+
+
+FOLD, BRANCH_POINT, PERIOD_DOUBLING, NEIMARK_SACKER = (
+    "fold", "branch_point", "period_doubling", "neimark_sacker",
+)  # fmt: skip
+BIFURCATIONS: Mapping[str, TestFunction] = {
+    FOLD: TestFunction(
+        FOLD, "The branch turns back, or crosses another one.", n_multipliers=1,
+        evaluate=lambda jacobians: _evaluate_polynomial(jacobians, 1.0),
+    ),
+    PERIOD_DOUBLING: TestFunction(
+        PERIOD_DOUBLING, "A branch of twice the period begins.", n_multipliers=1,
+        evaluate=lambda jacobians: _evaluate_polynomial(jacobians, -1.0),
+    ),
+    NEIMARK_SACKER: TestFunction(
+        NEIMARK_SACKER, "A closed curve of states begins.", n_multipliers=2,
+        evaluate=_evaluate_pair_margin,
+    ),
+}  # fmt: skip
+"""Bifurcations by name. The margins of the closed forms are the first three Jury margins."""
+
+
+def evaluate_bifurcations(jacobians: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the test functions of `BIFURCATIONS` by name, each of shape (...)."""
+    return {name: test.evaluate(jacobians) for name, test in BIFURCATIONS.items() if test.evaluate}
+
+
+def compute_multipliers(jacobians: np.ndarray) -> np.ndarray:
+    """Return the multipliers in the order of decreasing modulus, NaN if a matrix is not finite."""
+    is_finite = np.isfinite(jacobians).all((-1, -2))[..., None]
+    multipliers = np.linalg.eigvals(np.where(is_finite[..., None], jacobians, 0.0))
+    order = np.argsort(-np.abs(multipliers), -1, kind="stable")
+    return np.where(is_finite, np.take_along_axis(multipliers, order, -1), np.nan)
+
+
+def has_unit_circle_pair(jacobian: np.ndarray) -> bool:
+    """Return whether a complex pair of multipliers lies on the unit circle.
+
+    The test function of the Neimark-Sacker bifurcation also vanishes for two real reciprocal
+    multipliers. Such multipliers are no bifurcation.
     """
-
-    @abc.abstractmethod
-    def linearize(self, args: Any, z: ProblemUnknowns, p: ParameterPair) -> TestFunctionNewtonStep:
-        """Return the Newton step at (z, p). It is not finite if the map is undefined there."""
-
-
-class TestFunctionPoint(NamedTuple):
-    """Unknowns at a point of the curve: those of the fixed point, and the second parameter."""
-
-    z: ProblemUnknowns
-    second_parameter_fraction: Elementwise  # second parameter as a fraction of its range
+    multipliers = compute_multipliers(jacobian)
+    is_complex_pair = np.abs(multipliers.imag) > MIN_IMAGINARY_PART
+    is_on_circle = np.abs(np.abs(multipliers) - 1.0) < LOCATED_PAIR_CIRCLE_DISTANCE
+    return bool(np.any(is_on_circle & is_complex_pair))
 
 
-class TestFunctionCurve(AbstractContinuationProblem):
-    """Continuation problem for the curve on which a test function of two parameters is zero.
+def is_multiplier_change_explained(
+    previous_jacobian: np.ndarray, next_jacobian: np.ndarray, has_parameter_turned_back: bool
+) -> bool:
+    """Return whether bifurcations explain the change of the multipliers between two points.
 
-    The curve is continued in the first parameter. Arc lengths include the second parameter as a
-    fraction of its range. The curve ends when this fraction leaves [0, 1].
+    A continuation step may pass several special points, or may end on a nearby branch. Both change
+    the number of multipliers outside the unit circle, or the sign of the determinant of Newton's
+    equations. On a single branch that sign changes only at folds and branch points.
     """
-
-    test_function: AbstractTestFunction
-    second_parameter_bounds: tuple[float, float] = eqx.field(static=True)  # lower and upper bound
-
-    has_multipliers: ClassVar[bool] = False
-
-    def compute_second_parameter(self, z: TestFunctionPoint) -> Elementwise:
-        """Return the second parameter at a point of the curve."""
-        lower_bound, upper_bound = self.second_parameter_bounds
-        return lower_bound + (upper_bound - lower_bound) * z.second_parameter_fraction
-
-    def linearize(self, args: Any, z: TestFunctionPoint, p: Scalar) -> NewtonStep:
-        parameter_range = self.second_parameter_bounds[1] - self.second_parameter_bounds[0]
-        newton_step = self.test_function.linearize(
-            args, z.z, jnp.stack([p, self.compute_second_parameter(z)])
-        )
-        derivative_by_second_fraction = parameter_range * newton_step.parameter_gradient[1]
-        second_fraction_change = -newton_step.test_function_value / derivative_by_second_fraction
-        second_fraction_tangent = -newton_step.parameter_gradient[0] / derivative_by_second_fraction
-        add_second_tangent = lambda tree, fraction_change: jax.tree.map(
-            lambda leaf, tangents: leaf + parameter_range * fraction_change * tangents[1],
-            tree,
-            newton_step.parameter_tangents,
-        )
-        fixed_point_correction = add_second_tangent(
-            newton_step.newton_correction, second_fraction_change
-        )
-        fixed_point_tangent = add_second_tangent(
-            jax.tree.map(lambda tangents: tangents[0], newton_step.parameter_tangents),
-            second_fraction_tangent,
-        )
-        # The fraction adds a multiplier of zero, which has no effect.
-        padded_return_map_jacobian = jnp.pad(newton_step.return_map_jacobian, (0, 1))
-        return NewtonStep(
-            TestFunctionPoint(fixed_point_correction, second_fraction_change),
-            TestFunctionPoint(fixed_point_tangent, second_fraction_tangent),
-            padded_return_map_jacobian,
-        )
-
-    def section_state(self, z: TestFunctionPoint) -> SectionStateVector:
-        return jnp.append(self.test_function.section_state(z.z), z.second_parameter_fraction)
-
-    def correction_norm(self, z: TestFunctionPoint, correction: TestFunctionPoint) -> Scalar:
-        return jnp.maximum(
-            self.test_function.correction_norm(z.z, correction.z),
-            jnp.abs(correction.second_parameter_fraction),
-        )
-
-    def is_admissible(self, args: Any, z: TestFunctionPoint, p: Scalar) -> Bool[Array, ""]:
-        is_inside_parameter_range = (z.second_parameter_fraction >= 0.0) & (
-            z.second_parameter_fraction <= 1.0
-        )
-        return is_inside_parameter_range & self.test_function.is_admissible(
-            args, z.z, jnp.stack([p, self.compute_second_parameter(z)])
-        )
+    jacobians = np.stack([previous_jacobian, next_jacobian])
+    has_sign_change = {
+        name: bool(values[0] * values[1] < 0.0)
+        for name, values in evaluate_bifurcations(jacobians).items()
+    }
+    n_explained = sum(
+        test.n_multipliers for name, test in BIFURCATIONS.items() if has_sign_change[name]
+    )
+    moduli = np.abs(compute_multipliers(jacobians))
+    (least_before, least_after), (most_before, most_after) = (
+        np.sum(moduli > 1.0 + distance, -1)
+        for distance in (UNIT_CIRCLE_DISTANCE, -UNIT_CIRCLE_DISTANCE)
+    )
+    n_changed = max(least_after - most_before, least_before - most_after)
+    return has_sign_change[FOLD] == has_parameter_turned_back and bool(n_changed <= n_explained)
 
 
-JURY_MARGIN_OFFSET = 1e-6
-"""Value that the margin to the fold has on the curve by which the fold is represented.
+def classify_multipliers(
+    jacobian: np.ndarray, ranks: range, has_parameter_turned: bool
+) -> dict[str, int]:
+    """Return the number of multipliers for each bifurcation, by the name of the bifurcation.
 
-The value is above zero, because the equations are singular at the fold. It is small, because the
-error of the parameters is the square of the value.
-"""
-
-
-def compute_offset_bifurcation_margins(return_map_jacobian: Float[Array, "n n"]) -> Array:
-    """Return the bifurcation margins, with the margin to the fold reduced by
-    `JURY_MARGIN_OFFSET`.
+    - `ranks`: ranks by modulus of the multipliers on the unit circle;
+    - `has_parameter_turned`: whether the parameter changes its direction at the point. A multiplier
+      of 1 is then that of a fold, and otherwise that of a branch point.
     """
-    return compute_bifurcation_margins(return_map_jacobian).at[0].add(-JURY_MARGIN_OFFSET)
+    multipliers = compute_multipliers(jacobian)[list(ranks)]
+    is_complex = np.abs(multipliers.imag) > MIN_IMAGINARY_PART
+    counts = {
+        FOLD if has_parameter_turned else BRANCH_POINT: ~is_complex & (multipliers.real > 0.0),
+        PERIOD_DOUBLING: ~is_complex & (multipliers.real < 0.0),
+        NEIMARK_SACKER: is_complex,
+    }
+    return {name: int(np.sum(mask)) for name, mask in counts.items() if np.any(mask)}

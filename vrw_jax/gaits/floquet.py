@@ -9,13 +9,13 @@ of the matrix entries and always differentiable.
 import functools
 import itertools
 import operator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Inexact
 
 from vrw_jax.lanes.autodiff import compute_square_root
 
@@ -47,7 +47,9 @@ EQUAL_MODULI_DISTANCE = 1e-6
 """
 
 
-def compute_characteristic_polynomial(matrix: RealSquareMatrix) -> tuple[Array, ...]:
+def compute_characteristic_polynomial(
+    matrix: Inexact[Array | np.ndarray, "... n n"],
+) -> tuple[Any, ...]:
     """Return the coefficients (a_0, ..., a_{n-1}) of det(z - matrix) = z^n + ... + a_1 z + a_0."""
     n = matrix.shape[-1]
     if matrix.shape[-2:] != (n, n) or n not in (1, 2, 3):

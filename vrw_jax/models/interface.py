@@ -209,6 +209,13 @@ class AbstractWheel(eqx.Module):
         model's counterpart of `StepResult`. The results are differentiable in any mode.
         """
 
+    def take_steps(self, params: WheelParams, x: np.ndarray, options: StepOptions) -> Any:
+        """Return the steps of a batch of wheels, whose arrays have the batch on their first axis.
+
+        The function is not traced by JAX, and returns NumPy arrays.
+        """
+        return jax.tree.map(np.asarray, _take_steps(self, params, x, options))
+
     def measure_force_peaks(
         self, params: WheelParams, x: SectionState, options: StepOptions
     ) -> dict[str, Array]:
@@ -326,6 +333,12 @@ class AbstractWheel(eqx.Module):
         `x` may be the paper's section state, which has three entries.
         """
         return x
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(None, 0, 0, None))
+def _take_steps(model: AbstractWheel, params: WheelParams, x: Array, options: StepOptions) -> Any:
+    return model.take_step(params, x, options)
 
 
 def complete_ground_line_slopes(slope: Array, n_steps: int) -> Array:

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax import lanes
@@ -150,6 +151,15 @@ class ViscoelasticWheel(AbstractWheel):
 
     def take_step(self, params: WheelParams, x: SectionState, options: StepOptions) -> StepResult:
         return _compute_step(self, params, x, options, True)
+
+    def take_steps(self, params: WheelParams, x: np.ndarray, options: StepOptions) -> Any:
+        if not can_use_batch_kernel(options):
+            return super().take_steps(params, x, options)
+        params = self.attach_leg_force(params)
+        run_steps = _compile_lane_steps(self.stop_at_lift_off, self.friction).run
+        to_lanes_last = lambda leaf: np.ascontiguousarray(np.moveaxis(np.asarray(leaf), 0, -1))
+        steps = run_steps(*jax.tree.map(to_lanes_last, (params, x)), options)
+        return jax.tree.map(lambda leaf: np.moveaxis(leaf, -1, 0), steps)
 
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
@@ -292,6 +302,14 @@ def take_steps_of_lanes(
     return with_batched_jvp(
         lambda phase_sequence: make_step_result(phase_sequence, friction, "lanes")
     )(float_phase_sequence)
+
+
+@functools.cache
+def _compile_lane_steps(stop_at_lift_off: bool, friction: float) -> Any:
+    """Return steps with margins for NumPy arrays with lanes on the last axis."""
+    return lanes.compile_batch_function(
+        functools.partial(take_steps_of_lanes, stop_at_lift_off, friction)
+    )
 
 
 def _make_column_function(

@@ -1,4 +1,4 @@
-"""Find sign changes of quantities on a branch, and locate them exactly.
+"""Locate roots and jumps of functions in brackets, many at once.
 
 All brackets are searched in one batch. Each round evaluates the quantities once for all brackets.
 """
@@ -6,69 +6,12 @@ All brackets are searched in one batch. Each round evaluates the quantities once
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-
-from vrw_jax.gaits.floquet import (
-    LOCATED_PAIR_CIRCLE_DISTANCE,
-    MIN_IMAGINARY_PART,
-    compute_bifurcation_margins,
-    floquet_multipliers,
-)
-
-BIFURCATION_NAMES = ("fold", "period_doubling", "neimark_sacker")
-"""Names of the bifurcations. A multiplier is 1 at a fold and -1 at a period doubling; a pair of
-multipliers has modulus 1 at a Neimark-Sacker bifurcation.
-"""
-
 
 MAX_ROUNDS_PER_SMOOTH_BRACKET = 12
 """Number of rounds after which an unresolved bracket is treated as a jump."""
 N_PARTS_PER_JUMP_BRACKET = 9
 """Number of equal sections into which each round divides a bracket that contains a jump."""
-
-
-def evaluate_bifurcation_functions(return_map_jacobians: np.ndarray) -> np.ndarray:
-    """Evaluate the test functions of the bifurcations in `BIFURCATION_NAMES`, shape (..., 3).
-
-    `return_map_jacobians` has the shape (..., n, n). A value is NaN if a matrix of size n cannot
-    have that bifurcation.
-    """
-    bifurcation_margin_values = np.asarray(
-        compute_bifurcation_margins(jnp.asarray(return_map_jacobians))
-    )
-    bifurcation_values = np.full(
-        (*bifurcation_margin_values.shape[:-1], len(BIFURCATION_NAMES)), np.nan
-    )
-    bifurcation_values[..., : bifurcation_margin_values.shape[-1]] = bifurcation_margin_values
-    return bifurcation_values
-
-
-def has_unit_circle_pair(return_map_jacobian: np.ndarray) -> bool:
-    """Return whether a complex pair of multipliers lies on the unit circle.
-
-    The test function of the Neimark-Sacker bifurcation also vanishes for two real reciprocal
-    multipliers. Such multipliers are no bifurcation.
-    """
-    multipliers = np.asarray(floquet_multipliers(jnp.asarray(return_map_jacobian)))
-    is_complex_pair = np.abs(multipliers.imag) > MIN_IMAGINARY_PART
-    is_on_circle = np.abs(np.abs(multipliers) - 1.0) < LOCATED_PAIR_CIRCLE_DISTANCE
-    return bool(np.any(is_on_circle & is_complex_pair))
-
-
-def find_sign_changes(quantity_values: np.ndarray) -> list[tuple[int, int, int]]:
-    """Return the sign changes of each quantity between neighboring points.
-
-    A sign change consists of the indices of the two points and of the quantity. `quantity_values`
-    has the shape (points, quantities). NaN and 0 have no sign. Two sign changes between the same
-    neighboring points cancel, and neither is detected.
-    """
-    quantity_signs = np.sign(np.nan_to_num(quantity_values))
-    sign_change_indices = np.argwhere(quantity_signs[:-1] * quantity_signs[1:] < 0.0)
-    return [
-        (int(point_index), int(point_index) + 1, int(quantity_index))
-        for point_index, quantity_index in sign_change_indices
-    ]
 
 
 class RootLocations(NamedTuple):

@@ -1,0 +1,444 @@
+"""Continue curves of special points in two parameters, as branches of an extended system.
+
+The extended system has the second parameter as an additional unknown, and a test function of the
+special point as an additional equation. One call of machine code computes Newton's correction, the
+tangents, the quantities of a collocated gait and their derivatives. Event-driven steps compute the
+margins that the collocation does not determine.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.branches.arclength import (
+    AbstractContinuationProblem,
+    ContinuationPoint,
+    NewtonStep,
+)
+from vrw_jax.branches.branch_location import QuantitiesByName
+from vrw_jax.branches.continuation import (
+    DOUBLE_SUPPORT_INDICATOR_NAMES,
+    SECOND_PEAK_RATE_NAME,
+    GaitContinuation,
+)
+from vrw_jax.branches.continuation_problems import (
+    BranchWheel,
+    CollocationProblem,
+    make_trial_linearizer,
+)
+from vrw_jax.branches.test_functions import BIFURCATIONS, FOLD, evaluate_bifurcations
+from vrw_jax.gaits.collocation_search import CollocationSystem
+from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration
+from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.models.measures import MARGIN_MEASURES
+from vrw_jax.wheel import transitions
+from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.phases import PhaseInstant, make_paper_phases
+
+
+class TwoParameterStep(NamedTuple):
+    """Newton steps at trial points in two parameters, and the test function there."""
+
+    newton_correction: np.ndarray  # of z at fixed parameters, (points, unknowns)
+    tangents: np.ndarray  # derivatives of z by both parameters, (points, 2, unknowns)
+    return_map_jacobian: np.ndarray
+    test_value: np.ndarray  # at the corrected z, (points,)
+    test_gradient: np.ndarray  # total derivatives by both parameters, (points, 2)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AbstractCurveProblem(AbstractContinuationProblem):
+    """Continuation problem for the curve on which a test function of two parameters is zero.
+
+    The curve is continued in the first parameter, and turns back like a branch at a fold. The
+    unknowns begin with the second parameter as a fraction of its range, and then those of the fixed
+    point. The curve ends when this fraction leaves [0, 1].
+    """
+
+    second_bounds: tuple[float, float]
+
+    has_multipliers: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def linearize_in_two_parameters(
+        self, args: Any, z: np.ndarray, p: np.ndarray
+    ) -> TwoParameterStep:
+        """Return the Newton steps at fixed points z and parameters p, shape (points, 2)."""
+
+    def compute_second_parameter(self, y: np.ndarray) -> np.ndarray:
+        """Return the second parameter at points of the curve."""
+        lower_bound, upper_bound = self.second_bounds
+        return lower_bound + (upper_bound - lower_bound) * y[..., 0]
+
+    def linearize(self, args: Any, y: np.ndarray, p: np.ndarray) -> NewtonStep:
+        step = self.linearize_in_two_parameters(
+            args, y[:, 1:], np.stack([p, self.compute_second_parameter(y)], 1)
+        )
+        parameter_range = self.second_bounds[1] - self.second_bounds[0]
+        by_fraction = parameter_range * step.test_gradient[:, 1:]
+        changes = (
+            (-step.test_value[:, None] / by_fraction, step.newton_correction),
+            (-step.test_gradient[:, :1] / by_fraction, step.tangents[:, 0]),
+        )
+        correction, tangent = (
+            np.concatenate([fraction, z + parameter_range * fraction * step.tangents[:, 1]], 1)
+            for fraction, z in changes
+        )
+        # The fraction adds a multiplier of zero, which has no effect.
+        jacobian = np.pad(step.return_map_jacobian, ((0, 0), (0, 1), (0, 1)))
+        return NewtonStep(correction, tangent, jacobian)
+
+    def is_admissible(self, args: Any, y: np.ndarray, p: float) -> bool:
+        return super().is_admissible(args, y, p) and bool(0.0 <= y[0] <= 1.0)
+
+
+FOLD_MARGIN_OFFSET = 1e-6
+"""Value that the margin to the fold has on the curve by which the fold is represented.
+
+The value is above zero, because the equations are singular at the fold. It is small, because the
+error of the parameters is the square of the value.
+"""
+
+COMPLEX_STEP = 1e-30
+"""Imaginary step of derivatives of polynomials, which have no round-off of differences."""
+
+
+def stack_bifurcation_margins(jacobians: np.ndarray) -> np.ndarray:
+    """Return the test functions of the bifurcations on the last axis, with that of the fold reduced
+    by `FOLD_MARGIN_OFFSET`.
+    """
+    margins = evaluate_bifurcations(jacobians)
+    return np.stack([*(margins | {FOLD: margins[FOLD] - FOLD_MARGIN_OFFSET}).values()], -1)
+
+
+LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_substitutes
+"""Names of margins that vanish as a cube. Each margin is mapped to a quantity that vanishes
+linearly at the same point.
+"""
+
+DISCONTINUOUS_QUANTITIES = (*DOUBLE_SUPPORT_INDICATOR_NAMES, "duration_sls1", "duration_sls2")
+"""Names of the quantities that make the gait step discontinuous if they vanish. The measures of the
+step are then undefined.
+"""
+
+DLS_VANISHING_NAME = "duration_dls"
+"""Name of the special point at which the duration of double support vanishes.
+
+At that point the rear foot's force is zero and decreases. Where `lambda_4_plus` vanishes, the force
+is zero and increases, and the gait jumps.
+"""
+
+INITIAL_FORCE_FALL_NAME = "fall of the rear foot's force at first"
+"""Name of the rate at which the rear foot's force first decreases, N/s.
+
+The rate is positive on the curve of `DLS_VANISHING_NAME`. The curve ends where the rate is zero.
+"""
+
+MEAN_FORCE_FALL_NAME = "its mean fall in double support"
+"""Name of the mean rate at which the rear foot's force decreases in double support, N/s.
+
+The rate is zero on the curve of `lambda_4_plus`. It is not zero on the curve of
+`DLS_VANISHING_NAME`, which otherwise satisfies the same equations.
+"""
+
+CONTINUED_QUANTITIES = (
+    *DISCONTINUOUS_QUANTITIES,
+    *LINEAR_MARGIN_SUBSTITUTES.values(),
+    INITIAL_FORCE_FALL_NAME,
+    MEAN_FORCE_FALL_NAME,
+)
+"""Names of quantities of the collocated gait that are defined on both sides of a special point."""
+
+
+FORCE_QUANTITY_NAMES = (SECOND_PEAK_RATE_NAME,)
+"""Names of quantities of the gait's force, whose extrema are located on its collocation."""
+
+
+def select_test_quantity(special_point_name: str, has_double_support: bool) -> str:
+    """Return the name of the quantity that vanishes at the named special point.
+
+    The quantity depends on whether the gait has double support.
+    """
+    if special_point_name == "lambda_4_plus" and has_double_support:
+        return MEAN_FORCE_FALL_NAME
+    return (
+        "lambda_4_plus"
+        if special_point_name == DLS_VANISHING_NAME
+        else LINEAR_MARGIN_SUBSTITUTES.get(special_point_name, special_point_name)
+    )
+
+
+def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]:
+    """Return the names of all quantities that are evaluated together with `quantity_name`."""
+    leg_suffixes = [f"[{leg_number}]" for leg_number in range(3, n_legs + 1)]
+    step_quantity_names = tuple(
+        margin_name + leg_suffix
+        for margin_name, margin_measure in MARGIN_MEASURES.items()
+        for leg_suffix in (leg_suffixes if margin_measure.leg_dimension else [""])
+        if margin_name not in CONTINUED_QUANTITIES
+    )
+    quantity_groups = (
+        tuple(BIFURCATIONS),
+        CONTINUED_QUANTITIES,
+        FORCE_QUANTITY_NAMES,
+        step_quantity_names,
+    )
+    return next(
+        quantity_group
+        for quantity_group in quantity_groups
+        if select_test_quantity(quantity_name, True) in quantity_group
+    )
+
+
+class CurveWheel(NamedTuple):
+    """Wheels on curves of special points, and the index of the quantity that vanishes on each."""
+
+    branch_wheel: BranchWheel
+    quantity_index: np.ndarray
+
+
+# Largest round-off of a duration that is zero on a whole curve, s.
+MAX_DURATION_ROUNDOFF_S = 1e-9
+# Finite difference of the section state and of the relative parameters, for derivatives of
+# quantities that an event-driven step determines.
+RELATIVE_DIFFERENCE_STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GaitCurveProblem(AbstractCurveProblem):
+    """Problem of the curves of special points of gaits that collocation finds.
+
+    - `gait_problem`: problem of the gaits in the first parameter;
+    - `second_name`: name of the second parameter;
+    - `quantity_names`: names of the quantities in one group, which are evaluated together.
+    """
+
+    gait_problem: CollocationProblem
+    second_name: str
+    quantity_names: tuple[str, ...]
+
+    @property
+    def second_index(self) -> int:
+        """Return the index of the second parameter."""
+        return self.gait_problem.model.parameter_names.index(self.second_name)
+
+    def replace_second(self, wheels: BranchWheel, second: np.ndarray) -> BranchWheel:
+        """Return the wheels with other values of the second parameter."""
+        values = np.array(wheels.values)
+        values[:, self.second_index] = second
+        return wheels._replace(values=values)
+
+    def linearize_in_two_parameters(
+        self, wheels: CurveWheel, z: np.ndarray, p: np.ndarray
+    ) -> TwoParameterStep:
+        gaits, rows = self.gait_problem, np.arange(len(z))
+        branch_wheels = self.replace_second(wheels.branch_wheel, p[:, 1])
+        linearize_trials = make_trial_linearizer(
+            gaits.collocation_system,
+            (gaits.parameter_index, self.second_index),
+            QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names),
+        )
+        correction, tangents, monodromy, *quantities = linearize_trials(
+            gaits.replace_parameter(branch_wheels, p[:, 0]),
+            branch_wheels.is_phase_active,
+            gaits.unpack(z),
+        )
+        correction = gaits.pack(correction)
+        tangents = np.stack(
+            [gaits.pack(jax.tree.map(lambda x, i=i: x[:, i], tangents)) for i in range(2)], 1
+        )
+        if quantities:
+            values, rates = quantities  # The first rate is along the correction.
+            if self.quantity_names == tuple(BIFURCATIONS):
+                trials = values[:, None] + 1j * COMPLEX_STEP * rates
+                rates = stack_bifurcation_margins(trials).imag / COMPLEX_STEP
+                values = stack_bifurcation_margins(values)
+            values, gradient = values + rates[:, 0], rates[:, 1:]
+        else:
+            values, gradient = self._differentiate_step_quantities(
+                branch_wheels, z + correction, p, correction, tangents
+            )
+        index = wheels.quantity_index
+        return TwoParameterStep(
+            correction, tangents, monodromy, values[rows, index], gradient[rows, :, index]
+        )
+
+    def _differentiate_step_quantities(
+        self,
+        wheels: BranchWheel,
+        z: np.ndarray,
+        p: np.ndarray,
+        correction: np.ndarray,
+        tangents: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the step's quantities at corrected gaits z, and their derivatives by p.
+
+        Newton's method requires only a few digits of the derivatives. Finite differences of gait
+        steps are cheaper than automatic derivatives, and use the same machine code. Near a fold the
+        tangents and the correction grow without bound and become parallel. The differences are
+        therefore taken in the directions of an orthonormal basis of the tangents' plane. They start
+        from the point of that plane that is nearest to the trial.
+        """
+        section_state, n = self.gait_problem.section_state, len(p)
+        scaled_tangents = np.concatenate(
+            [p[:, :, None] * section_state(tangents), np.broadcast_to(np.eye(2), (n, 2, 2))], 2
+        )
+        basis, factor = np.linalg.qr(np.swapaxes(scaled_tangents, 1, 2))
+        coefficients = p[:, :, None] * np.linalg.inv(factor)
+        start = np.einsum("nki,nk->ni", basis[:, :-2], section_state(correction))
+        offsets = RELATIVE_DIFFERENCE_STEP * np.eye(3, 2, -1)
+        changes = np.einsum("nij,nkj->nki", coefficients, offsets - start[:, None])
+        trials = z[:, None] + changes @ tangents
+        repeated = jax.tree.map(lambda x: np.repeat(x, 3, 0), wheels)
+        quantities = self.measure_step_quantities(
+            repeated, trials.reshape(3 * n, -1), (p[:, None] + changes).reshape(3 * n, 2)
+        ).reshape(n, 3, -1)
+        rates = (quantities[:, 1:] - quantities[:, :1]) / RELATIVE_DIFFERENCE_STEP
+        gradient = np.swapaxes(factor, 1, 2) @ rates / p[:, :, None]
+        return quantities[:, 0] + np.einsum("ni,niq->nq", start, rates), gradient
+
+    def measure_step_quantities(
+        self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray
+    ) -> np.ndarray:
+        """Return the quantities of gaits that the collocation equations do not contain.
+
+        They are either those of the gait's force, or those of an event-driven step that starts from
+        the gait. The last axis has the order of `quantity_names`.
+        """
+        wheels, gaits = self.replace_second(wheels, p[:, 1]), self.gait_problem
+        if self.quantity_names == FORCE_QUANTITY_NAMES:
+            gaits = dataclasses.replace(gaits, measures_force_peaks=True)
+            measures = gaits.read_gaits(wheels, gaits.replace_parameter(wheels, p[:, 0]), z)[1]
+        else:
+            points = ContinuationPoint(z, p[:, 0], z, p[:, 0], z, p[:, 0])
+            measures = gaits.measure_gaits(wheels, points)
+        names_and_legs = [name.partition("[")[::2] for name in self.quantity_names]
+        columns = [
+            measures[name][:, int(leg[:-1]) - 3] if leg else measures[name]
+            for name, leg in names_and_legs
+        ]
+        return np.stack(columns, -1)
+
+    def measure_gaits(self, wheels: CurveWheel, points: ContinuationPoint) -> QuantitiesByName:
+        """Return the quantities of the gaits at points of curves, see `GaitContinuation`."""
+        gait_wheels = self.replace_second(
+            wheels.branch_wheel, self.compute_second_parameter(points.z)
+        )
+        return self.gait_problem.measure_gaits(gait_wheels, points._replace(z=points.z[:, 1:]))
+
+    def section_state(self, y: np.ndarray) -> np.ndarray:
+        return y[..., : 1 + self.gait_problem.shapes[0][0]]
+
+    def correction_norm(self, y: np.ndarray, correction: np.ndarray) -> float:
+        return max(abs(correction[0]), self.gait_problem.correction_norm(y[1:], correction[1:]))
+
+    def is_admissible(self, wheel: CurveWheel, y: np.ndarray, p: float) -> bool:
+        durations = self.gait_problem.unpack(y[1:]).durations
+        is_inactive = wheel.branch_wheel.is_phase_active < 0.5
+        return super().is_admissible(wheel, y, p) and bool(
+            np.all((durations > -MAX_DURATION_ROUNDOFF_S) | is_inactive)
+        )
+
+
+# Number of Newton iterations for a point of codimension two.
+N_CODIM2_ITERATIONS = 8
+
+
+def locate_jump_onset(
+    problem: GaitCurveProblem, wheels: BranchWheel, z: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Locate the two parameters at which `DLS_VANISHING_NAME` meets `lambda_4_plus`.
+
+    Return the parameters and their last relative change. The search starts from a nearby gait and
+    its parameters. If the duration of double support is zero, the equations of both curves are
+    singular. The search therefore uses the equations for the gait without double support, which are
+    regular. The rear foot's force and its rate must be zero.
+    """
+    # One row for each of the two equations.
+    solution = problem.gait_problem.unpack(np.repeat(z[None], 2, 0))
+    solution.durations[:, 0, 0] = 0.0
+    z = problem.gait_problem.pack(solution)
+    values, is_phase_active = (np.repeat(np.asarray(x)[None], 2, 0) for x in wheels)
+    is_phase_active[:, 0, 0] = 0.0
+    names = ("lambda_4_plus", INITIAL_FORCE_FALL_NAME)
+    curve_wheels = CurveWheel(
+        BranchWheel(values, is_phase_active),
+        np.array([CONTINUED_QUANTITIES.index(name) for name in names]),
+    )
+    relative_change = np.inf
+    for _ in range(N_CODIM2_ITERATIONS):
+        step = problem.linearize_in_two_parameters(curve_wheels, z, np.repeat(p[None], 2, 0))
+        change = -np.linalg.solve(step.test_gradient, step.test_value)
+        relative_change = float(np.max(np.abs(change / p)))
+        z = z + step.newton_correction + np.einsum("i,niu->nu", change, step.tangents)
+        p = p + change
+    return p, relative_change
+
+
+def _stack_continued_quantities(
+    collocation_system: CollocationSystem,
+    parameters: Array,
+    is_phase_active: Array,
+    z: CollocationSolution,
+) -> Array:
+    """Return the values of `CONTINUED_QUANTITIES` for a collocated gait, in their order."""
+    wheel_symbols = collocation_system.make_wheel(parameters).symbols()
+    (phase_points,) = collocation_system.evaluate_phase_points(parameters, z)
+    return jnp.stack(list(compute_continued_quantities(wheel_symbols, phase_points, z).values()))
+
+
+def compute_continued_quantities(
+    wheel_symbols: Symbols, phase_points: Any, z: CollocationSolution
+) -> dict[str, Array]:
+    """Return the `CONTINUED_QUANTITIES` of a gait step by name, computed from the points of its
+    phases.
+    """
+    (dls_start, _, dls_end), sls1_phase_points, (_, _, sls2_end) = phase_points
+    landing_result = transitions.resolve_landing(wheel_symbols, sls2_end.q[0], *sls2_end.v)
+    fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing_result)
+    takeoff_acceleration = compute_takeoff_acceleration(wheel_symbols, sls1_phase_points)
+    dls_duration, *single_support_durations = z.durations[0]
+    dls_phase, *_ = make_paper_phases(
+        wheel_symbols, dls_start.held_constants[0], stop_at_lift_off=False
+    )
+
+    def make_dls_instant(theta: Array, dtheta: Array) -> PhaseInstant:
+        return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)))
+
+    compute_rear_force = lambda *dls_state: dls_phase.compute_end_guard(
+        make_dls_instant(*dls_state)
+    )
+    start_state = *dls_start.q, *dls_start.v
+    dls_state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
+    initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, dls_state_rates)
+    mean_decrease_rate = (
+        initial_rear_force - compute_rear_force(*dls_end.q, *dls_end.v)
+    ) / jnp.where(dls_duration == 0.0, 1.0, dls_duration)
+    quantity_values = (
+        landing_result.rear_impulse.normal,
+        fore_force.normal,
+        rear_force.normal,
+        *single_support_durations,
+        takeoff_acceleration,
+        -rear_force_rate,
+        mean_decrease_rate,
+    )
+    return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
+
+
+QUANTITY_FUNCTION_BY_GROUP = {
+    CONTINUED_QUANTITIES: _stack_continued_quantities,
+    tuple(BIFURCATIONS): lambda collocation_system, parameters, is_phase_active, z: (
+        collocation_system.linearize_at(parameters, z, is_phase_active).monodromy
+    ),
+}
+"""Function that computes a group of quantities without an event-driven step, by the names in the
+group.
+"""
