@@ -11,7 +11,8 @@ from vrw_jax.base.parameters import parameter
 from vrw_jax.base.start import start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
-from vrw_jax.branches.continuation import continue_branch, continue_branches, continue_map
+from vrw_jax.branches.continuation import continue_branch, continue_branches
+from vrw_jax.branches.map_branch import continue_map
 from vrw_jax.branches.special_point_curves import continue_special_point
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point

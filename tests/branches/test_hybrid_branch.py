@@ -34,6 +34,26 @@ def test_the_simplest_walker_doubles_its_period_near_the_slope_of_its_paper():
     )
     # A multiplier moves by 1e2 per unit of slope, and the slope is known to 1e-9 of its range.
     assert np.min(np.abs(np.asarray(doubled.multipliers) + 1.0)) < 1e-8
+    two_steps = vrw.continue_branch(
+        {"slope": 0.009},
+        "slope",
+        (0.006, 0.018),
+        model=SIMPLEST_WALKER,
+        cycle=gait,
+        step_options=tight,
+        switch_at=doubling,
+    )
+    (second_doubling,) = two_steps.special_points
+    assert second_doubling.kind == "period_doubling"
+    four = vrw.limit_cycle(
+        {"slope": second_doubling.value},
+        model=SIMPLEST_WALKER,
+        guess=second_doubling.point.section_state,
+        period_n=2,
+        options=tight,
+    )
+    assert np.min(np.abs(np.asarray(four.multipliers) + 1.0)) < 1e-7
+    np.testing.assert_allclose(four.section_state, second_doubling.cycle.section_state, atol=1e-8)
 
 
 def test_a_rimless_wheel_of_a_user_has_the_speeds_of_its_closed_form_along_the_slope():
@@ -67,3 +87,156 @@ def test_a_rimless_wheel_of_a_user_has_the_speeds_of_its_closed_form_along_the_s
     np.testing.assert_allclose(branch.dataset.x.values[:, 0], rates, rtol=1e-9)
     with pytest.raises(ValueError, match="choose from gravity, wheel"):
         vrw.continue_branch(params, "incline", (0.15, 0.3), model=wheel, cycle=gait)
+
+
+# A ball on a table that moves as A sin(2 pi t / T), and an oscillator with a stop -----------------
+
+TIGHT = vrw.StepOptions.tight()
+TABLE_RATE = 2.0 * np.pi  # rad/s, for a period of 1 s
+RESTITUTION, GRAVITY = 0.8, 9.81
+
+
+def table_height(phase, p):
+    return p["amplitude"] * jnp.sin(TABLE_RATE * phase)
+
+
+def bounce(y, p):
+    table_speed = p["amplitude"] * TABLE_RATE * jnp.cos(TABLE_RATE * y[2])
+    speed = (1.0 + RESTITUTION) * table_speed - RESTITUTION * y[1]
+    return jnp.stack([y[0], speed, y[2] - 1.0])
+
+
+BALL = HybridSystem(
+    modes={
+        "flight": Mode(
+            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1], 1.0 + 0.0 * y[2]]),
+            {"impact": Guard(lambda y, p: y[0] - table_height(y[2], p), bounce)},
+        )
+    },
+    section="impact",
+    state=("height", "speed", "phase"),
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([table_height(x[1], p), x[0], x[1]]),
+)
+
+
+def continue_ball(**keywords):
+    """From the orbit of one impact per period at the amplitude 0.15 m, whose phase is known."""
+    params = {"amplitude": 0.15}
+    speed = 0.5 * GRAVITY
+    cosine = speed * (1.0 - RESTITUTION) / (1.0 + RESTITUTION) / (0.15 * TABLE_RATE)
+    gait = vrw.limit_cycle(
+        params, model=BALL, guess=[speed, np.arccos(cosine) / TABLE_RATE], options=TIGHT
+    )
+    return vrw.continue_branch(
+        params, "amplitude", (0.05, 0.32), model=BALL, cycle=gait, step_options=TIGHT, **keywords
+    )
+
+
+def test_a_ball_on_a_moving_table_has_the_fold_and_the_doubling_of_its_closed_form():
+    """Holmes (1982): orbits of one impact per period exist if the impact speed fits the table's."""
+    branch = continue_ball()
+    amplitude_rate = GRAVITY * (1.0 - RESTITUTION) / (2.0 * (1.0 + RESTITUTION))
+    fold, doubling = sorted(branch.special_points, key=lambda point: point.value)
+    assert (fold.kind, doubling.kind) == ("fold", "period_doubling")
+    assert abs(fold.value - amplitude_rate / TABLE_RATE) < 1e-12
+    # A multiplier is -1 where the table's acceleration at the impact is 2 (1 + e²)/(1 + e)² g.
+    table_acceleration = 2.0 * (1.0 + RESTITUTION**2) / (1.0 + RESTITUTION) ** 2 * GRAVITY
+    expected = np.hypot(amplitude_rate * TABLE_RATE, table_acceleration) / TABLE_RATE**2
+    assert abs(doubling.value - expected) < 1e-9
+    assert branch.dataset.period.values == pytest.approx(1.0, abs=1e-9)
+    doubled = continue_ball(switch_at=doubling)
+    assert doubled.ends[0] == "It begins on another branch."
+    assert doubled.values[0] - doubling.value < 1e-5
+    assert doubled.stable[:5].all()
+    assert doubled.dataset.period.values == pytest.approx(2.0, abs=1e-9)
+    speeds = doubled.dataset.x.values[-1]
+    once = BALL.step({"amplitude": float(doubled.values[-1])}, speeds, TIGHT).section_state
+    assert np.max(np.abs(np.asarray(once) - speeds)) > 0.1  # not of one impact per period
+    with pytest.raises(ValueError, match="a branch_point or a period_doubling"):
+        continue_ball(switch_at=fold)
+
+
+def make_oscillator(has_stop):
+    """x'' + 0.1 x' + x = A cos(w t), with a stop at x = 1 or without."""
+    swing = lambda y, p: jnp.stack(
+        [y[1], p["A"] * jnp.cos(y[2]) - y[0] - 0.1 * y[1], p["w"] + 0.0 * y[2]]
+    )
+    guards = {
+        "period": Guard(
+            lambda y, p: 2.0 * jnp.pi - y[2],
+            lambda y, p: jnp.stack([y[0], y[1], y[2] - 2.0 * jnp.pi]),
+        ),
+        "stop": Guard(lambda y, p: 1.0 - y[0], lambda y, p: jnp.stack([y[0], -0.8 * y[1], y[2]])),
+    }
+    return HybridSystem(
+        modes={"free": Mode(swing, guards if has_stop else {"period": guards["period"]})},
+        section="period",
+        state=("x", "v", "phase"),
+        project=lambda y, p: y[:2],
+        embed=lambda x, p: jnp.stack([x[0], x[1], 0.0 * x[0]]),
+        max_events=4,
+    )
+
+
+@pytest.mark.parametrize("has_stop", [False, True])
+@pytest.mark.parametrize("rate", [0.7, 1.6])
+def test_an_oscillator_touches_its_stop_at_the_amplitude_of_the_linear_equation(has_stop, rate):
+    """Without the stop the branch goes on; with it, no step passes the touch, however short."""
+    amplitude = np.hypot(1.0 - rate**2, 0.1 * rate)
+    oscillator = make_oscillator(has_stop)
+    params = {"A": 0.5 * amplitude, "w": rate}
+    gait = vrw.limit_cycle(params, model=oscillator, guess=[0.3, 0.0], options=TIGHT)
+    branch = vrw.continue_branch(
+        params,
+        "A",
+        (0.4 * amplitude, 1.1 * amplitude),
+        model=oscillator,
+        cycle=gait,
+        step_options=TIGHT,
+        margins={"distance to the stop": lambda y, p: 1.0 - y[0]},
+    )
+    (touch,) = branch.special_points
+    assert (touch.kind, touch.name) == ("border_collision", "distance to the stop")
+    assert touch.ends_branch == has_stop
+    assert abs(touch.value - amplitude) < 1e-12
+    distance = branch.dataset["distance to the stop"].values
+    np.testing.assert_allclose(distance, 1.0 - branch.values / amplitude, atol=1e-9)
+
+
+def test_the_sequence_of_events_changes_where_a_second_leg_touches():
+    """A point falls through two levels; the order of their guards changes at equal heights."""
+    fall = lambda y, p: jnp.stack([1.0 + 0.0 * y[0], -y[1]])
+    keep = lambda y, p: y
+    clock = HybridSystem(
+        modes={
+            "first": Mode(
+                fall,
+                {
+                    "half": Guard(lambda y, p: 0.5 - y[0], keep, "second"),
+                    "level": Guard(lambda y, p: p["level"] - y[0], keep, "second"),
+                },
+            ),
+            "second": Mode(
+                fall,
+                {
+                    "turn": Guard(
+                        lambda y, p: 1.0 - y[0],
+                        lambda y, p: jnp.stack([0.0 * y[0], y[1] + 1.0]),
+                        "first",
+                    )
+                },
+            ),
+        },
+        section="turn",
+        state=("phase", "level"),
+        project=lambda y, p: y[1:],
+        embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
+    )
+    params = {"level": 0.3}
+    gait = vrw.limit_cycle(params, model=clock, guess=[1.5])
+    branch = vrw.continue_branch(params, "level", (0.2, 0.8), model=clock, cycle=gait)
+    (change,) = branch.special_points
+    assert change.kind == "order_of_events_changes"
+    assert abs(change.value - 0.5) < 1e-9
+    assert branch.values[[0, -1]].tolist() == [0.2, 0.8]

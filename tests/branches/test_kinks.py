@@ -12,8 +12,8 @@ from vrw_jax.branches.arclength import (
     NewtonStep,
 )
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
-from vrw_jax.branches.continuation import MapContinuation
 from vrw_jax.branches.jumps import find_state_jumps
+from vrw_jax.branches.map_branch import MapContinuation
 
 TAN = float(np.tan(0.3))
 

@@ -12,12 +12,12 @@ import vrw_jax as vrw
 from experiments.gaits.both_sides import judge_curve
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationStatus
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
-from vrw_jax.branches.continuation import MapContinuation
 from vrw_jax.branches.curve_problems import (
     FOLD_MARGIN_OFFSET,
     AbstractCurveProblem,
     TwoParameterStep,
 )
+from vrw_jax.branches.map_branch import MapContinuation
 from vrw_jax.branches.special_point_curves import _check_parameter_plane, continue_special_points
 from vrw_jax.gaits.floquet import compute_bifurcation_margins
 

@@ -137,6 +137,7 @@ class ContinuationStatus(StatusCode):
     MAX_POINTS_REACHED = 4, "The branch has the largest allowed number of points: raise max_points."
     START_NOT_FOUND = 5, "No starting point was found."
     CURVE_CLOSED = 6, "The curve returned to its start."
+    BRANCH_SWITCHED = 7, "It begins on another branch."
 
 
 class ContinuationPoint(NamedTuple):
@@ -259,8 +260,8 @@ class ArclengthDriver:
         while n_iterations < self.options.max_newton_iterations:
             n_iterations += 1
             newton_step = yield z, self.compute_parameter(fraction)
-            jacobian = newton_step.return_map_jacobian
-            fraction_tangent = self.parameter_range * newton_step.branch_tangent
+            jacobian = np.asarray(newton_step.return_map_jacobian)
+            fraction_tangent = self.parameter_range * np.asarray(newton_step.branch_tangent)
             distance = normal @ (
                 self.coordinates(z + newton_step.newton_correction, fraction) - plane_point
             )

@@ -42,12 +42,15 @@ class FixedPoint(NamedTuple):
 
     - `section_state`: fixed point, shape (n,);
     - `parameter`: value of the continued parameter;
-    - `jacobian`: Jacobian of the return map, shape (n, n).
+    - `jacobian`: Jacobian of the return map, shape (n, n);
+    - `tangent`: direction of the branch: derivatives of the fixed point and of the parameter by arc
+      length, shape (n + 1,).
     """
 
     section_state: np.ndarray
     parameter: float
     jacobian: np.ndarray
+    tangent: np.ndarray = np.zeros(0)
 
     @property
     def multipliers(self) -> np.ndarray:
@@ -67,7 +70,8 @@ class SpecialPoint:
     At a border collision, an indicator or a margin is zero.
 
     - `kind`: "fold", "branch_point", "period_doubling", "neimark_sacker", "border_collision",
-      "order_of_contacts_changes" (the branch continues with a kink or a jump),
+      "order_of_contacts_changes" or "order_of_events_changes" (the branch continues with a kink or
+      a jump),
       "number_of_force_peaks_changes" (a peak appears or disappears) or "lost" (the order of events
       changes, as `name` describes);
     - `name`: name of the bifurcation, or of the quantity that vanishes or changes its sign;

@@ -58,6 +58,9 @@ EVENT_ORDER, EVENT_ORDER_CHANGE = "contact_order", "order_of_contacts_changes"
 changes.
 """
 
+BORDER_COLLISION = "border_collision"
+"""Kind of a special point at which a margin vanishes."""
+
 # Estimated mesh error above which the mesh is refined.
 MAX_SPECIAL_POINT_MESH_ERROR = 1e-8
 
@@ -129,8 +132,11 @@ class AbstractContinuation(abc.ABC):
 
     def make_fixed_point(self, point: ContinuationPoint) -> FixedPoint:
         """Return the fixed point of the return map at one point of a branch."""
-        section_state = self.continuation_problem.section_state(point.z)
-        return FixedPoint(section_state, float(point.p), point.return_map_jacobian)
+        section_state, tangent = map(
+            self.continuation_problem.section_state, (point.z, point.arclength_tangent)
+        )
+        tangent = np.append(tangent, point.fraction_rate)
+        return FixedPoint(section_state, float(point.p), point.return_map_jacobian, tangent)
 
     @abc.abstractmethod
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
@@ -212,7 +218,9 @@ class AbstractContinuation(abc.ABC):
         tests = {
             name: self.evaluate_margin(name, quantities)
             for name, values in quantities.items()
-            if values.ndim == 1 and self.find_test_function(name)
+            if values.ndim == 1
+            and self.find_test_function(name)
+            and name not in self.linear_margin_substitutes.values()
         }
         with np.errstate(divide="ignore", invalid="ignore"):
             tests[BRANCH_POINT] = tests[FOLD] / points.fraction_rate
@@ -349,6 +357,9 @@ class _AdmissibleRange(NamedTuple):
 # Width of the bracket, in the parameter, at which the search ends; for maps it is a fraction of the
 # range of the parameter.
 LOCATION_PARAMETER_ACCURACY = 1e-10
+# Largest distance of an extrapolated zero of a margin from the last point, in shortest steps. The
+# value is chosen because the last step is at most twice as long as the shortest one.
+MAX_EXTRAPOLATED_STEPS = 4.0
 # Smallest width of the bracket as a fraction of its initial width. The value is chosen because near
 # a fold the parameter varies with the square of the distance.
 MIN_BRACKET_FRACTION = 1e-6
@@ -539,6 +550,49 @@ class _SpecialPointLocator(NamedTuple):
                 located_ends[owner, end] = root
         return located_ends
 
+    def extrapolate_stalled_ends(
+        self,
+        admissible_ranges: list[_AdmissibleRange],
+        statuses: Mapping[int, Sequence[ContinuationStatus]],
+    ) -> dict[tuple[int, int], LocatedRoot]:
+        """Return the zeros of margins just beyond ends at which no step is short enough.
+
+        Where an orbit touches a guard, the return map has an infinite derivative on one side. The
+        margin is smooth on the other side, up to the last point of the branch.
+        """
+        p, located_ends = self.table.points.p, {}
+        driver = self.continuation.driver
+        max_distance = (
+            MAX_EXTRAPOLATED_STEPS * self.continuation.arclength_options.min_ds
+        ) * driver.parameter_range
+        for owner, indices, end_pairs in admissible_ranges:
+            for end, status in enumerate(statuses[owner]):
+                last = indices[2::-1] if end == 0 else indices[-3:]
+                if (
+                    status != ContinuationStatus.STEP_SIZE_UNDERFLOW
+                    or end in end_pairs
+                    or len(last) < 3
+                ):
+                    continue
+                for name, values in self.table.tests.items():
+                    test, margin = self.continuation.find_test_function(name), values[last]
+                    if test is None or test.kind != BORDER_COLLISION or not margin[-1] > 0.0:
+                        continue
+                    # The parameter is a quadratic polynomial of the margin, evaluated at zero.
+                    root = float(np.polyval(np.polyfit(margin, p[last] - p[last[-1]], 2), 0.0))
+                    is_falling = margin[-1] < margin[-2] < margin[0]
+                    if is_falling and abs(root) <= max_distance:
+                        index = int(last[-1])
+                        located_ends[owner, end] = LocatedRoot(
+                            RootRequest.of_test((index, index), name, name),
+                            name,
+                            0,
+                            float(p[index] + root),
+                            0.0,
+                            select_tree_rows(self.table, slice(index, index + 1)),
+                        )
+        return located_ends
+
     def locate_inner_special_points(self) -> list[LocatedRoot]:
         """Locate all special points of the branches except their ends."""
         points, tests = self.table.points, self.table.tests
@@ -598,7 +652,7 @@ class _SpecialPointLocator(NamedTuple):
             name: test
             for name in tests
             if (test := self.continuation.find_test_function(name))
-            and (not test.ends_branch or test.kind == "border_collision")
+            and (not test.ends_branch or test.kind == BORDER_COLLISION)
         }
         requests = [
             RootRequest.of_test(
@@ -788,6 +842,7 @@ def continue_and_locate_special_points(
     if not admissible_ranges:
         return branches
     located_ends = locator.locate_branch_ends(admissible_ranges)
+    stalled_ends = locator.extrapolate_stalled_ends(admissible_ranges, statuses)
     joined = locator.join_located_ends(admissible_ranges, located_ends)
     inner_roots = _SpecialPointLocator(continuation, joined).locate_inner_special_points()
 
@@ -814,7 +869,7 @@ def continue_and_locate_special_points(
         special_points = [make_special_point(root, False) for root in roots]
         end_reasons = []
         for end, status in enumerate(statuses[owner]):
-            located_end = located_ends.get((owner, end))
+            located_end = located_ends.get((owner, end), stalled_ends.get((owner, end)))
             if located_end is None:
                 end_reasons.append(status.meaning)
                 continue

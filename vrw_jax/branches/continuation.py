@@ -7,7 +7,6 @@ Special points are therefore as accurate as the gaits.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -19,21 +18,18 @@ from jaxtyping import Array
 
 from vrw_jax.base.checks import (
     check_bool,
-    check_callable,
     check_int,
     check_range,
-    check_real,
-    check_reals,
     check_type,
-    require_no_masked_entries,
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint, Track, run_together
-from vrw_jax.branches.branch import Branch, FixedPoint
+from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
+from vrw_jax.branches.branch import Branch, SpecialPoint
 from vrw_jax.branches.branch_location import (
+    BORDER_COLLISION,
     EVENT_ORDER,
     EVENT_ORDER_CHANGE,
     AbstractContinuation,
@@ -43,19 +39,13 @@ from vrw_jax.branches.branch_location import (
     continue_and_locate_special_points,
 )
 from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
-from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS, BranchWheel, MapProblem
-from vrw_jax.branches.hybrid_branch import find_parameter, make_section_map
-from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction, compute_multipliers
+from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS, BranchWheel
+from vrw_jax.branches.hybrid_branch import continue_hybrid_branch
+from vrw_jax.branches.map_branch import check_arclength_options, make_stability_variables
+from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.fixed_points import (
-    UNIT_MULTIPLIER_ADVICE,
-    check_state_units,
-    check_vector_map,
-    estimate_state_units,
-    has_unit_multiplier,
-)
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
@@ -99,18 +89,19 @@ FORCE_PEAK_COUNT, FORCE_PEAK_COUNT_CHANGE = "n_force_peaks", "number_of_force_pe
 disappears, at an event or inside a phase.
 """
 
-_BORDER = "border_collision"
 GAIT_TEST_FUNCTIONS: Mapping[str, TestFunction] = {
     **BIFURCATIONS,
     **{name: TestFunction("lost", "A phase vanishes.", True) for name in BRANCH_ENDING_QUANTITIES},
     FRICTION_SURPLUS: TestFunction("lost", "No contact carries the weight along the slope.", True),
-    **{name: TestFunction(_BORDER, MEASURES[name].description) for name in MARGIN_MEASURES},
     **{
-        name: TestFunction(_BORDER, "A landing without double support begins.", True)
+        name: TestFunction(BORDER_COLLISION, MEASURES[name].description) for name in MARGIN_MEASURES
+    },
+    **{
+        name: TestFunction(BORDER_COLLISION, "A landing without double support begins.", True)
         for name in DOUBLE_SUPPORT_INDICATOR_NAMES
     },
     SECOND_PEAK_RATE_NAME: TestFunction(
-        _BORDER, "A force peak appears inside a phase.", explains=FORCE_PEAK_COUNT_CHANGE
+        BORDER_COLLISION, "A force peak appears inside a phase.", explains=FORCE_PEAK_COUNT_CHANGE
     ),
     EVENT_ORDER: TestFunction(EVENT_ORDER_CHANGE, "Events change their order.", is_stepwise=True),
     FORCE_PEAK_COUNT: TestFunction(
@@ -194,6 +185,8 @@ def continue_branch(
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
     force_peaks: bool = False,
+    margins: Mapping[str, Callable[[Array, Any], Array]] | None = None,
+    switch_at: SpecialPoint | None = None,
 ) -> Branch:
     """Continue the branch of limit cycles through `params` in one parameter, within `bounds`.
 
@@ -219,7 +212,9 @@ def continue_branch(
     unilateral contact would be selected.
 
     For a `HybridSystem`, `params` are its parameters, `name` is that of one of their entries, and
-    `cycle` is the `HybridGait` at `params`. Its bifurcations are located, as by `continue_map`.
+    `cycle` is the `HybridGait` at `params`. Special points are its bifurcations, the changes of its
+    sequence of events ("order_of_events_changes"), and the zeros of `margins`. A branch that ends
+    where an orbit touches a guard has the zero of a margin there.
 
     Args:
         params: one wheel; its gait is on the branch.
@@ -237,6 +232,10 @@ def continue_branch(
             second peak appears. There the first and the second time derivative of the force are
             zero at the same time. The special point "number_of_force_peaks_changes" is any other
             change of the number of peaks, such as at a landing or at the start of slip.
+        margins: for a `HybridSystem`, functions of state and parameters by name, such as the
+            distance to a guard. Their minima over the gait are measures of the branch.
+        switch_at: for a `HybridSystem`, a branch point or period doubling of the branch of `cycle`.
+            The branch that crosses there is continued, or that of gaits of twice the period.
 
     Returns:
         A `Branch`. If there is no gait from which to start, `outcome` is the reason.
@@ -252,14 +251,13 @@ def continue_branch(
     """
     if isinstance(model, HybridSystem):
         check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
-        return continue_map(
-            make_section_map(model, name, period_n, step_options),
-            cycle.section_state,
-            float(find_parameter(params, name)),
-            bounds,
-            constants=params,
-            name=name,
-            options=options,
+        return continue_hybrid_branch(
+            model, params, name, bounds, cycle, period_n, step_options, options, margins, switch_at
+        )
+    if margins or switch_at is not None:
+        raise ValueError(
+            "margins and switch_at are for a HybridSystem, but the model is a wheel: leave them "
+            "out, and give cycle=vrw.limit_cycle(..., period_n=2) for gaits of two steps."
         )
     require_single_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
@@ -338,7 +336,7 @@ def continue_branches(
         )
     (lower_bound, upper_bound), options = (
         check_range("bounds", bounds),
-        _check_arclength_options(options),
+        check_arclength_options(options),
     )
     gait_finder = make_finder(
         model, params.n_legs, cycle_options=cycle_options, step_options=step_options
@@ -453,16 +451,6 @@ MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
 """Names of measures of the event-driven step that the dataset of a branch does not contain."""
 
 
-def _check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:
-    """Check the options of a continuation.
-
-    Return them, or `ArclengthOptions()` if they are None.
-    """
-    options = ArclengthOptions() if options is None else options
-    check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
-    return options
-
-
 def _make_labeled_gait_branch(
     branch_data: BranchData | None,
     params: WheelParams,
@@ -522,204 +510,8 @@ def _make_labeled_gait_branch(
         "leg": make_locked_leg_coordinate(params.n_legs),
     }
     branch_dataset = xr.Dataset(
-        branch_variables | _make_stability_variables(points.return_map_jacobian),
+        branch_variables | make_stability_variables(points.return_map_jacobian),
         branch_coordinates,
         branch_attrs,
     )
     return Branch(parameter_name, branch_dataset, special_points, end_reasons, Outcome.STEPPED)
-
-
-def _make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.Variable]:
-    """Build labeled variables with the multipliers and the stability measures at each point of a
-    branch.
-    """
-    multipliers = compute_multipliers(return_map_jacobians)
-    spectral_radius = np.max(np.abs(multipliers), -1)
-    multiplier_parts = (
-        ("multiplier_real", multipliers.real, "real part of a multiplier"),
-        ("multiplier_imag", multipliers.imag, "imaginary part"),
-    )
-    multiplier_variables = {
-        variable_name: xr.Variable(
-            ("point", "multiplier"), multiplier_part, {"units": "1", "long_name": long_name}
-        )
-        for variable_name, multiplier_part, long_name in multiplier_parts
-    }
-    return multiplier_variables | make_labeled_variables(
-        {"spectral_radius": spectral_radius, "spectral_margin": 1.0 - spectral_radius}, "point"
-    )
-
-
-MAX_START_DISTANCE_FACTOR = 10.0
-"""Largest distance of a regular start from a singular start, as a multiple of the first
-continuation step. The value is chosen because branches may cross at small angles.
-"""
-
-MIN_SINGULAR_VALUE = 1e-9
-"""Relative singular value of the equations below which a tangent has few accurate digits."""
-
-
-def are_equations_regular(return_map_jacobian: np.ndarray) -> bool:
-    """Return whether the tangent of a branch is determined at a fixed point."""
-    if not np.isfinite(return_map_jacobian).all():
-        return False
-    equations = np.eye(len(return_map_jacobian)) - return_map_jacobian
-    singular_values = np.linalg.svd(equations, compute_uv=False)
-    return bool(singular_values[-1] > MIN_SINGULAR_VALUE * max(1.0, singular_values[0]))
-
-
-@dataclass(frozen=True)
-class MapContinuation(AbstractContinuation):
-    """Continuation of the fixed points of any map. All finite fixed points are admissible.
-
-    - `state_units`: units of the components of the state in which points are stored.
-    """
-
-    state_units: Any = 1.0
-
-    @property
-    def parameter_unit(self) -> float:
-        return float(np.ptp(self.parameter_bounds))
-
-    def make_fixed_point(self, point: ContinuationPoint) -> FixedPoint:
-        section_state, p, jacobian = super().make_fixed_point(point)
-        units = np.broadcast_to(self.state_units, section_state.shape)
-        return FixedPoint(units * section_state, p, units[:, None] * jacobian / units)
-
-    def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
-        return {"x": self.state_units * self.continuation_problem.section_state(points.z)}
-
-    def continue_in_both_directions(
-        self, z: np.ndarray, p: np.ndarray, is_requested: np.ndarray
-    ) -> dict[int, list[Track]]:
-        """Continue the branch of one map in both directions.
-
-        If the equations are singular at the start, the branch starts at a fixed point next to it.
-        """
-        tracks = super().continue_in_both_directions(z, p, is_requested)
-        points = tracks[0][0].points
-        if points and are_equations_regular(points[0].return_map_jacobian):
-            return tracks
-        start = self._find_regular_start(z, p)
-        if start is None:
-            return {}
-        return super().continue_in_both_directions(start.z[None], np.array([start.p]), is_requested)
-
-    def _find_regular_start(self, z: np.ndarray, p: np.ndarray) -> ContinuationPoint | None:
-        """Find a fixed point next to a start at which the equations are singular.
-
-        Each search is in a plane whose distance from the start is about that of the first
-        continuation step. A branch that turns at the start does not cross all planes. Return None
-        if no plane contains a fixed point near the start.
-        """
-        problem, distance = self.continuation_problem, self.arclength_options.initial_ds
-        jacobian = np.asarray(problem.linearize(self.wheels, z, p).return_map_jacobian)[0]
-        singular_direction = np.linalg.svd(np.eye(z.shape[-1]) - np.nan_to_num(jacobian))[2][-1]
-        tasks = []
-        # Along one branch through a crossing, the state may be constant.
-        for state_part, parameter_part in itertools.product((0.0, 0.5, -0.5), (1.0, -1.0)):
-            normal = distance * self.driver.coordinates(
-                state_part * singular_direction, parameter_part
-            )
-            start = self.driver.coordinates(z[0], self.driver.compute_fraction(p[0])) + normal
-            tasks.append(
-                self.driver.solve_on_plane(self.wheels, start[:-1], start[-1], (start, normal))
-            )
-        lower_bound, upper_bound = self.parameter_bounds
-        for point, is_found in run_together(problem, self.wheels, [0] * len(tasks), tasks):
-            if (
-                is_found
-                and np.abs(point.z - z[0]).max() <= MAX_START_DISTANCE_FACTOR * distance
-                and lower_bound <= point.p <= upper_bound
-                and are_equations_regular(point.return_map_jacobian)
-            ):
-                return point
-        return None
-
-
-@announce_wait("the map and its derivatives", "10 s")
-def continue_map(
-    function: Callable[[Any, Array, Array], Array],
-    x: object,
-    p: float,
-    bounds: tuple[float, float],
-    *,
-    constants: Any = (),
-    name: str = "parameter",
-    units: Any = None,
-    options: ArclengthOptions | None = None,
-) -> Branch:
-    """Continue the branch of fixed points through (x, p) for a map x -> `function(constants, x,
-    p)`.
-
-    The map must be differentiable in forward mode, and return NaN where it is undefined.
-    Bifurcations are located as in `continue_branch`, to 1e-9 of the range between the bounds. The
-    start may be a fold or a crossing of branches.
-
-    Args:
-        function: `function(constants, x, p)`, which returns an array of the shape of `x`.
-        x: a fixed point or a state near one, shape (n,).
-        p: value of the parameter at `x`.
-        bounds: lower and upper bound of the parameter.
-        constants: any pytree, passed to the function.
-        name: name of the parameter in the result.
-        units: units of the components of `x`, a number or shape (n,), in which continuation steps
-            are measured. By default, the unit of a component is its size at the start, or the size
-            of its change within the bounds if it is larger.
-        options: `ArclengthOptions` of the branch.
-
-    Returns:
-        A `Branch`: the fixed points, their stability, the special points, and why the branch ends.
-
-    Raises:
-        TypeError, ValueError: if an argument is invalid; the message names the remedy.
-
-    Examples:
-        >>> logistic = lambda _, x, r: r * x * (1.0 - x)
-        >>> branch = vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5))
-        >>> [(point.kind, round(point.value, 6)) for point in branch.special_points]
-        [('period_doubling', 3.0)]
-    """
-    check_callable("function", function, "of constants, x and p")
-    require_untraced_arguments("vrw.continue_map", "use vrw.solve_fixed_point", x, p, constants)
-    lower_bound, upper_bound = check_range("bounds", bounds)
-    if not lower_bound <= check_real("p", p) <= upper_bound:
-        raise ValueError(
-            f"p is {p:g}, but the branch must start within its bounds: give one in "
-            f"[{lower_bound:g}, {upper_bound:g}]."
-        )
-    options, x = _check_arclength_options(options), check_reals("x", x)
-    require_no_masked_entries("constants", jax.tree.leaves(constants))
-    constants = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), constants)
-    check_vector_map(lambda x: function(constants, x, jnp.asarray(p, float)), "x", x)
-    state_units = (
-        estimate_state_units(function, constants, np.asarray(x), p, (lower_bound, upper_bound))
-        if units is None
-        else np.asarray(check_state_units(units, x))
-    )
-    units = tuple(np.broadcast_to(state_units, x.shape).tolist())
-    continuation = MapContinuation(
-        MapProblem(function, units),
-        options,
-        jax.tree.map(lambda leaf: np.asarray(leaf)[None], constants),
-        np.array([lower_bound, upper_bound]),
-        np.array(units),
-    )
-    (branch_data,) = continue_and_locate_special_points(
-        continuation, np.asarray(x / state_units)[None], np.array([p], float), np.array([True])
-    )
-    if branch_data is None:
-        empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))})
-        start_jacobian = jax.jacfwd(function, 1)(constants, x, jnp.asarray(p, float))
-        is_singular = has_unit_multiplier(np.asarray(start_jacobian))
-        reasons = (UNIT_MULTIPLIER_ADVICE if is_singular else "",) * 2
-        return Branch(name, empty_dataset, (), reasons, Outcome.NO_CYCLE_FOUND)
-    dataset = xr.Dataset(
-        {"x": (("point", "component"), branch_data.quantities["x"])}
-        | _make_stability_variables(branch_data.points.return_map_jacobian),
-        {name: ("point", branch_data.points.p)},
-        {"title": f"Branch of fixed points along {name}"},
-    )
-    return Branch(
-        name, dataset, branch_data.special_points, branch_data.end_reasons, Outcome.STEPPED
-    )
