@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from vrw_jax.app.explorer import explore
 from vrw_jax.base.checks import format_name_suggestion
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import parameter
 from vrw_jax.base.start import start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
@@ -59,7 +60,6 @@ from vrw_jax.studies.tolerance_request import measure_to_tolerance
 from vrw_jax.studies.tune_objective import WheelObjective
 from vrw_jax.studies.tune_problem import tune
 from vrw_jax.studies.tune_result import TuneResult
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.parameter_sets import ParameterSet, parameter_sets
 from vrw_jax.wheel.params import WheelParams
 

@@ -26,7 +26,7 @@ from vrw_jax.app.figure_style import (
     figure_style,
     save,
 )
-from vrw_jax.wheel import Outcome
+from vrw_jax.base.outcomes import Outcome
 
 STYLES = {  # of Okabe and Ito, a marker each
     "lanes Tsit5": ("#0072B2", "o"),

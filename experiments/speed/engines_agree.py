@@ -17,7 +17,8 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
-from vrw_jax.wheel import PARAMETER_NAMES, Outcome, make_wheel_from_parameters
+from vrw_jax.base.outcomes import Outcome
+from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
 
 BOX = {
     "damping": (5.0, 400.0),

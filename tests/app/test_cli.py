@@ -28,13 +28,13 @@ from vrw_jax.app.commands import app
 from vrw_jax.app.config import parse_config
 from vrw_jax.app.console import make_scan_progress_reporter
 from vrw_jax.app.encoding import replace_unencodable_characters
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import Branch
 from vrw_jax.studies import SpecialPointMap
 from vrw_jax.studies import scan_forecast as forecast
 from vrw_jax.studies.scan_execution import ScanProgress
 from vrw_jax.studies.scan_planning import ScanPlan
 from vrw_jax.studies.scan_store import open_scan
-from vrw_jax.wheel.outcomes import Outcome
 
 SCAN_CONFIG = """
 [grid]

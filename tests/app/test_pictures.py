@@ -17,10 +17,10 @@ from vrw_jax.app import figure_style as style
 from vrw_jax.app._branch_figures import basin_figure
 from vrw_jax.app._tuning_figures import tuning_figure
 from vrw_jax.app._walk_figures import indicators, save_animation
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.studies import TrialKind
 from vrw_jax.studies.tune_maximization import TuneStatus
 from vrw_jax.studies.tune_result import ActiveConstraint, WalkValidation
-from vrw_jax.wheel import Outcome
 
 ROOT = Path(__file__).parents[2]
 MIN_COLOR_DISTANCE = 0.12

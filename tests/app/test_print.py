@@ -22,9 +22,10 @@ import vrw_jax.hybrid
 from vrw_jax.app import _contact_figures as _contact
 from vrw_jax.app import figure_style as style
 from vrw_jax.app._walk_figures import ground_forces
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches import Branch, SpecialPoint
 from vrw_jax.branches.branch import FixedPoint
-from vrw_jax.wheel import ContactMode, Outcome
+from vrw_jax.wheel import ContactMode
 
 ROOT = Path(__file__).parents[2]
 

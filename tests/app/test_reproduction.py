@@ -18,7 +18,7 @@ from vrw_jax.app import commands as cli
 from vrw_jax.app import paper_reproduction as reproduce
 from vrw_jax.app import paper_table as facts
 from vrw_jax.app.paper_fact import PaperEvidence
-from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.base.outcomes import Outcome
 
 FIGURE_NAMES = (
     "fig06_gait",

@@ -6,7 +6,7 @@ import xarray as xr
 
 from vrw_jax.app._scan_figures import scan_figures
 from vrw_jax.app.figure_style import OUTCOME_LABELS_AND_COLORS, format_axis_label
-from vrw_jax.wheel import Outcome
+from vrw_jax.base.outcomes import Outcome
 
 
 @pytest.mark.parametrize("second", ["friction", "gravity"])

@@ -8,8 +8,8 @@ from matplotlib.mathtext import MathTextParser
 
 from vrw_jax import plot
 from vrw_jax.app import figure_style as style
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.models import MEASURES
-from vrw_jax.wheel import Outcome
 
 MATHTEXT_PARSER = MathTextParser("path")
 

@@ -29,6 +29,7 @@ from support.scanning import (
 
 import vrw_jax as vrw
 from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits import finder
 from vrw_jax.lanes.keys import make_key
 from vrw_jax.studies import scan_dask as dask
@@ -46,7 +47,6 @@ from vrw_jax.studies.scan_planning import (
     plan_scan,
 )
 from vrw_jax.studies.scan_store import choose_chunk_shape, open_scan
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 

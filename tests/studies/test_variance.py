@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.wheel.outcomes import Outcome
+from vrw_jax.base.outcomes import Outcome
 
 ISHIGAMI_RANGES = {"damping": (100.0, 200.0), "slope": (0.2, 0.3), "stiffness": (400.0, 500.0)}
 

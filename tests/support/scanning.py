@@ -5,12 +5,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 import xarray as xr
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.models.measures import MARGIN_MEASURES
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies import scan_execution as running
 from vrw_jax.studies.scan_design import ParameterSamples
 from vrw_jax.studies.scan_planning import ChunkResult, ScanPlan, plan_scan
-from vrw_jax.wheel.outcomes import Outcome
 
 SCANNED_MEASURES = ("dls_fraction", "speed", "d dls_fraction / d damping")
 SMALL_GRID = designs.grid(damping=np.linspace(100.0, 200.0, 5), slope=np.linspace(0.28, 0.31, 4))

@@ -32,9 +32,9 @@ from vrw_jax.app.figure_style import (
     typeset_greek_symbols,
 )
 from vrw_jax.base.checks import check_type
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import Branch, SpecialPoint
 from vrw_jax.models.measures import MEASURES, PRE_TOUCHDOWN_COMPONENT_NAMES, describe_violation
-from vrw_jax.wheel.outcomes import Outcome
 
 BRANCH_END_COLOR = OKABE_ITO_PINK
 """Color that marks the end of a branch, chosen because no curve has this color."""

@@ -41,13 +41,13 @@ from vrw_jax.app.figure_style import (
     select_special_point_style,
     typeset_greek_symbols,
 )
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.models.measures import LEG_PREFIX, MARGIN_MEASURES, MEASURES, describe_violation
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
 from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS
 from vrw_jax.studies.sensitivity_indices import sobol_indices
 from vrw_jax.studies.store_integrity import read_scan_manifest
-from vrw_jax.wheel.outcomes import Outcome
 
 PARAMETER_AXIS_ORDER = dict.fromkeys(
     ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)

@@ -32,6 +32,7 @@ from vrw_jax.app.console import (
 from vrw_jax.app.encoding import replace_unencodable_output
 from vrw_jax.app.explorer import make_page_address
 from vrw_jax.base.checks import check_path
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import PROGRESS_VARIABLE
 from vrw_jax.base.start import start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
@@ -48,7 +49,6 @@ from vrw_jax.studies.gait_sensitivity import gait_sensitivity
 from vrw_jax.studies.scan_forecast import forecast_scan
 from vrw_jax.studies.special_point_map import follow_special_points, require_map_grid
 from vrw_jax.studies.tune_problem import tune
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 MAX_OPTION_INTEGER = 10**9

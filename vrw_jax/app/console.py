@@ -20,6 +20,7 @@ from rich.table import Table
 
 from vrw_jax.app.encoding import replace_unencodable_characters
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import PROGRESS_VARIABLE
 from vrw_jax.gaits.cycle import format_floquet_multipliers
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
@@ -28,7 +29,6 @@ from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.models.step_results import StepResult
 from vrw_jax.studies.scan_execution import ScanProgress
 from vrw_jax.studies.scan_forecast import format_duration
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, WheelParams
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from vrw_jax.base.checks import check_path, check_real, check_type
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import format_mathtext
 from vrw_jax.models.measures import MEASURES
-from vrw_jax.wheel.outcomes import Outcome
 
 OKABE_ITO_BLUE = "#0072B2"
 OKABE_ITO_ORANGE = "#D55E00"

@@ -17,8 +17,8 @@ from vrw_jax.app.paper_fact import (
     split_trajectory_by_phase,
 )
 from vrw_jax.app.paper_gaits import MAX_SETTLED_STATE_CHANGE
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.models.measures import PHASE_NAMES
-from vrw_jax.wheel.outcomes import Outcome
 
 
 def _compute_typical_gait_values(paper_evidence: PaperEvidence) -> ClaimValues:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     STEP_MEASURES,
@@ -28,7 +29,6 @@ from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.step_results import SectionState
 from vrw_jax.models.stepping import step, walk
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

@@ -20,13 +20,13 @@ from vrw_jax.app.paper_fact import (
     PaperEvidence,
     make_agreement_test,
 )
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.wheel.dynamics import (
     Motion,
     compute_length_at_touchdown,
     compute_mass_matrix,
     compute_momentum,
 )
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols, WheelParams
 
 _compute_length_at_touchdown = jax.jit(compute_length_at_touchdown)

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import format_html_table
 from vrw_jax.gaits import floquet
-from vrw_jax.wheel.outcomes import Outcome
 
 MAX_PRINTED_SPECIAL_POINTS = 20
 """Largest number of special points that are printed. The value is chosen because a branch then fits

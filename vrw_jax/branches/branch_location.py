@@ -14,6 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.arclength import (
     AbstractContinuationProblem,
     ArclengthDriver,
@@ -40,7 +41,6 @@ from vrw_jax.branches.test_functions import (
 from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.gaits.floquet import EQUAL_MODULI_DISTANCE, UNIT_CIRCLE_DISTANCE
 from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
-from vrw_jax.wheel.outcomes import Outcome
 
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
 """Name of a branch end at which the mesh is too coarse. Event-driven steps that start from the

@@ -25,6 +25,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Branch, SpecialPoint
@@ -70,7 +71,6 @@ from vrw_jax.models.stepping import (
     convert_step_options,
     require_single_wheel,
 )
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, check_parameter_name
 
 DOUBLE_SUPPORT_INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")

@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.arclength import AbstractContinuationProblem, ContinuationPoint, NewtonStep
 from vrw_jax.branches.branch_location import EVENT_ORDER, QuantitiesByName
 from vrw_jax.gaits.collocation_search import CollocationSystem
@@ -34,7 +35,6 @@ from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
 from vrw_jax.models.step_results import AbstractStep
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import FRICTION_NAME
 
 FRICTION_SURPLUS = "friction_above_slope"

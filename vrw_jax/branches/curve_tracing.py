@@ -18,6 +18,7 @@ import numpy as np
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_location import (
@@ -54,7 +55,6 @@ from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 RANGE_EDGE_COLUMN = "edge of the box"

@@ -22,6 +22,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.branches.arclength import (
     ArclengthOptions,
@@ -47,7 +48,6 @@ from vrw_jax.gaits.fixed_points import (
     has_unit_multiplier,
 )
 from vrw_jax.models.measures import make_labeled_variables
-from vrw_jax.wheel.outcomes import Outcome
 
 
 def check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:

@@ -16,6 +16,7 @@ import numpy as np
 
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.branch_location import COARSE_MESH_END_NAME
 from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES, SECOND_PEAK_RATE_NAME
@@ -31,7 +32,6 @@ from vrw_jax.branches.test_functions import BIFURCATIONS
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import MARGIN_MEASURES
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 GAIT_CHANGE_NAME = "gait"

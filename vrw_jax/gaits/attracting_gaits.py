@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.gait_walks import (
     compute_fallback_walk_starts,
     compute_walk_starts,
@@ -16,7 +17,6 @@ from vrw_jax.gaits.gait_walks import (
 )
 from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
 from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 DUPLICATE_GAIT_DISTANCE = 1e-5

@@ -16,12 +16,12 @@ from jaxtyping import Array
 
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.stepping import walk
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

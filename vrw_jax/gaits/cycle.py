@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.base.checks import check_choice
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -26,7 +27,6 @@ from vrw_jax.gaits import floquet
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 SAME_STATE_RELATIVE_TOLERANCE = 1e-7

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.slope_response import SlopeResponse, compute_step_slope_response
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
@@ -23,7 +24,6 @@ from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models.step_results import AbstractStep
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 STATE_AGREEMENT_TOLERANCE = 1e-8

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import RETRY_OUTCOMES
@@ -27,7 +28,6 @@ from vrw_jax.gaits.gait_walks import (
 from vrw_jax.gaits.limit_cycle_result import transfer_solution_to_mesh
 from vrw_jax.lanes.batching import concatenate_tree_rows, map_in_batches, select_tree_rows
 from vrw_jax.models.batch_stiffness import SolverIndex, select_cheapest_solver
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 MAX_UNREFINED_MESH_ERROR = 1e-7

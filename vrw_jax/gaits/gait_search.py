@@ -26,6 +26,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.attracting_gaits import find_attracting_gaits, find_slowest_gait_indices
@@ -52,7 +53,6 @@ from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 FailureFillName = Literal["zeros", "nan"]

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.models.contact_walks import embed_section_states
 from vrw_jax.models.step_batch import step_batch
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams, compute_wheel_units_of_rows
 
 WALK_STARTS = ((1.0, 0.45), (1.0, 0.7), (1.0, 1.0), (0.5, 1.0), (0.0, 1.0))

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
@@ -19,7 +20,6 @@ from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_batch import step_batch
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 from vrw_jax.wheel.phases import PAPER_PHASES, TRANSITION_ASSUMPTIONS
 

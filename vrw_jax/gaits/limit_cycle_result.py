@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import LabelAndText, format_numbers
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits import floquet
@@ -42,7 +43,6 @@ from vrw_jax.models.stepping import step
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import Motion
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams, stack_parameters
 from vrw_jax.wheel.phases import make_paper_phases
 

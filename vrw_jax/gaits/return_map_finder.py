@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.gaits.finder import (
@@ -37,7 +38,6 @@ from vrw_jax.models.measures import (
     SHARED_STEP_MEASURE_NAMES,
 )
 from vrw_jax.models.stepping import convert_step_arguments, start_walk_toward_gait
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams, compute_wheel_units
 
 MIN_NEWTON_TOLERANCE = 1e-12

@@ -9,6 +9,7 @@ import numpy as np
 from vrw_jax.base.checks import check_names, format_name_suggestion, require_untraced_arguments
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.finder_selection import (
     UserCycleGuess,
@@ -19,7 +20,6 @@ from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.stepping import ModelLike
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Array
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.attracting_gaits import find_slow_gaits
 from vrw_jax.gaits.finder import (
     Gait,
@@ -44,7 +45,6 @@ from vrw_jax.models.measures import FORCE_PEAK_MEASURES, UNILATERAL_DIFFERENTIAB
 from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.models.stepping import convert_step_arguments
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins
 from vrw_jax.flow.scaled_integration import (
     integrate_phase_in_scaled_units,
@@ -45,7 +46,6 @@ from vrw_jax.models.contact_state import (
     pack_state,
     unpack_state,
 )
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import compute_wheel_units
 
 ROLLING_INDEX = 2

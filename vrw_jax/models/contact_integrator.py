@@ -26,6 +26,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.flow.diffrax_minima import GUARD_ROUNDOFF_IN_EPS
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
@@ -46,7 +47,6 @@ from vrw_jax.models.contact_state import (
     compute_state_units,
     evaluate_guards,
 )
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
 N_ACCUMULATOR_ROWS = 3

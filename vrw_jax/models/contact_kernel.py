@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.elementwise import make_opaque_loop_condition, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.flow.tableaus import ButcherTableau
 from vrw_jax.lanes.batching import make_zeros_like_output
 from vrw_jax.models.contact_diffrax import init_diffrax_contact_interval, integrate_by_diffrax
@@ -72,7 +73,6 @@ from vrw_jax.models.contact_state import (
 )
 from vrw_jax.models.phase_sequence import find_stance_slope
 from vrw_jax.wheel.ground import GroundAhead
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
     Symbols,

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise
 from vrw_jax.models.contact_impacts import (
     ContactEvent,
@@ -36,7 +37,7 @@ from vrw_jax.models.contact_state import (
     split_normal_forces,
 )
 from vrw_jax.models.step_results import AbstractContactStep
-from vrw_jax.wheel.outcomes import ContactMode, Outcome, replace_rest_outcome
+from vrw_jax.wheel.outcomes import ContactMode, replace_rest_outcome
 from vrw_jax.wheel.params import Symbols
 
 # Smallest height of a resolved bounce, divided by absolute tolerance and leg length.

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_each_batch_element
 from vrw_jax.base.types import RealInput, Scalar
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
@@ -38,7 +39,7 @@ from vrw_jax.models.unilateral_wheel import (
     UnilateralWheel,
 )
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.outcomes import ContactMode, Outcome
+from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import WheelParams, convert_friction
 
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.printing import format_mathtext
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_DOMAINS
 from vrw_jax.wheel.phases import PAPER_PHASES
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Int
 
 from vrw_jax.base.elementwise import compute_sine_cosine, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
@@ -37,7 +38,7 @@ from vrw_jax.wheel.ground import (
     compute_foot_distance_for_length,
     compute_line_slope,
 )
-from vrw_jax.wheel.outcomes import Outcome, replace_rest_outcome
+from vrw_jax.wheel.outcomes import replace_rest_outcome
 from vrw_jax.wheel.params import MAX_SI_VALUE, PARAMETER_DOMAINS, Symbols, WheelParams
 from vrw_jax.wheel.phases import (
     PAPER_PHASES,

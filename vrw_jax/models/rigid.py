@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from vrw_jax.base.checks import check_bool
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise
 from vrw_jax.lanes.autodiff import compute_square_root
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
@@ -32,7 +33,6 @@ from vrw_jax.models.step_results import (
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Motion, compute_rear_foot_height
 from vrw_jax.wheel.ground import compute_foot_distance
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import Symbols, WheelParams, require_known_friction
 
 # Number of angles that each round of the search for minima of margins samples. The value is chosen

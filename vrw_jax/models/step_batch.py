@@ -29,6 +29,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
@@ -61,7 +62,6 @@ from vrw_jax.models.walk_batch import (
     make_height_terms,
     select_lanes,
 )
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     NO_LEG_FORCE,

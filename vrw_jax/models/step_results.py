@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -17,7 +18,6 @@ from vrw_jax.base.printing import (
     format_quantity,
 )
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES
-from vrw_jax.wheel.outcomes import Outcome
 
 SectionState = Float[Array, "3"]
 """State (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s and m/s. The leg labels are

@@ -19,6 +19,7 @@ from jaxtyping import Array, Int
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_int, check_reals, check_type, format_value
 from vrw_jax.base.options import EngineName, StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import list_parameters
 from vrw_jax.base.printing import (
     AbstractPrintable,
@@ -37,7 +38,6 @@ from vrw_jax.models.registry import describe_accepted_models
 from vrw_jax.models.step_results import AdvanceResult, SectionState, StepResult
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 SectionStateLike = Array | np.ndarray | Sequence[float]

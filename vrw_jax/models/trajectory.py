@@ -19,6 +19,7 @@ from jaxtyping import Array
 from vrw_jax.base.checks import check_int, require_untraced_arguments
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.models.contact_mechanics import (
     compute_foot_heights,
@@ -42,7 +43,6 @@ from vrw_jax.wheel.dynamics import (
     rotate_to_rear_leg,
 )
 from vrw_jax.wheel.ground import compute_line_slope
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

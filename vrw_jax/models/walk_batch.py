@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -14,7 +15,6 @@ from vrw_jax.base.printing import (
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.wheel.outcomes import Outcome
 
 
 class StepSensitivity(eqx.Module):

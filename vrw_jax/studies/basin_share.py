@@ -9,13 +9,13 @@ from jaxtyping import Float
 
 from vrw_jax.base.checks import check_choice, check_int, check_range, check_real, check_type
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.models.stepping import ModelLike
 from vrw_jax.studies.basins import compute_section_states_of_starts, select_start_components
 from vrw_jax.studies.gait_arrival import StableGait, walk_until_on_gait
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 StartSamplingName = Literal["sobol", "random"]

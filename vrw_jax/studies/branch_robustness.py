@@ -11,6 +11,7 @@ import numpy as np
 from vrw_jax.base.checks import check_int, check_names, check_type
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.branches.branch import Branch
 from vrw_jax.gaits.finder_selection import resolve_finder
@@ -24,7 +25,6 @@ from vrw_jax.studies.basin_share import StartBox, compute_basin_share, parse_sta
 from vrw_jax.studies.gait_arrival import StableGait
 from vrw_jax.studies.gait_sensitivity import compute_gait_sensitivity, parse_sensitivity_measures
 from vrw_jax.studies.smallest_disturbance import compute_smallest_disturbance
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 BASIN_VARIABLE_ATTRS = {

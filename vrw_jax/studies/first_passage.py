@@ -19,6 +19,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
@@ -38,7 +39,6 @@ from vrw_jax.studies.rigid_passage import (
     solve_passage_on_slopes,
 )
 from vrw_jax.studies.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 MAX_QUADRATURE_NODES = 1600

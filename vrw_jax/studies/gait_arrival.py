@@ -9,6 +9,7 @@ import numpy as np
 
 from vrw_jax.base.checks import check_type, require_untraced_arguments
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.models.interface import AbstractWheel
@@ -19,7 +20,6 @@ from vrw_jax.models.stepping import (
     convert_step_options,
     require_single_wheel,
 )
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams, compute_wheel_units
 
 # Largest distance between the section states of a walk and of the gait at which the walk has

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.checks import check_names, has_traced_leaf, require_known_name
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
@@ -24,7 +25,6 @@ from vrw_jax.models.measures import (
     UNILATERAL_STEP_MEASURES,
 )
 from vrw_jax.models.stepping import ModelLike
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.further_search import search_further
 from vrw_jax.gaits.gait_search import find_cycles_from_starts, summarize_search
@@ -23,7 +24,6 @@ from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.studies.step_quantities import N_STEP_QUANTITIES
 from vrw_jax.studies.tolerance_contact import replace_rows
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

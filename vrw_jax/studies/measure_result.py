@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -16,7 +17,6 @@ from vrw_jax.base.printing import (
 )
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.studies.lower_fidelity import MODEL_NAMES, ModelIndex
-from vrw_jax.wheel.outcomes import Outcome
 
 
 class MeasureStatus(StatusCode):

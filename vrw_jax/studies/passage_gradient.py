@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.studies.failure_density import GaussianMixture
 from vrw_jax.studies.sampled_passage import WalkerGroups
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET
 from vrw_jax.studies.lower_fidelity import LowerFidelityGaits, ModelIndex
@@ -22,7 +23,6 @@ from vrw_jax.studies.step_quantities import (
     evaluate_measures,
 )
 from vrw_jax.studies.tolerance_contact import ContactWheelBatch, StepQuantities
-from vrw_jax.wheel.outcomes import Outcome
 
 
 class MeasureEstimates(NamedTuple):

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import report_progress
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.walk_batch import StepBatchResult
 from vrw_jax.studies.failure_density import GaussianMixture, fit_failure_density
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 MAX_BIASED_GROUND_LINES = 12

@@ -22,6 +22,7 @@ from jaxtyping import Array
 from vrw_jax import lanes
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.finder import confirm_outcome_by_step
 from vrw_jax.gaits.finder_selection import make_finder
@@ -43,7 +44,6 @@ from vrw_jax.studies.measure_catalog import (
     parse_derivative,
 )
 from vrw_jax.studies.scan_design import ParameterSamples
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 GaitOutputs = tuple[Array, Array, dict[str, Array]]

@@ -22,6 +22,7 @@ from jaxtyping import Array
 
 from vrw_jax import lanes
 from vrw_jax.base import batch_sizes
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.attracting_gaits import find_slow_gaits
 from vrw_jax.gaits.finder import MeasureReader, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
@@ -47,7 +48,6 @@ from vrw_jax.studies.scan_collocation import (
 )
 from vrw_jax.studies.scan_design import ParameterSamples
 from vrw_jax.studies.tolerance_request import measure_to_tolerance
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, make_wheel_from_parameters
 
 SampleEvaluator = Callable[[ParameterSamples], ValuesByVariable]

@@ -18,6 +18,7 @@ from pathlib import Path
 from vrw_jax.base.checks import check_callable, check_path
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait, report_progress
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.lanes.settings import with_default_jax_settings
@@ -40,7 +41,6 @@ from vrw_jax.studies.scan_store import (
     read_stored_manifest,
 )
 from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]

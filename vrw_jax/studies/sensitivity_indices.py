@@ -15,9 +15,9 @@ import numpy as np
 
 from vrw_jax.base.checks import check_names, check_type, format_name_suggestion
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND
 from vrw_jax.studies.store_integrity import read_scan_manifest
-from vrw_jax.wheel.outcomes import Outcome
 
 MIN_SALTELLI_ROWS = 64
 """Smallest number of rows of a `saltelli` design, chosen because indices from fewer rows are noise.

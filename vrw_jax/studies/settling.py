@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.studies.tolerance_contact import ContactWheelBatch, StepQuantities, replace_rows
-from vrw_jax.wheel.outcomes import Outcome
 
 
 class WalkEnds(NamedTuple):

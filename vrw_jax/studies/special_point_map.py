@@ -11,6 +11,7 @@ import numpy as np
 from vrw_jax.base.checks import check_callable, check_names, check_type
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.special_point_map import (
@@ -23,7 +24,6 @@ from vrw_jax.models.registry import describe_accepted_models
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
 from vrw_jax.studies.scan_design import AbstractSampleDesign
 from vrw_jax.studies.scan_execution import ProgressCallback, scan
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 

@@ -27,6 +27,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.gait_search import GaitChoice, parse_gait_choice
 from vrw_jax.gaits.gait_walks import compute_walk_starts
@@ -54,7 +55,6 @@ from vrw_jax.studies.tolerance_contact import (
     ContactWheelBatch,
     replace_rows,
 )
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, convert_friction
 
 # Smallest tolerance of a measure for which walking steps are computed at `TIGHT_TOLERANCE`. Below

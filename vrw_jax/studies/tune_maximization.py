@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
 from vrw_jax.studies.tune_objective import (
@@ -25,7 +26,6 @@ from vrw_jax.studies.tune_objective import (
     compute_max_violation,
     compute_slack_scales,
 )
-from vrw_jax.wheel.outcomes import Outcome
 
 
 class TuneStatus(StatusCode):

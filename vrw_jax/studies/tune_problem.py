@@ -30,6 +30,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
@@ -83,7 +84,6 @@ from vrw_jax.studies.tune_objective import (
     zero_objective,
 )
 from vrw_jax.studies.tune_result import ActiveConstraint, TuneResult, WalkValidation
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     format_heading_and_rows,
     format_html_table,
@@ -14,7 +15,6 @@ from vrw_jax.base.printing import (
 from vrw_jax.models.measures import MEASURES, get_measure
 from vrw_jax.studies.tune_exploration import ExplorationResult
 from vrw_jax.studies.tune_maximization import TuneStatus
-from vrw_jax.wheel.outcomes import Outcome
 from vrw_jax.wheel.params import WheelParams
 
 NO_ACTIVE_CONSTRAINT_TEXTS = {

@@ -1,4 +1,4 @@
-"""Outcomes of a step, contact modes of a foot, and wheels that come to rest.
+"""Contact modes of a foot, and wheels that come to rest.
 
 For a wheel at rest, round-off decides which guard ends the step, or whether any guard does. The
 outcome therefore depends only on the state at the end of the step. It is the same with every
@@ -13,56 +13,8 @@ from enum import IntEnum
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.printing import StatusCode
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise
-
-
-class Outcome(StatusCode):
-    """Outcome of a step. Only a step with the outcome STEPPED ends in a section state. Every other
-    outcome ends the walk.
-
-    Examples:
-        >>> vrw.Outcome.FELL_BACK.meaning
-        'The wheel stopped rolling forward and would fall back.'
-        >>> vrw.Outcome(0).name
-        'STEPPED'
-    """
-
-    STEPPED = 0, "The wheel stepped from touchdown to touchdown."
-    TOUCHDOWN_BEFORE_STOPPER = (
-        1, "The next foot met the ground before Leg 2 was back at its stopper."
-    )  # fmt: skip
-    STOPPER_IN_DOUBLE_SUPPORT = (
-        2, "Leg 2 reached its stopper while its foot was still on the ground."
-    )  # fmt: skip
-    FELL_BACK = 3, "The wheel stopped rolling forward and would fall back."
-    COLLAPSED = 4, "A loaded leg collapsed to where its mass meets the hub: the wheel fell."
-    LEG_1_LIFTED_OFF = 5, "The ground would have to pull on Leg 1's foot: it lifts off."
-    NO_TOUCHDOWN_IN_TIME = 6, "No touchdown came within the allowed time of one phase."
-    SOLVER_FAILED = 7, "The integrator ran out of steps or could not locate an event."
-    BAD_INPUT = 8, "A parameter or the start is not finite, or outside its domain."
-    NO_CYCLE_FOUND = (
-        9, "The search for a limit cycle did not converge: there may be one that it missed."
-    )  # fmt: skip
-    TOO_MANY_EVENTS = 10, "Contacts and stoppers changed more often than one step may."
-    NO_ADMISSIBLE_CONTACT = (
-        11, "No combination of contact modes was found that satisfies Coulomb's law in an impact."
-    )  # fmt: skip
-    THREE_FEET_LOADED = 12, "Three feet would have to carry load at once."
-    MESH_TOO_COARSE = (
-        13, "A cycle solves the equations, but the mesh is too coarse: give more intervals."
-    )  # fmt: skip
-    EVENT_ORDER_MISMATCH = (
-        14, "A cycle solves the equations, but its events do not come in the paper's order."
-    )  # fmt: skip
-    BRANCH_ENDS_BEFORE_TARGET = (
-        16, "No cycle was found; followed from Table 1 to this wheel, the gait ends on the way."
-    )  # fmt: skip
-    PAINLEVE_PARADOX = (
-        15, "Friction is so high that no forces can carry the motion on (Painlevé's paradox)."
-    )  # fmt: skip
-    CAME_TO_REST = 17, "The wheel came to rest: it neither rolls on nor falls back."
-
 
 POSSIBLE_OUTCOMES_AT_REST = (Outcome.FELL_BACK, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
 """Outcomes with which a step can end before the wheel is recognized to be at rest."""

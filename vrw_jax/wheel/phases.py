@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.base.elementwise import compute_sine_cosine
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import (
@@ -28,7 +29,7 @@ from vrw_jax.wheel.dynamics import (
     compute_landing_foot_height,
     compute_rear_foot_height,
 )
-from vrw_jax.wheel.outcomes import Outcome, are_coordinates_at_rest
+from vrw_jax.wheel.outcomes import are_coordinates_at_rest
 from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
 SHARED_FAILURE_OUTCOMES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
