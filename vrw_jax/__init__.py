@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from vrw_jax.app.explorer import explore
 from vrw_jax.base.checks import format_name_suggestion
+from vrw_jax.base.measures import measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import parameter
 from vrw_jax.base.start import start_jax
+from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
 from vrw_jax.branches.continuation import continue_branch, continue_branches
@@ -65,7 +67,9 @@ from vrw_jax.wheel.params import WheelParams
 
 __all__ = (
     "MEASURES",
+    "AbstractWalker",
     "AbstractWheel",
+    "AdvanceResult",
     "ArclengthOptions",
     "BasinShare",
     "Branch",
@@ -119,6 +123,7 @@ __all__ = (
     "limit_cycle",
     "limit_cycles",
     "map_special_points",
+    "measure",
     "measure_basins",
     "measure_gait_sensitivity",
     "measure_to_tolerance",

@@ -12,8 +12,8 @@ import vrw_jax as vrw
 from vrw_jax.base import progress
 
 QUICK_FUNCTIONS = {
-    "default_margins", "explore", "grid", "open_scan", "paper_start", "parameter", "saltelli",
-    "samples", "sobol", "sobol_indices", "start_jax", "uniform",
+    "default_margins", "explore", "grid", "measure", "open_scan", "paper_start", "parameter",
+    "saltelli", "samples", "sobol", "sobol_indices", "start_jax", "uniform",
 }  # fmt: skip
 """Public functions that compile nothing and read or compute for less than a second."""
 

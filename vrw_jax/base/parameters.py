@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 
 from vrw_jax.base.checks import check_real
 
@@ -112,3 +113,25 @@ def list_parameters(module: eqx.Module | None, prefix: str) -> Iterator[ModulePa
             domain = domain._replace(symbol=domain.symbol or field.name)
             default = 1.0 if field.default is dataclasses.MISSING else field.default
             yield ModuleParameter(name, value, domain, default)
+
+
+def list_tree_parameters(params: Any) -> list[ModuleParameter]:
+    """Return the parameters in a tree of dictionaries, sequences and modules, in leaf order.
+
+    A nested parameter has a name with dots, such as `leg.damping`.
+    """
+    parameters = []
+    for path, value in jax.tree_util.tree_flatten_with_path(params)[0]:
+        owner, names, domain = params, [], _UNDECLARED_DOMAIN
+        for key in path:
+            name: Any = getattr(key, "name", getattr(key, "key", getattr(key, "idx", None)))
+            names.append(str(name))
+            if isinstance(key, jax.tree_util.GetAttrKey):
+                fields = {field.name: field for field in dataclasses.fields(owner)}
+                domain = fields[name].metadata.get("domain", _UNDECLARED_DOMAIN)
+                owner = getattr(owner, name)
+            else:
+                owner, domain = owner[name], _UNDECLARED_DOMAIN
+        domain = domain._replace(symbol=domain.symbol or names[-1])
+        parameters.append(ModuleParameter(".".join(names), value, domain, 1.0))
+    return parameters

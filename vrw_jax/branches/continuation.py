@@ -27,6 +27,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import is_own_walker
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Branch, SpecialPoint
 from vrw_jax.branches.branch_location import (
@@ -44,7 +45,6 @@ from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS, BranchWheel
 from vrw_jax.branches.hybrid_branch import continue_hybrid_branch
 from vrw_jax.branches.map_branch import check_arclength_options, make_stability_variables
 from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
-from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.gait_search import resolve_model
@@ -180,7 +180,7 @@ def continue_branch(
     *,
     cycle: Any = None,
     period_n: int = 1,
-    model: ModelLike | HybridSystem | None = None,
+    model: ModelLike | None = None,
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
@@ -211,8 +211,8 @@ def continue_branch(
     model is violated, the branch has a special point with the name of the margin. Beyond this point
     unilateral contact would be selected.
 
-    For a `HybridSystem`, `params` are its parameters, `name` is that of one of their entries, and
-    `cycle` is the `HybridGait` at `params`. Special points are its bifurcations, the changes of its
+    For a `HybridSystem` or another walker of yours, `params` are its parameters, `name` is that of
+    one of their entries, and `cycle` is the `HybridGait` at `params`. Special points are its bifurcations, the changes of its
     sequence of events ("order_of_events_changes"), and the zeros of `margins`. A branch that ends
     where an orbit touches a guard has the zero of a margin there.
 
@@ -249,7 +249,7 @@ def continue_branch(
         >>> print(point.name, f"{point.value:.6f}", branch.ends[1])
         lambda_4_plus 219.847688 lambda 4 plus at 219.847688 ends it.
     """
-    if isinstance(model, HybridSystem):
+    if is_own_walker(model):
         check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
         return continue_hybrid_branch(
             model, params, name, bounds, cycle, period_n, step_options, options, margins, switch_at

@@ -1,4 +1,4 @@
-"""Branches of hybrid systems along one of their parameters."""
+"""Branches of a user's walkers along one of their parameters."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from jaxtyping import Array
 
 from vrw_jax.base.checks import check_callable, check_int, check_type, require_known_name
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.walker import AbstractWalker, make_return_map, step_batch_of_walker
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Branch, SpecialPoint
 from vrw_jax.branches.branch_location import (
@@ -29,7 +31,6 @@ from vrw_jax.branches.branch_location import (
 from vrw_jax.branches.map_branch import SWITCHED_KINDS, AbstractMapContinuation, trace_map_branch
 from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins
-from vrw_jax.flow.hybrid_simulation import Termination
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.flow.phase_integration import integrate_phase
 from vrw_jax.gaits.hybrid_gait import HybridGait, find_hybrid_gait
@@ -43,9 +44,9 @@ MAX_PERIOD_CHANGE_AT_JUMP = 0.01
 
 @dataclass(frozen=True)
 class HybridGaitFinder:
-    """Gaits of a hybrid system along the parameter `name`. The search can be pickled."""
+    """Gaits of a walker along the parameter `name`. The search can be pickled."""
 
-    system: HybridSystem
+    walker: AbstractWalker
     params: Any
     name: str
     period_n: int
@@ -54,12 +55,12 @@ class HybridGaitFinder:
     def find(self, section_state: np.ndarray, p: float) -> HybridGait:
         """Return the gait near a section state at the value p of the parameter."""
         params = replace_parameter(self.params, self.name, p)
-        return find_hybrid_gait(self.system, params, section_state, self.period_n, self.options)
+        return find_hybrid_gait(self.walker, params, section_state, self.period_n, self.options)
 
 
 @dataclass(frozen=True)
 class HybridContinuation(AbstractMapContinuation):
-    """Continuation of the gaits of a hybrid system, with margins and the sequence of events."""
+    """Continuation of the gaits of a walker, with margins and, if known, the order of events."""
 
     _: KW_ONLY
     gait_finder: HybridGaitFinder
@@ -89,35 +90,39 @@ class HybridContinuation(AbstractMapContinuation):
         finder, states = self.gait_finder, self.state_units * points.z
         params = replace_parameter(wheels, finder.name, points.p)
         quantities = {"x": states, "period": np.zeros(len(states))}
-        codes, termination = [], np.full(len(states), int(Termination.SECTION_REACHED))
+        codes, outcome = [], np.full(len(states), int(Outcome.STEPPED))
         minima = np.full((len(states), len(self.margins)), np.inf)
         for _ in range(finder.period_n):
-            step = finder.system.step_batch(params, states, finder.options)
+            step = step_batch_of_walker(finder.walker, params, states, finder.options)
             if self.margins:
                 functions = tuple(function for _, function in self.margins)
                 step_minima = _measure_margins(
-                    finder.system, functions, params, states, step.n_events, finder.options
+                    finder.walker, functions, params, states, step.n_events, finder.options
                 )
                 minima = np.minimum(minima, step_minima)
             quantities["period"] = quantities["period"] + step.duration
-            codes.append(np.column_stack([step.n_events, step.events]))
-            termination = np.where(step.is_complete, termination, step.termination)
+            if isinstance(finder.walker, HybridSystem):
+                codes.append(np.column_stack([step.n_events, step.events]))
+            outcome = np.where(outcome == Outcome.STEPPED, step.outcome, outcome)
             states = step.section_state
         return quantities | {
             EVENT_ORDER: np.array(
-                [zlib.crc32(row.tobytes()) for row in np.concatenate(codes, 1)], float
+                [
+                    zlib.crc32(row.tobytes())
+                    for row in np.concatenate([np.zeros((len(states), 1)), *codes], 1)
+                ],
+                float,
             ),
-            "termination": termination,
+            "outcome": outcome,
             **{name: minima[:, i] for i, (name, _) in enumerate(self.margins)},
         }
 
     def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
-        return quantities["termination"] == Termination.SECTION_REACHED
+        return quantities["outcome"] == Outcome.STEPPED
 
     def name_branch_end(self, quantities: QuantitiesByName, point_index: int) -> str:
-        termination = Termination(int(quantities["termination"][point_index]))
-        is_complete = termination == Termination.SECTION_REACHED
-        return ADMISSIBILITY if is_complete else termination.name.lower()
+        outcome = Outcome(int(quantities["outcome"][point_index]))
+        return ADMISSIBILITY if outcome == Outcome.STEPPED else outcome.name.lower()
 
     def is_same_gait(self, before: PointTable, after: PointTable) -> np.ndarray:
         periods, new_periods = (table.quantities["period"] for table in (before, after))
@@ -167,7 +172,7 @@ def _measure_margins(
 
 
 def continue_hybrid_branch(
-    system: HybridSystem,
+    walker: AbstractWalker,
     params: Any,
     name: str,
     bounds: tuple[float, float],
@@ -178,21 +183,26 @@ def continue_hybrid_branch(
     margins: MarginFunctions | None,
     switch_at: SpecialPoint | None,
 ) -> Branch:
-    """Return the branch of `continue_branch` for a hybrid system."""
+    """Return the branch of `continue_branch` for a walker of the user."""
     check_int("period_n", period_n)
     step_options = StepOptions() if step_options is None else step_options
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
     check_type("margins", margins, (Mapping, type(None)), "give a dictionary of functions by name")
     margins = dict(margins or {})
+    if margins and not isinstance(walker, HybridSystem):
+        raise ValueError(
+            f"margins are minima over the motion, which a {type(walker).__name__} does not define: "
+            "give a vrw.HybridSystem, or leave them out."
+        )
     for margin_name, margin in margins.items():
         check_callable(f"margin {margin_name!r}", margin, "of state and parameters")
     n_periods = SWITCHED_KINDS.get(switch_at.kind, 1) if isinstance(switch_at, SpecialPoint) else 1
     start_value = float(find_parameter(params, name))
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
-    finder = HybridGaitFinder(system, params, name, n_periods * period_n, step_options)
+    finder = HybridGaitFinder(walker, params, name, n_periods * period_n, step_options)
 
     def map_section_state(params: Any, x: Array, value: Array) -> Array:
-        take_step = system.return_map(replace_parameter(params, name, value), step_options)
+        take_step = make_return_map(walker, replace_parameter(params, name, value), step_options)
         for _ in range(period_n):
             x = take_step(x)
         return x

@@ -21,13 +21,23 @@ from vrw_jax import lanes
 from vrw_jax.base.checks import (
     check_callable,
     check_int,
-    check_reals,
     check_type,
     require_known_name,
 )
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import describe_step_ending
 from vrw_jax.base.types import Scalar
+from vrw_jax.base.walker import (
+    AbstractWalker,
+    AdvanceResult,
+    check_arguments,
+    compile_step,
+    find_batch_axes,
+    make_return_map,
+    step_batch_of_walker,
+)
 from vrw_jax.flow.diffrax_minima import StateArray
 from vrw_jax.flow.hybrid_simulation import (
     Event,
@@ -41,6 +51,21 @@ from vrw_jax.flow.hybrid_simulation import (
 
 MAX_EVENTS_PER_STEP = 16
 """Default limit of the events in one step, chosen above those of walkers with several legs."""
+
+
+OUTCOME_BY_TERMINATION = np.array(
+    [
+        Outcome.TOO_MANY_EVENTS,
+        Outcome.NO_TOUCHDOWN_IN_TIME,
+        Outcome.TOO_MANY_EVENTS,
+        Outcome.BAD_INPUT,
+        Outcome.SOLVER_FAILED,
+        Outcome.SOLVER_FAILED,
+        Outcome.STEPPED,
+    ],
+    np.int32,
+)
+"""Outcome of a step by the `Termination` of its simulation."""
 
 
 class HybridStep(NamedTuple):
@@ -65,6 +90,17 @@ class HybridStep(NamedTuple):
     termination: Int[Array, ""]
 
     @property
+    def durations(self) -> Any:
+        """Return the durations of all modes, s."""
+        return self.mode_durations
+
+    @property
+    def outcome(self) -> Any:
+        """Return the `Outcome` of the step, whose codes are the same for all walkers."""
+        array_module: Any = jnp if isinstance(self.termination, jax.Array) else np
+        return array_module.asarray(OUTCOME_BY_TERMINATION)[self.termination]
+
+    @property
     def is_complete(self) -> Any:
         """Return whether the step has reached the section."""
         return self.termination == Termination.SECTION_REACHED
@@ -75,8 +111,8 @@ class HybridStep(NamedTuple):
         return describe_step_ending(self.termination, Termination)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class HybridSystem:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class HybridSystem(AbstractWalker):
     """A walker, or another hybrid system, defined by its modes, guards and resets.
 
     Use it for your own legs and walkers: one step in a batch of thousands takes microseconds, and
@@ -87,11 +123,15 @@ class HybridSystem:
     - `modes`: a `Mode(field, guards)` for each name. The guards of a mode are a dictionary, and the
       `target_mode` of a `Guard` is the name of a mode;
     - `section`: name of the guard whose event ends a step, in any mode;
-    - `state`: names of the coordinates of the state;
+    - `state`: names of the coordinates of the state, or their units by name;
     - `project`, `embed`: functions from state and parameters to section coordinates and back,
       `project(y, params)` after the reset of the section's event, and `embed(x, params)`. By
       default, the section coordinates are the whole state;
     - `invariants`: functions of state and parameters that a step conserves, such as the energy;
+    - `coordinates`: units of the section coordinates by name, such as {"angle": "rad"};
+    - `starts`: function of the parameters that returns section coordinates, one row for each start,
+      from which the search for a gait begins if no guess is given;
+    - `measures`: measures of its gaits, see `vrw.measure`;
     - `max_events`: largest number of events in one step.
 
     Examples:
@@ -112,10 +152,13 @@ class HybridSystem:
 
     modes: Mapping[str, Mode]
     section: str
-    state: Sequence[str]
+    state: Sequence[str] | Mapping[str, str]
     project: Callable[[StateArray, Any], Array] = lambda y, params: y
     embed: Callable[[Array, Any], StateArray] = lambda x, params: x
     invariants: Sequence[Callable[[StateArray, Any], Scalar]] = ()
+    coordinates: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    starts: Callable[[Any], Any] | None = None
+    measures: Sequence[Measure] = ()
     max_events: int = MAX_EVENTS_PER_STEP
 
     def __post_init__(self) -> None:
@@ -150,6 +193,14 @@ class HybridSystem:
                 f"{self.section!r} leads to the modes {sorted(self._start_modes)}, but each step "
                 "begins in one mode: give the other guards another name."
             )
+
+    def evaluate_invariants(self, params: Any, x: Array) -> Array:
+        y = self.embed(x, params)
+        return jnp.stack([invariant(y, params) for invariant in self.invariants])
+
+    def __repr__(self) -> str:
+        modes = ", ".join(f"{name}: {'/'.join(mode.guards)}" for name, mode in self.modes.items())
+        return f"HybridSystem({modes}; section {self.section!r})"
 
     @property
     def guard_names(self) -> tuple[str, ...]:
@@ -191,8 +242,8 @@ class HybridSystem:
             for mode in self.modes.values()
         )
 
-    def _take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
-        """Return one step of one element; `lanes.jit` compiles this function."""
+    def take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
+        """Return one step of one element; `compile_step` compiles this function."""
         modes, n_modes = self._bind_modes(params), len(self.modes)
         first_guards = np.cumsum([0, *(len(mode.guards) for mode in modes)])[:-1]
         section_guards = [
@@ -256,8 +307,7 @@ class HybridSystem:
         Raises:
             TypeError, ValueError: if an argument is invalid, or a function returns a wrong shape.
         """
-        params, x, options = self._check_arguments(params, x, options, 1)
-        return _compile_step(self)(params, x, options)
+        return compile_step(self)(*check_arguments(self, params, x, options, 1))
 
     def step_batch(self, params: Any, x: Any, options: StepOptions | None = None) -> HybridStep:
         """Return one step of each element of a batch, as NumPy arrays, computed on all cores.
@@ -276,9 +326,13 @@ class HybridSystem:
         Raises:
             TypeError, ValueError: as for `step`, or if batches have different lengths.
         """
-        params, x, options = self._check_arguments(params, x, options, 2)
-        return _compile_step(self).batch(
-            params, x, options, in_axes=self._find_batch_axes(params, x)
+        return step_batch_of_walker(self, params, x, options)
+
+    def advance(self, params: Any, x: Array, options: StepOptions) -> AdvanceResult:
+        """Return the end of one step of one element."""
+        step = compile_step(self)(params, x, options)
+        return AdvanceResult(
+            step.section_state, step.mode_durations, step.outcome, step.solver_steps
         )
 
     def simulate(
@@ -306,7 +360,7 @@ class HybridSystem:
         Raises:
             TypeError, ValueError: if an argument is invalid, or a function returns a wrong shape.
         """
-        params, start, options = self._check_arguments(params, start, options, 1, "start")
+        params, start, options = check_arguments(self, params, start, options, 1, "start")
         return _compile_simulation(self, check_int("events", events), self._find_mode(mode))(
             params, start, options
         )
@@ -325,13 +379,9 @@ class HybridSystem:
         The arguments are those of `simulate`. Parameters that are arrays have the batch on their
         first axis, and `start` has the shape (batch, dim), or (dim,) for all elements.
         """
-        params, start, options = self._check_arguments(params, start, options, 2, "start")
+        params, start, options = check_arguments(self, params, start, options, 2, "start")
         simulate = _compile_simulation(self, check_int("events", events), self._find_mode(mode))
-        return simulate.batch(params, start, options, in_axes=self._find_batch_axes(params, start))
-
-    def _find_batch_axes(self, params: Any, x: Array) -> tuple:
-        axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, params)
-        return axes, 0 if x.ndim == 2 else None, None
+        return simulate.batch(params, start, options, in_axes=find_batch_axes(params, start))
 
     def return_map(
         self, params: Any, options: StepOptions | None = None
@@ -340,46 +390,23 @@ class HybridSystem:
 
         The map returns NaN if the step fails, so that its last state is not taken for a return.
         """
+        return make_return_map(self, params, StepOptions() if options is None else options)
 
-        def map_section_state(x: Array) -> Array:
-            step = self.step(params, x, options)
-            factor = jnp.where(step.is_complete, 1.0, jnp.nan)
-            return step.section_state * factor
-
-        return map_section_state
-
-    def _check_arguments(
-        self, params: Any, x: Any, options: StepOptions | None, max_axes: int, name: str = "x"
-    ) -> tuple[Any, Array, StepOptions]:
-        """Return parameters, section coordinates or a start, and options, or raise an error."""
-        options = StepOptions() if options is None else options
-        check_type("options", options, StepOptions, "give vrw.StepOptions()")
-        params = jax.tree.map(lambda leaf: check_reals("a parameter", leaf), params)
-        x = check_reals(name, x)
-        if not 1 <= x.ndim <= max_axes:
-            shapes = "(n,)" if max_axes == 1 else "(n,) or (batch, n)"
-            raise ValueError(f"{name} has shape {x.shape}, but its shape must be {shapes}.")
-        one_x = jax.ShapeDtypeStruct(x.shape[-1:], x.dtype)
-        one_params = jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct(leaf.shape[max_axes - 1 :], leaf.dtype), params
-        )
-        start = jax.eval_shape(self.embed, one_x, one_params) if name == "x" else one_x
+    def check_definition(self, params: Any, x: Any, name: str) -> None:
+        start = jax.eval_shape(self.embed, x, params) if name == "x" else x
         self._require_shape("embed" if name == "x" else name, start, (len(self.state),))
         if name == "x":
-            end = jax.eval_shape(self.project, start, one_params)
-            self._require_shape("project", end, one_x.shape)
+            self._require_shape("project", jax.eval_shape(self.project, start, params), x.shape)
         for mode_name, mode in self.modes.items():
-            field = jax.eval_shape(mode.field, start, one_params)
+            field = jax.eval_shape(mode.field, start, params)
             self._require_shape(f"the field of {mode_name!r}", field, start.shape)
             for guard_name, guard in mode.guards.items():
                 place = f"{guard_name!r} in {mode_name!r}"
                 value, reset = (
-                    jax.eval_shape(f, start, one_params) for f in (guard.evaluate, guard.reset)
+                    jax.eval_shape(f, start, params) for f in (guard.evaluate, guard.reset)
                 )
                 self._require_shape(f"the guard {place}", value, ())
                 self._require_shape(f"the reset of {place}", reset, start.shape)
-        options.check_tolerances(start.dtype)
-        return params, x, options
 
     def _require_shape(self, function_name: str, result: Any, shape: tuple[int, ...]) -> None:
         if getattr(result, "shape", None) != shape:
@@ -387,12 +414,6 @@ class HybridSystem:
                 f"{function_name} gives {getattr(result, 'shape', type(result).__name__)}, but the "
                 f"coordinates of the state are {self.state}: give an array of shape {shape}."
             )
-
-
-@functools.lru_cache
-def _compile_step(system: HybridSystem) -> Any:
-    """Return the compiled step, the same for each call, so that JAX traces it once."""
-    return lanes.jit(system._take_step)
 
 
 @functools.lru_cache

@@ -19,10 +19,8 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
-from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.stepping import walk
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
-from vrw_jax.wheel.params import WheelParams
 
 
 class PeriodicWalkEnds(NamedTuple):
@@ -39,7 +37,7 @@ class PeriodicWalkEnds(NamedTuple):
 
 @eqx.filter_jit
 def _simulate_block_of_starts(
-    model: AbstractWheel, options: StepOptions, n_steps: int, params: WheelParams, x: Array
+    model: Any, options: StepOptions, n_steps: int, params: Any, x: Array
 ) -> tuple[Array, Array]:
     """Return the section states and outcomes after each step of one round of walking steps.
 
@@ -52,7 +50,7 @@ def _simulate_block_of_starts(
 
 
 def _simulate_starts_with_contact(
-    model: Any, options: StepOptions, n_steps: int, params: WheelParams, x: np.ndarray
+    model: Any, options: StepOptions, n_steps: int, params: Any, x: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the section states and outcomes of one round of walking steps with unilateral contact.
 
@@ -70,7 +68,7 @@ def _simulate_starts_with_contact(
     return np.stack(states_by_step, 1), np.stack(outcomes_by_step[1:], 1)
 
 
-def _stack_contact_parameters(model: Any, params: WheelParams) -> np.ndarray:
+def _stack_contact_parameters(model: Any, params: Any) -> np.ndarray:
     """Return the parameters of wheels with unilateral contact, shape (parameters, wheels)."""
     return np.asarray(jax.vmap(model.collect_parameter_values)(params)).T
 
@@ -83,9 +81,9 @@ MAX_DISTANCE_ON_ARRIVAL = 1e-3
 
 
 def walk_until_periodic(
-    params: WheelParams,
+    params: Any,
     start_states: np.ndarray,
-    model: AbstractWheel,
+    model: Any,
     options: StepOptions,
     max_steps: int,
     max_period: int,
@@ -109,7 +107,7 @@ def walk_until_periodic(
     simulate_round: Callable[..., tuple] = functools.partial(
         _simulate_starts_with_contact, model, options, N_STEPS_PER_ROUND
     )
-    if model.batch_kernel != "legs":
+    if getattr(model, "batch_kernel", "") != "legs":
         simulate_round = functools.partial(
             map_in_batches,
             functools.partial(_simulate_block_of_starts, model, options, N_STEPS_PER_ROUND),
@@ -142,7 +140,9 @@ def walk_until_periodic(
         states_of_walk = state_history[i, : n_steps_to_orbit[i] + 1]
         last_period_states = states_of_walk[-orbit_periods[i] :]
         orbit_states[i, : orbit_periods[i]] = np.roll(
-            last_period_states, -int(np.argmin(last_period_states[:, 1])), axis=0
+            last_period_states,
+            -int(np.argmin(last_period_states[:, min(1, start_states.shape[1] - 1)])),
+            axis=0,
         )
         orbit_distances = np.linalg.norm(states_of_walk[:, None] - last_period_states, axis=-1).min(
             1
@@ -208,14 +208,14 @@ def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> tuple[np.ndarray, list[
 
 @eqx.filter_jit
 def _measure_steps_of_block(
-    model: AbstractWheel, options: StepOptions, params: WheelParams, x: Array
+    model: Any, options: StepOptions, params: Any, x: Array
 ) -> dict[str, Array]:
     """Return all measures of one step from each start in a batch, by name."""
     return jax.vmap(lambda p, x: model.take_step(p, x, options).measures())(params, x)
 
 
 def measure_orbit_steps(
-    params: WheelParams, section_states: np.ndarray, model: AbstractWheel, options: StepOptions
+    params: Any, section_states: np.ndarray, model: Any, options: StepOptions
 ) -> dict[str, np.ndarray]:
     """Return all measures of one step from each section state, by name.
 

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.slope_response import SlopeResponse, compute_step_slope_response
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.measures import FORCE_PEAK_MEASURES
+from vrw_jax.models.measures import FORCE_PEAK_MEASURES, get_measure
 from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.wheel.params import WheelParams
 
@@ -56,10 +56,10 @@ class Gait(eqx.Module):
     batch axis comes first.
     """
 
-    cycle: AbstractCycle
-    step: AbstractStep  # event-driven step from the cycle's section state
-    cycle_derivatives: AbstractCycle
-    step_derivatives: AbstractStep
+    cycle: Any  # an `AbstractCycle`, or a `HybridGait`
+    step: Any  # event-driven step from the cycle's section state
+    cycle_derivatives: Any
+    step_derivatives: Any
     branch_point: GaitBranchPoint
 
     @property
@@ -137,7 +137,7 @@ class AbstractGaitFinder(eqx.Module):
     Packages above `gaits` use only this interface. `make_finder` selects the class.
     """
 
-    model: eqx.AbstractVar[AbstractWheel]
+    model: eqx.AbstractVar[Any]
     n_legs: eqx.AbstractVar[int]
     step_options: eqx.AbstractVar[StepOptions]
     options_type: eqx.AbstractClassVar[type]  # type of the options that `limit_cycle` accepts
@@ -209,7 +209,7 @@ class AbstractGaitFinder(eqx.Module):
 
     def find_cycle_from_values(
         self, parameter_values: ParameterValues, cycle_guess: Any = None, **search_options: bool
-    ) -> AbstractCycle:
+    ) -> Any:
         """Find the cycle near `cycle_guess` for the wheel that `parameter_values` describes.
 
         - `search_options`: further arguments of `find_cycle`.
@@ -253,6 +253,15 @@ class AbstractGaitFinder(eqx.Module):
         return _compute_step_slope_response(
             self.model, params, cycle.section_state, tuple(measure_names), self.step_options
         )
+
+    def get_measure(self, name: str) -> Measure:
+        """Return unit and description of a measure of the gaits."""
+        return get_measure(name)
+
+    @property
+    def measure_reader(self) -> Callable:
+        """Return a function of a measure's name, a cycle and a step that returns the measure."""
+        return type(self).read_measure
 
     @classmethod
     def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:

@@ -11,14 +11,17 @@ from jaxtyping import Array
 from vrw_jax.base.checks import check_int, check_type, has_traced_leaf
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import format_numbers
+from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder import AbstractGaitFinder
+from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
+from vrw_jax.gaits.walker_finder import make_walker_finder
 from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.stepping import (
     ModelLike,
@@ -27,7 +30,6 @@ from vrw_jax.models.stepping import (
     convert_step_options,
     require_single_wheel,
 )
-from vrw_jax.wheel.params import WheelParams
 
 UserCycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
 """Guess that a user provides: a similar wheel's cycle, or a section state near the gait."""
@@ -78,6 +80,8 @@ def check_cycle_guess(cycle_guess: Any) -> Any:
     """
     if cycle_guess is None or isinstance(cycle_guess, AbstractCycle | CollocationState):
         return cycle_guess
+    if isinstance(cycle_guess, HybridGait):
+        return cycle_guess.section_state
     section_state = convert_section_state(cycle_guess, "guess")
     if not has_traced_leaf(section_state) and not np.isfinite(section_state).all():
         raise ValueError(
@@ -88,15 +92,21 @@ def check_cycle_guess(cycle_guess: Any) -> Any:
 
 
 def resolve_finder(
-    params: WheelParams,
+    params: Any,
     model: ModelLike | None,
     options: CycleOptions | StepOptions | None,
     period_n: int = 1,
+    guess: Any = None,
 ) -> AbstractGaitFinder:
     """Check the arguments of a search, and return the gait finder for a model and options.
 
     Raise TypeError or ValueError if the arguments do not fit the model.
     """
+    if is_own_walker(model):
+        step_options: Any = options
+        return make_walker_finder(
+            model, params, convert_step_options(step_options), guess, period_n
+        )
     require_single_wheel(
         params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan"
     )

@@ -28,7 +28,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.base.walker import AbstractWalker, is_own_walker
 from vrw_jax.gaits.attracting_gaits import find_attracting_gaits, find_slowest_gait_indices
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.collocation_search import CollocationState
@@ -44,7 +44,7 @@ from vrw_jax.gaits.further_search import (
     search_further,
     transfer_to_mesh,
 )
-from vrw_jax.gaits.hybrid_gait import HybridGait, find_hybrid_gait
+from vrw_jax.gaits.hybrid_gait import HybridGait, find_hybrid_gait, find_hybrid_gaits
 from vrw_jax.gaits.last_gait import describe_last_gait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
@@ -95,9 +95,9 @@ def limit_cycle(
 def limit_cycle(
     params: Any,
     *,
-    guess: Any,
+    guess: Any = None,
     period_n: int = 1,
-    model: HybridSystem,
+    model: AbstractWalker,
     options: StepOptions | None = None,
 ) -> HybridGait: ...
 
@@ -109,7 +109,7 @@ def limit_cycle(
     *,
     guess: Any = None,
     period_n: int = 1,
-    model: ModelLike | HybridSystem | None = None,
+    model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
     on_failure: FailureFillName = "zeros",
     which: GaitChoice = "slowest",
@@ -139,8 +139,9 @@ def limit_cycle(
     for the gait on its ground. A `LimitCycle` then belongs to the paper's model, a `ReturnMapCycle`
     to unilateral contact.
 
-    For a `HybridSystem`, `params` are its parameters, and Newton's method starts at the `guess`,
-    section coordinates near the gait. The result is a `HybridGait`.
+    For a `HybridSystem` or another walker of yours, `params` are its parameters. Newton's method
+    starts at the `guess`, section coordinates near the gait, or at the walker's `starts`. The
+    result is a `HybridGait`.
 
     Args:
         params: the wheel.
@@ -154,7 +155,7 @@ def limit_cycle(
             speed.
 
     Returns:
-        A `LimitCycle`; a `ReturnMapCycle` for other models, a `HybridGait` for a `HybridSystem`.
+        A `LimitCycle`; a `ReturnMapCycle` for other models, a `HybridGait` for a walker of yours.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -168,7 +169,7 @@ def limit_cycle(
         0.000115 per N s/m
     """
     parse_gait_choice(which)
-    if isinstance(model, HybridSystem):
+    if is_own_walker(model):
         return find_hybrid_gait(model, params, guess, period_n, options)
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, period_n)
@@ -188,28 +189,33 @@ def limit_cycle(
 @with_default_jax_settings
 @announce_wait("the search for gaits", "10 s, or 50 s if it finds no gait")
 def limit_cycles(
-    params: WheelParams,
+    params: Any,
     *,
+    guess: Any = None,
     period_n: int = 1,
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
     which: GaitChoice = "slowest",
-) -> LimitCycle | ReturnMapCycle:
+) -> LimitCycle | ReturnMapCycle | HybridGait:
     """Find the limit cycles of a batch of wheels, as `limit_cycle` does for one wheel.
 
     Fields of `params` and of the result have one leading axis. All cycles are computed on one mesh,
     which is as fine as any of the cycles requires. For a single wheel with unilateral contact, all
-    attracting gaits are returned, in the order of increasing speed.
+    attracting gaits are returned, in the order of increasing speed. An element without a gait has a
+    code in `outcome`, and never stops the batch.
 
     Args:
-        params: the wheels; fields are scalars or of shape (wheels,).
+        params: the wheels; fields are scalars or of shape (wheels,). For a walker of yours, its
+            parameters.
+        guess: for a walker of yours, section coordinates for all elements or one row for each.
         period_n: number of gait steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: as in `limit_cycle`.
         which: as in `limit_cycle`, for batches.
 
     Returns:
-        A `LimitCycle` or `ReturnMapCycle` whose fields have a leading axis over the wheels.
+        A `LimitCycle`, `ReturnMapCycle` or `HybridGait` whose fields have a leading axis over the
+        batch.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -219,8 +225,15 @@ def limit_cycles(
         >>> cycles.found.tolist(), cycles.period.round(3).tolist()
         ([True, True, False], [0.595, 0.6980000000000001, 0.0])
     """
-    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=...)")
     parse_gait_choice(which)
+    if is_own_walker(model):
+        return find_hybrid_gaits(model, params, guess, period_n, options)
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=...)")
+    if guess is not None:
+        raise ValueError(
+            "guess is given, but the gaits of many wheels are searched without guesses: leave it "
+            "out, or map vrw.limit_cycle over the batch."
+        )
     checked_model: Any = convert_model_argument(model, allows_friction_arrays=True)
     params = checked_model.attach_leg_force(params)
     batch_shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))

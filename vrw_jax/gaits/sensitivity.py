@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,24 +12,22 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.finder_selection import (
-    UserCycleGuess,
     check_cycle_guess,
     resolve_finder,
 )
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.stepping import ModelLike
-from vrw_jax.wheel.params import WheelParams
 
 
 @announce_wait("the gait with its derivatives", "15 s")
 def sensitivities(
-    params: WheelParams,
+    params: Any,
     *,
     measures: Sequence[str] | None = None,
-    guess: UserCycleGuess | None = None,
+    guess: Any = None,
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
 ) -> xr.Dataset:
@@ -38,10 +37,11 @@ def sensitivities(
     relative change of a measure per relative change of a parameter. It is NaN if the measure is
     zero. If the stability measures are omitted, compilation takes much less time. With unilateral
     contact, friction is also a parameter. With model "auto", `attrs` contains the name of the model
-    that was selected for the gait.
+    that was selected for the gait. For a walker of yours, the measures are the period, the section
+    coordinates and its own `measures`, by all its parameters.
 
     Args:
-        params: the wheel.
+        params: the wheel, or the parameters of a walker of yours.
         measures: names of measures; by default all measures of the model's gait.
         guess: as in `limit_cycle`.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
@@ -59,8 +59,10 @@ def sensitivities(
         1.887
     """
     require_untraced_arguments("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
-    model = resolve_model(params, model)
-    gait_finder = resolve_finder(params, model, options)
+    guess = check_cycle_guess(guess)
+    if not is_own_walker(model):
+        model = resolve_model(params, model)  # type: ignore[arg-type]
+    gait_finder = resolve_finder(params, model, options, guess=guess)
     measure_names = (
         gait_finder.default_measures if measures is None else check_names("measures", measures)
     )
@@ -73,9 +75,7 @@ def sensitivities(
             f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )
     parameter_values = gait_finder.model.collect_parameter_values(params)
-    gait_measures = gait_finder.measure_gait(
-        parameter_values, check_cycle_guess(guess), measure_names
-    )
+    gait_measures = gait_finder.measure_gait(parameter_values, guess, measure_names)
     if int(gait_measures.outcome) != Outcome.STEPPED:
         failure_outcome = Outcome(int(gait_measures.outcome))
         raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
@@ -102,7 +102,7 @@ def sensitivities(
             ),
             "measure_unit": (
                 "measure",
-                [MEASURES[measure_name].unit for measure_name in measure_names],
+                [gait_finder.get_measure(name).unit for name in measure_names],
             ),
             "parameter_unit": (
                 "parameter",

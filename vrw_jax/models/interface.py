@@ -14,8 +14,9 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
+from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.models.capabilities import ModelCapabilities
-from vrw_jax.models.step_results import AdvanceResult, SectionState
+from vrw_jax.models.step_results import SectionState
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import (
     PARAMETER_DOMAINS,
@@ -31,7 +32,7 @@ models, friction coefficients. `with_step_ground` takes the arrays of one step.
 """
 
 
-class AbstractWheel(eqx.Module):
+class AbstractWheel(AbstractWalker, eqx.Module):
     """Model of the wheel.
 
     The classes of models are final, and the rest of the library uses only this interface.
@@ -44,6 +45,7 @@ class AbstractWheel(eqx.Module):
         True
     """
 
+    is_wheel: ClassVar[bool] = True
     model_name: eqx.AbstractClassVar[str]
     """Name of the model that results report."""
     capabilities: eqx.AbstractClassVar[ModelCapabilities]

@@ -21,6 +21,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_each_batch_element
 from vrw_jax.base.types import RealInput, Scalar
+from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET, FullState, embed_section_state
 from vrw_jax.models.interface import AbstractWheel
@@ -30,7 +31,6 @@ from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
     AbstractContactStep,
-    AdvanceResult,
     StepResult,
 )
 from vrw_jax.models.unilateral_wheel import (

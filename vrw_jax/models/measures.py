@@ -9,79 +9,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import ParameterDomain
-from vrw_jax.base.printing import format_mathtext
 from vrw_jax.wheel.params import PARAMETER_DOMAINS
 from vrw_jax.wheel.phases import PAPER_PHASES
-
-
-@dataclass(frozen=True)
-class Measure:
-    """Measured quantity with its name, unit, symbol and description.
-
-    - `unit`: SI unit, "1" for a pure number;
-    - `equation`: equation or section of the paper, "" if there is none;
-    - `leg_dimension`: "leg" if the measure has one value per leg, otherwise "". Margins have values
-      for the locked legs 3 to n, `CONTACT_MEASURES` for every leg;
-    - `violation_text`: clause that states what a negative margin means, otherwise "";
-    - `is_shared`: whether the steps of every model have the measure;
-    - `is_integer_code`: whether the measure is an integer code or count without derivatives;
-    - `is_averaged_over_steps`, `is_largest_over_steps`: whether the measure of several steps is
-      their mean or their maximum instead of their sum.
-    """
-
-    name: str
-    unit: str
-    symbol: str
-    long_name: str
-    description: str
-    equation: str = ""
-    leg_dimension: str = ""
-    violation_text: str = ""
-    is_shared: bool = False
-    is_integer_code: bool = False
-    is_averaged_over_steps: bool = False
-    is_largest_over_steps: bool = False
-
-    @property
-    def mathtext(self) -> str:
-        """Return the symbol as Matplotlib mathtext, without dollar signs."""
-        return format_mathtext(self.symbol)
-
-    @property
-    def label_with_symbol(self) -> str:
-        """Return the long name followed by the symbol, or the long name alone if it contains the
-        symbol.
-        """
-        has_symbol = self.symbol in self.long_name
-        return self.long_name if has_symbol else f"{self.long_name} {self.symbol}"
-
-    @property
-    def display_unit(self) -> str:
-        """Return the unit to be printed, which is "" for a pure number."""
-        return "" if self.unit == "1" else self.unit
-
-    @property
-    def variable_attributes(self) -> dict[str, str]:
-        """Return the attributes for a dataset variable that contains this measure."""
-        measure_attributes = {
-            "units": self.unit,
-            "long_name": self.long_name,
-            "symbol": self.symbol,
-            "description": self.description,
-        }
-        return measure_attributes | ({"equation": self.equation} if self.equation else {})
-
-    def format_with_unit(self, measured_value: object) -> str:
-        """Return a value as text with the unit of this measure and six significant digits."""
-        return f"{float(np.asarray(measured_value)):.6g} {self.display_unit}".strip()
-
 
 _make_leg_measure = functools.partial(Measure, leg_dimension="leg")
 _make_friction_measure = functools.partial(Measure, is_largest_over_steps=True)

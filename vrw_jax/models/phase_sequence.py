@@ -19,9 +19,9 @@ from vrw_jax.base.elementwise import compute_sine_cosine, select_trees_by_condit
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
-    AdvanceResult,
     DoubleSupportIndicators,
     EnergyLoss,
     Margins,

@@ -1,16 +1,19 @@
 """Provenance of results: versions, device, floating-point type, tolerances and parameters."""
 
 import platform
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import list_tree_parameters
 from vrw_jax.lanes.disk_cache import find_library_version
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel.params import WheelParams
 
 
 def collect_provenance_attributes(
-    params: WheelParams, model: object, options: StepOptions | None = None
+    params: Any, model: object, options: StepOptions | None = None
 ) -> dict[str, str | float | int]:
     """Return dataset attributes that describe how a result was computed.
 
@@ -19,12 +22,13 @@ def collect_provenance_attributes(
     """
     options = StepOptions() if options is None else options
     parameter_attributes: dict[str, str | float | int] = {
-        f"parameter_{parameter_name}": float(getattr(params, parameter_name))
-        for parameter_name in PARAMETER_NAMES
-        if getattr(params, parameter_name).ndim == 0
+        f"parameter_{parameter.name}": float(parameter.value)
+        for parameter in list_tree_parameters(params)
+        if jnp.ndim(parameter.value) == 0
     }
+    if isinstance(params, WheelParams):
+        parameter_attributes["parameter_n_legs"] = params.n_legs
     return parameter_attributes | {
-        "parameter_n_legs": params.n_legs,
         "model": repr(model),
         "versions": ", ".join(
             f"{library_name} {find_library_version(library_name)}"
@@ -32,7 +36,7 @@ def collect_provenance_attributes(
         )
         + f", python {platform.python_version()}",
         "device": jax.devices()[0].device_kind,
-        "dtype": str(params.damping.dtype),
+        "dtype": str(jnp.result_type(*jax.tree.leaves(params), float)),
         "solver": options.solver,
         "rtol": float(options.rtol),
         "atol": float(options.atol),

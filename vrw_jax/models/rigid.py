@@ -14,12 +14,12 @@ from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise
+from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.lanes.autodiff import compute_square_root
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_sequence import replace_invalid_inputs, select_stance_line
 from vrw_jax.models.step_results import (
-    AdvanceResult,
     AnySectionState,
     DoubleSupportIndicators,
     EnergyLoss,

@@ -25,15 +25,22 @@ from vrw_jax.base.checks import (
     check_int,
     check_names,
     check_numpy_reals,
+    check_reals,
     check_type,
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import (
+    AbstractWalker,
+    check_parameters,
+    is_own_walker,
+    step_batch_of_walker,
+)
 from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
-from vrw_jax.lanes.batching import map_in_batches
+from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
 from vrw_jax.models.batch_stiffness import (
     IMPLICIT_SOLVER_NAME,
@@ -83,11 +90,11 @@ after the next landing or two rises (see `models.select_stance_line`).
 
 @announce_wait("batches of gait steps", "10 s")
 def step_batch(
-    params: WheelParams,
+    params: Any,
     states: Array | np.ndarray,
     n_steps: int = 1,
     *,
-    model: AbstractWheel | None = None,
+    model: AbstractWalker | None = None,
     options: StepOptions | None = None,
     engine: BatchEngineName = "auto",
     derivatives: Sequence[str] = (),
@@ -118,6 +125,9 @@ def step_batch(
     too. Heights of footholds, as in `walk`, may be given instead of such slopes. Derivatives with
     respect to such an array have the axis over gait steps last.
 
+    For a walker of yours, `params` are its parameters, and `states` are section coordinates. The
+    only engine is "lanes", without derivatives.
+
     Args:
         params: parameters of the wheels. Each field is a scalar or has the shape (elements,); the
             slope may also have the shapes above.
@@ -147,11 +157,17 @@ def step_batch(
     require_untraced_arguments(
         "vrw.step_batch", "map vrw.return_map over the lanes", params, states, heights
     )
+    check_choice("engine", engine, BATCH_ENGINE_NAMES)
+    n_steps, options = check_int("n_steps", n_steps), convert_step_options(options)
+    if is_own_walker(model):
+        if heights is not None or derivatives or engine == "diffrax":
+            raise ValueError(
+                "heights, derivatives and engine are for models of the wheel only: differentiate "
+                "vrw.step of your walker, and map it with jax.vmap."
+            )
+        return _step_batch_of_own_walker(model, params, states, n_steps, options)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
-    options = convert_step_options(options)
-    check_choice("engine", engine, BATCH_ENGINE_NAMES)
-    n_steps = check_int("n_steps", n_steps)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
     checked_section_states = convert_section_state(states, "states", check_numpy_reals)
     values_by_parameter = _check_parameter_shapes(
@@ -196,6 +212,47 @@ def step_batch(
         params.n_legs,
         derivatives,
         element_heights,
+    )
+
+
+def _step_batch_of_own_walker(
+    walker: Any, params: Any, states: Any, n_steps: int, options: StepOptions
+) -> StepBatchResult:
+    params, states = jax.tree.map(np.asarray, (check_parameters(params), check_reals("x", states)))
+    lengths = {len(leaf) for leaf in jax.tree.leaves(params) if leaf.ndim} | {
+        len(x) for x in [states] if x.ndim == 2
+    }
+    if len(lengths) != 1:
+        raise ValueError(
+            f"the batch has the lengths {sorted(lengths)}, but states and parameters that are "
+            "arrays have one common length: give states of shape (batch, n)."
+        )
+    (n_elements,) = lengths
+    x = np.array(np.broadcast_to(states, (n_elements, states.shape[-1])))
+    outcome, n_stepped, solver_steps = (np.zeros(n_elements, np.int32) for _ in range(3))
+    durations = np.zeros((n_elements, 0))
+    arrays, numbers = eqx.partition(params, lambda leaf: leaf.ndim > 0)
+    for _ in range(n_steps):
+        walking = np.flatnonzero(outcome == Outcome.STEPPED)
+        if not walking.size:
+            break
+        rows = eqx.combine(select_tree_rows(arrays, walking), numbers)
+        step = step_batch_of_walker(walker, rows, x[walking], options)
+        if not durations.size:
+            durations = np.zeros((n_elements, step.durations.shape[-1]))
+        x[walking], durations[walking] = step.section_state, step.durations
+        outcome[walking] = step.outcome
+        n_stepped[walking] += step.outcome == Outcome.STEPPED
+        solver_steps[walking] += step.solver_steps
+    return StepBatchResult(
+        np.where((outcome == Outcome.STEPPED)[:, None], x, 0.0),
+        durations,
+        outcome,
+        n_stepped,
+        solver_steps,
+        np.zeros(n_elements, np.int32),
+        "lanes",
+        (options.solver,),
     )
 
 

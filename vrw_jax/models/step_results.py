@@ -377,18 +377,6 @@ class StepResult(AbstractStep):
         }
 
 
-class AdvanceResult(eqx.Module):
-    """Section state, durations and outcome at the end of a step, without indicators and margins."""
-
-    section_state: AnySectionState
-    durations: Float[Array, "3 ..."]  # durations of DLS, SLS-I, SLS-II, s
-    outcome: Int[Array, "..."]  # an Outcome
-    solver_steps: Int[Array, "..."]  # attempted solver steps
-    model_code: Int[Array, "..."] | None = None  # code of the selected model
-    reason_code: Int[Array, "..."] | None = None  # code of the reason
-    engine: str = eqx.field(static=True, default="")  # see `StepOptions`
-
-
 class Trajectory(eqx.Module):
     """States, forces and energies at samples of each phase of one step; both ends are included.
 

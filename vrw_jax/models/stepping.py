@@ -30,12 +30,19 @@ from vrw_jax.base.printing import (
     format_quantity,
 )
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
+from vrw_jax.base.walker import (
+    AbstractWalker,
+    AdvanceResult,
+    check_arguments,
+    check_parameters,
+    compile_step,
+    is_own_walker,
+)
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
 from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
 from vrw_jax.models.registry import describe_accepted_models
-from vrw_jax.models.step_results import AdvanceResult, SectionState, StepResult
+from vrw_jax.models.step_results import SectionState, StepResult
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.params import WheelParams
@@ -45,9 +52,9 @@ SectionStateLike = Array | np.ndarray | Sequence[float]
 
 `convert_step_arguments` converts it to an array.
 """
-ModelLike = AbstractWheel | Literal["auto"]
-"""Model in any form that users may pass. "auto" means `LadderWheel()`, which uses the simplest
-valid model.
+ModelLike = AbstractWalker | Literal["auto"]
+"""Model in any form that users may pass, a walker of theirs included. "auto" means `LadderWheel()`,
+which uses the simplest valid model.
 """
 
 
@@ -77,6 +84,12 @@ def convert_model_argument(
         return _make_default_model()
     if isinstance(model, str) and model == "auto":
         return LadderWheel()
+    if is_own_walker(model):
+        raise TypeError(
+            f"model is {format_value(model)}, but this function computes with equations of the "
+            "wheel, which a walker of yours does not have: the page on your own walker lists the "
+            "functions that take it."
+        )
     if not isinstance(model, AbstractWheel):
         raise TypeError(
             f"model is {format_value(model)}, but a model of the wheel is needed: give "
@@ -250,8 +263,8 @@ def step(
 
 @overload
 def step(
-    params: Any, x: Any, *, model: HybridSystem, options: StepOptions | None = None
-) -> HybridStep: ...
+    params: Any, x: Any, *, model: AbstractWalker, options: StepOptions | None = None
+) -> Any: ...
 
 
 @announce_wait("a gait step", "5 s")
@@ -259,10 +272,10 @@ def step(
     params: Any,
     x: Any,
     *,
-    model: ModelLike | HybridSystem | None = None,
+    model: ModelLike | None = None,
     options: StepOptions | None = None,
     engine: EngineName = "auto",
-) -> StepResult | UnilateralStep | LadderStep | HybridStep:
+) -> Any:
     """Compute one step from touchdown to touchdown, with its indicators, margins and energies.
 
     The `outcome` of the step describes how the step ended. A fall raises no exception. Numerical
@@ -279,7 +292,7 @@ def step(
 
     Returns:
         A `StepResult`; a `UnilateralStep` with unilateral contact, a `LadderStep` for "auto", or a
-        `HybridStep` for a `HybridSystem`, whose parameters are `params`.
+        `HybridStep` for a `HybridSystem`. For a walker of yours, `params` are its parameters.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -289,8 +302,8 @@ def step(
         >>> print(f"{step.period:.3f} s, {vrw.Outcome(int(step.outcome)).name}")
         0.714 s, STEPPED
     """
-    if isinstance(model, HybridSystem):
-        return model.step(params, x, options)
+    if is_own_walker(model):
+        return compile_step(model)(*check_arguments(model, params, x, options, 1))
     params, section_state, model, options = _convert_single_step_arguments(
         params, x, model, options, engine
     )
@@ -343,7 +356,8 @@ class Walk(AbstractPrintable):
 
     - `start`: section state at the start;
     - `steps`: section state, durations and outcome of each step;
-    - `n_stepped`: number of steps before the first failure.
+    - `n_stepped`: number of steps before the first failure;
+    - `units`: units of the section state, for printing.
 
     Examples:
         >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
@@ -354,6 +368,7 @@ class Walk(AbstractPrintable):
     start: Array
     steps: AdvanceResult
     n_stepped: Int[Array, ""]
+    units: str = eqx.field(static=True, default="(rad, rad/s, m/s)")
 
     @property
     def outcome(self) -> Array:
@@ -379,7 +394,7 @@ class Walk(AbstractPrintable):
         return [
             ("outcome", Outcome(int(walk_outcome)).meaning),
             ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
-            ("start", f"{format_numbers(self.start)} (rad, rad/s, m/s)"),
+            ("start", f"{format_numbers(self.start)} {self.units}".strip()),
             ("last section state", format_numbers(self.steps.section_state[last_step_index])),
             ("time", format_quantity(np.sum(self.steps.durations), "s")),
         ]
@@ -387,12 +402,12 @@ class Walk(AbstractPrintable):
 
 @eqx.filter_jit
 def _simulate_walk_by_scan(
-    model: AbstractWheel,
-    params: WheelParams,
+    model: Any,
+    params: Any,
     x: Array,
     options: StepOptions,
     n_steps: int,
-    stepwise_ground: StepGroundValues | None,
+    stepwise_ground: Any,
 ) -> Walk:
     """Simulate a walk of `n_steps` steps. Steps after a failure repeat the outcome of the failed
     step.
@@ -400,9 +415,7 @@ def _simulate_walk_by_scan(
     - `stepwise_ground`: ground of each step, see `convert_walk_arguments`; None for flat ground.
     """
 
-    def advance_walk_by_one_step(
-        state_and_outcome: tuple, step_ground: StepGroundValues | None
-    ) -> tuple:
+    def advance_walk_by_one_step(state_and_outcome: tuple, step_ground: Any) -> tuple:
         """Return the state and the outcome after one step, and the results of this step.
 
         After a failure, the state and the outcome do not change.
@@ -426,12 +439,13 @@ def _simulate_walk_by_scan(
     _, step_results = lax.scan(
         advance_walk_by_one_step, (x, jnp.int32(Outcome.STEPPED)), stepwise_ground, length=n_steps
     )
-    return Walk(x, step_results, jnp.sum(step_results.outcome == Outcome.STEPPED))
+    n_stepped = jnp.sum(step_results.outcome == Outcome.STEPPED)
+    return Walk(x, step_results, n_stepped, **({} if model.is_wheel else {"units": ""}))
 
 
 @announce_wait("a gait step", "5 s")
 def walk(
-    params: WheelParams,
+    params: Any,
     x: SectionStateLike,
     n_steps: int,
     *,
@@ -459,6 +473,9 @@ def walk(
     two footholds follows from their heights and from the distance of the feet at touchdown. A
     sliding foot keeps its height.
 
+    For a walker of yours, `params` are its parameters. One that is an array has a value for each
+    step.
+
     Args:
         params: the wheel.
         x: section state (theta-, dtheta-, dL1-) just before touchdown, in rad, rad/s, m/s.
@@ -482,12 +499,44 @@ def walk(
         (5, (5, 3))
     """
     n_steps = check_int("n_steps", n_steps)
-    params, section_state, checked_model, options, stepwise_ground = convert_walk_arguments(
+    convert: Any = convert_own_walk_arguments if is_own_walker(model) else convert_walk_arguments
+    params, section_state, checked_model, options, stepwise_ground = convert(
         params, x, n_steps, model, options, engine, heights
     )
     return _simulate_walk_by_scan(
         checked_model, params, section_state, options, n_steps, stepwise_ground
     )
+
+
+def convert_own_walk_arguments(
+    params: Any,
+    x: Any,
+    n_steps: int,
+    model: AbstractWalker,
+    options: StepOptions | None,
+    engine: EngineName,
+    heights: object | None,
+) -> tuple[Any, Array, AbstractWalker, StepOptions, Any]:
+    """Return the arguments of a walk of a walker of the user, as `convert_walk_arguments` does.
+
+    The ground of the steps consists of the parameters that are arrays.
+    """
+    if heights is not None:
+        raise ValueError(
+            "heights are given, but only models of the wheel know what they change: give a "
+            "parameter of the walker as an array with one value for each step."
+        )
+    params = check_parameters(params)
+    for leaf in jax.tree.leaves(params):
+        if leaf.shape not in ((), (n_steps,)):
+            raise ValueError(
+                f"a parameter has shape {leaf.shape}, but a walk of {n_steps} steps takes one "
+                f"number, or an array of {n_steps}: map over batches with jax.vmap."
+            )
+    stepwise, constant = eqx.partition(params, lambda leaf: leaf.ndim > 0)
+    first_params = jax.tree.map(lambda leaf: leaf[0] if leaf.ndim else leaf, params)
+    _, x, options = check_arguments(model, first_params, x, options, 1)
+    return constant, x, model, options, stepwise if jax.tree.leaves(stepwise) else None
 
 
 def _convert_single_step_arguments(

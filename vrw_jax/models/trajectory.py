@@ -7,6 +7,7 @@ landing.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -16,11 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.base.checks import check_int, require_untraced_arguments
+from vrw_jax.base.checks import check_int, check_type, require_untraced_arguments
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import is_own_walker
+from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.flow.hybrid_trajectory import sample_walk_of_system
 from vrw_jax.models.contact_mechanics import (
     compute_foot_heights,
     compute_foot_positions,
@@ -34,7 +38,12 @@ from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.models.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
 from vrw_jax.models.phase_sequence import select_stance_line
 from vrw_jax.models.provenance import collect_provenance_attributes
-from vrw_jax.models.stepping import ModelLike, SectionStateLike, convert_walk_arguments
+from vrw_jax.models.stepping import (
+    ModelLike,
+    SectionStateLike,
+    convert_own_walk_arguments,
+    convert_walk_arguments,
+)
 from vrw_jax.models.unilateral_wheel import UnilateralTrajectory
 from vrw_jax.wheel.dynamics import (
     Motion,
@@ -48,7 +57,7 @@ from vrw_jax.wheel.params import WheelParams
 
 @announce_wait("gait steps and their samples", "5 s")
 def simulate(
-    params: WheelParams,
+    params: Any,
     x: SectionStateLike | None = None,
     n_steps: int = 10,
     *,
@@ -70,6 +79,9 @@ def simulate(
     jumps is therefore listed twice, with the values before and after the jump. A failed step ends
     the trajectory at the event, and the attributes `outcome` and `outcome_meaning` state the cause.
     Numerical errors are those of `vrw.step`.
+
+    For a `HybridSystem`, `params` are its parameters. One that is an array has a value for each
+    step. The variables are the coordinates of its state, and `phase` is the number of the mode.
 
     Args:
         params: the wheel.
@@ -96,6 +108,8 @@ def simulate(
     """
     require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x, heights)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
+    if is_own_walker(model):
+        return _simulate_own_walker(params, x, n_steps, model, options, n_samples, heights)
     given_params = params
     params, x, model, options, stepwise_ground = convert_walk_arguments(
         params,
@@ -177,6 +191,30 @@ def simulate(
         walk_attributes | provenance_attributes,
     )
     return dataset.set_coords(dataset_variables.keys() & {"step", "phase"})
+
+
+def _simulate_own_walker(
+    params: Any, x: Any, n_steps: int, walker: Any, options: Any, n_samples: int, heights: Any
+) -> xr.Dataset:
+    check_type(
+        "model", walker, HybridSystem, "only its motion within a step is known; take vrw.walk"
+    )
+    if x is None and walker.starts is None:
+        raise ValueError(
+            "x is None, but this walker has no starts: give section coordinates at the start."
+        )
+    first_params = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], params)
+    x = jnp.atleast_2d(walker.starts(first_params))[0] if x is None else x
+    params, x, _, options, stepwise = convert_own_walk_arguments(
+        params, x, n_steps, walker, options, "auto", heights
+    )
+    params_of_steps = [params] * n_steps
+    if stepwise is not None:
+        params_of_steps = [
+            walker.with_step_ground(params, jax.tree.map(operator.itemgetter(k), stepwise))[1]
+            for k in range(n_steps)
+        ]
+    return sample_walk_of_system(walker, params_of_steps, x, options, n_samples)
 
 
 class SampledStep(NamedTuple):

@@ -17,6 +17,7 @@ from vrw_jax.base.checks import check_choice, check_int, check_reals, check_type
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
+from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.contact_section import (
@@ -40,7 +41,7 @@ from vrw_jax.models.interface import (
     compute_rises,
     require_stepwise_shape,
 )
-from vrw_jax.models.step_results import PAPER_START_STATE, AdvanceResult
+from vrw_jax.models.step_results import PAPER_START_STATE
 from vrw_jax.models.viscoelastic import can_use_batch_kernel
 from vrw_jax.wheel.params import (
     FRICTION_DOMAIN,

@@ -25,6 +25,7 @@ from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.parameters import ParameterDomain, list_parameters
 from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
 from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
 from vrw_jax.flow.scaled_integration import (
@@ -53,7 +54,6 @@ from vrw_jax.models.phase_sequence import (
 )
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
-    AdvanceResult,
     SectionState,
     StepResult,
     Trajectory,

@@ -37,7 +37,7 @@ class StepBatchResult(AbstractPrintable):
 
     - `section_state`: state before the next touchdown; zeros if the step failed;
     - `durations`: durations of DLS, SLS-I and SLS-II, s; see `UnilateralWheel` for unilateral
-      contact;
+      contact. For a walker of yours, durations of its modes;
     - `outcome`: `Outcome` of the walk, which ends at the first outcome that is not STEPPED;
     - `n_stepped`: number of gait steps that ended in a touchdown;
     - `solver_steps`: number of attempted solver steps, summed over all gait steps;
@@ -54,7 +54,7 @@ class StepBatchResult(AbstractPrintable):
     """
 
     section_state: Float[np.ndarray, "lanes section"]
-    durations: Float[np.ndarray, "lanes 3"]
+    durations: Float[np.ndarray, "lanes phases"]
     outcome: Int[np.ndarray, " lanes"]
     n_stepped: Int[np.ndarray, " lanes"]
     solver_steps: Int[np.ndarray, " lanes"]

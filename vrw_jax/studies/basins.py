@@ -14,8 +14,14 @@ from vrw_jax.base.checks import check_int, check_reals, check_type, require_untr
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import (
+    AbstractWalker,
+    check_arguments,
+    check_parameters,
+    is_own_walker,
+    name_coordinates,
+)
 from vrw_jax.gaits.attractors import find_distinct_orbits, measure_orbit_steps, walk_until_periodic
-from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     POST_LANDING_COMPONENT_NAMES,
@@ -40,7 +46,7 @@ an axis.
 
 @announce_wait("batches of gait steps", "10 s")
 def basin(
-    params: WheelParams,
+    params: Any,
     grid: StartGrid,
     *,
     model: ModelLike | None = None,
@@ -64,7 +70,8 @@ def basin(
     of starts. The dataset has an `orbit_period` in steps, a DLS fraction and, for the paper's
     model, the minimum margins of each orbit. With unilateral contact, section states are full
     states of `UnilateralWheel`. The model "auto" means unilateral contact, which is valid for all
-    starts.
+    starts. For a walker of yours, `params` are its parameters, and `grid` names its section
+    coordinates: "x0", "x1", ..., unless the walker has names for them.
 
     Args:
         params: the wheel.
@@ -89,15 +96,25 @@ def basin(
         [0, 0]
     """
     require_untraced_arguments("vrw.basin", "map vrw.walk over the starts", params, options)
-    require_single_wheel(params, "compute one basin after the other")
-    model = convert_model_argument(model).fallback_model  # It is valid for any start.
+    own_walker: Any = model if is_own_walker(model) else None
+    if own_walker is None:
+        require_single_wheel(params, "compute one basin after the other")
+        model = wheel_model = convert_model_argument(
+            model
+        ).fallback_model  # It is valid for any start.
+    else:
+        params = check_parameters(params)
     options = convert_step_options(options)
-    options.check_tolerances(np.dtype(params.damping.dtype))
+    options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
     options = options.with_engine(engine)
     max_steps = check_int("max_steps", max_steps)
     max_period = check_int("max_period", max_period)
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    start_component_names = select_start_components("grid", grid, "a number or an axis")
+    start_component_names = (
+        select_start_components("grid", grid, "a number or an axis")
+        if own_walker is None
+        else _select_own_components(own_walker, grid)
+    )
     start_component_values = {
         component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
         for component_name in start_component_names
@@ -111,11 +128,13 @@ def basin(
     axis_names = [name for name, values in start_component_values.items() if values.ndim]
     grid_shape = [start_component_values[axis_name].size for axis_name in axis_names]
     coordinate_grids = np.meshgrid(*start_component_values.values(), indexing="ij")
-    start_states = compute_section_states_of_starts(
-        params, start_component_names, np.stack([x.ravel() for x in coordinate_grids], -1)
-    )
-    start_embedder = functools.partial(model.complete_section_state, params)
-    start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
+    start_states = np.stack([x.ravel() for x in coordinate_grids], -1)
+    if own_walker is None:
+        start_states = compute_section_states_of_starts(params, start_component_names, start_states)
+        start_embedder = functools.partial(wheel_model.complete_section_state, params)
+        start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
+    else:
+        check_arguments(own_walker, params, start_states[0], options, 1)
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
     orbit_indices, orbit_states = find_distinct_orbits(walk_ends)
 
@@ -135,23 +154,40 @@ def basin(
     }
     start_dataset_coordinates = {
         component_name: xr.Variable(
-            (component_name,) * values.ndim, values, make_measure_attributes(component_name)
+            (component_name,) * values.ndim,
+            values,
+            make_measure_attributes(component_name)
+            if own_walker is None
+            else {"units": name_coordinates(own_walker, len(grid))[component_name]},
         )
         for component_name, values in start_component_values.items()
     }
-    orbit_variables = _make_orbit_variables(params, orbit_states, max_period, model, options)
+    orbit_variables = _make_orbit_variables(
+        params, orbit_states, start_states.shape[1], max_period, model, options
+    )
     basin_attributes = {
         "title": "Basins of attraction",
         "most_steps": max_steps,
-        "starts": "before touchdown"
-        if start_component_names == PRE_TOUCHDOWN_COMPONENT_NAMES
-        else "after landing",
+        "starts": "after landing"
+        if start_component_names == POST_LANDING_COMPONENT_NAMES
+        else "before touchdown",
     }
     return xr.Dataset(
         walk_variables | orbit_variables,
         start_dataset_coordinates,
         basin_attributes | collect_provenance_attributes(params, model, options),
     )
+
+
+def _select_own_components(walker: AbstractWalker, grid: StartGrid) -> tuple[str, ...]:
+    """Return the names of the section coordinates of a walker, all of which a grid contains."""
+    names = tuple(name_coordinates(walker, len(grid)))
+    if set(grid) != set(names):
+        raise ValueError(
+            f"the grid contains {', '.join(map(str, grid))}, but it must contain the section "
+            f"coordinates {', '.join(names)}: give each a number or an axis."
+        )
+    return names
 
 
 def select_start_components(
@@ -203,21 +239,27 @@ def compute_section_states_of_starts(
 
 
 def _make_orbit_variables(
-    params: WheelParams,
+    params: Any,
     orbit_states: list[np.ndarray],
+    n_coordinates: int,
     max_period: int,
-    model: AbstractWheel,
+    model: Any,
     options: StepOptions,
 ) -> dict[str, xr.Variable]:
     """Return the dataset variables for the orbits: states, periods, DLS fractions and minimum
     margins.
     """
-    n_orbits, n_entries = len(orbit_states), model.count_section_entries(params)
+    n_orbits = len(orbit_states)
+    has_wheel_measures = not is_own_walker(model)
+    n_entries = model.count_section_entries(params) if has_wheel_measures else n_coordinates
     padded_orbit_states = np.full((n_orbits, max_period, n_entries), np.nan)
-    margin_names = MARGIN_MEASURES if n_entries == 3 else ()
-    orbit_measures = {name: np.zeros(n_orbits) for name in ("dls_fraction", *margin_names)}
+    margin_names = MARGIN_MEASURES if has_wheel_measures and n_entries == 3 else ()
+    names = ("dls_fraction", *margin_names) if has_wheel_measures else ()
+    orbit_measures = {name: np.zeros(n_orbits) for name in names}
     for i, states_of_one_orbit in enumerate(orbit_states):
         padded_orbit_states[i, : len(states_of_one_orbit)] = states_of_one_orbit
+        if not has_wheel_measures:
+            continue
         step_measures = measure_orbit_steps(params, states_of_one_orbit, model, options)
         orbit_measures["dls_fraction"][i] = (
             step_measures["duration_dls"].sum() / step_measures["period"].sum()

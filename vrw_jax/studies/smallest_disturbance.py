@@ -15,9 +15,9 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
-from vrw_jax.models.step_results import AdvanceResult
 from vrw_jax.models.stepping import ModelLike
 from vrw_jax.studies.gait_arrival import StableGait, walk_until_on_gait
 from vrw_jax.wheel.params import WheelParams

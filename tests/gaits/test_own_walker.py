@@ -1,0 +1,149 @@
+"""Gaits, walks and basins of a user's walker, which is a class or a hybrid system.
+
+The walker is a ball that a racket kicks. After a bounce its velocity is v' = e v + k, so that a
+gait has v = k / (1 - e), the multiplier e and the period 2 v / g.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.walkers import SIMPLEST_WALKER
+
+import vrw_jax as vrw
+from vrw_jax.hybrid import Guard, HybridSystem, Mode
+
+GRAVITY = 9.81
+PARAMS = {"ball": {"restitution": 0.5}, "kick": 1.0}
+
+
+@vrw.measure("height", unit="m", meaning="height of the flight")
+def flight_height(step, params):
+    return GRAVITY / 8.0 * step.duration**2
+
+
+class JuggledBall(vrw.AbstractWalker):
+    coordinates = {"velocity": "m/s"}  # noqa: RUF012
+    measures = (flight_height,)
+
+    def advance(self, params, x, options):
+        v = params["ball"]["restitution"] * x + params["kick"]
+        return vrw.AdvanceResult(v, 2.0 * v / GRAVITY, jnp.where(v[0] > 0.0, 0, 3))
+
+    def starts(self, params):
+        return jnp.array([1.0])
+
+
+def bounce(y, p):
+    return jnp.stack([0.0 * y[0], -p["ball"]["restitution"] * y[1] + p["kick"]])
+
+
+BALL_SYSTEM = HybridSystem(
+    modes={
+        "flight": Mode(
+            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
+            {"bounce": Guard(lambda y, p: y[0], bounce)},
+        )
+    },
+    section="bounce",
+    state={"height": "m", "velocity": "m/s"},
+    coordinates={"velocity": "m/s"},
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
+    starts=lambda p: jnp.array([1.0]),
+    measures=(flight_height,),
+)
+
+
+@pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
+def test_a_gait_has_the_closed_form_of_velocity_multiplier_and_period(walker):
+    gait = vrw.limit_cycle(PARAMS, model=walker)
+    np.testing.assert_allclose(gait.section_state, [2.0], rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(gait.multipliers), [0.5], rtol=1e-9)
+    # A flight lasts one solver step of a parabola; in the system it starts at the velocity before.
+    assert float(gait.period) == pytest.approx(4.0 / GRAVITY, rel=1e-10)
+
+
+@pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
+def test_an_element_of_a_batch_without_a_gait_has_a_code_and_the_others_their_gait(walker):
+    params = PARAMS | {"kick": np.array([1.0, np.nan, 2.0])}
+    gaits = vrw.limit_cycles(params, model=walker)
+    assert gaits.outcome.tolist() == [0, vrw.Outcome.BAD_INPUT, 0]
+    np.testing.assert_allclose(gaits.section_state[:, 0], [2.0, 0.0, 4.0], rtol=1e-12)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gaits))
+    assert "BAD_INPUT" in gaits.why[1]
+
+
+def test_a_batch_has_the_gaits_of_single_searches():
+    slopes = np.array([0.009, 0.012])
+    gaits = vrw.limit_cycles({"slope": slopes}, model=SIMPLEST_WALKER, guess=[0.2, -0.2])
+    for slope, state in zip(slopes, gaits.section_state, strict=True):
+        one = vrw.limit_cycle({"slope": slope}, model=SIMPLEST_WALKER, guess=[0.2, -0.2])
+        np.testing.assert_allclose(state, one.section_state, rtol=1e-10)
+
+
+def test_the_first_start_that_leads_to_a_gait_is_taken():
+    starts = lambda p: jnp.array([[-3.0], [1.0]])  # the ball that moves down never flies
+    walker = dataclasses.replace(BALL_SYSTEM, starts=starts)
+    assert vrw.limit_cycle(PARAMS, model=walker).converged
+
+
+@pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
+def test_sensitivities_are_the_derivatives_of_the_closed_form(walker):
+    """v = k / (1 - e), T = 2 v / g and h = v^2 / 2 g."""
+    table = vrw.sensitivities(PARAMS, model=walker)
+    assert table.measure.values.tolist() == ["period", "velocity", "height"]
+    assert table.parameter.values.tolist() == ["ball.restitution", "kick"]
+    assert table.measure_unit.values.tolist() == ["s", "m/s", "m"]
+    dv = np.array([4.0, 2.0])
+    expected = [2.0 / GRAVITY * dv, dv, 2.0 / GRAVITY * dv]
+    np.testing.assert_allclose(table.derivative, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
+def test_a_walk_takes_a_parameter_for_each_step_and_a_batch_walks_as_one(walker):
+    kicks = np.array([1.0, 0.5, 0.0])
+    walk = vrw.walk(PARAMS | {"kick": kicks}, [2.0], 3, model=walker)
+    np.testing.assert_allclose(walk.steps.section_state[:, 0], [2.0, 1.5, 0.75], rtol=1e-12)
+    assert int(walk.n_stepped) == 3
+    batch = vrw.step_batch(PARAMS | {"kick": kicks}, np.array([2.0]), 3, model=walker)
+    expected = 0.125 * 2.0 + kicks * 1.75
+    np.testing.assert_allclose(batch.section_state[:, 0], expected, rtol=1e-12)
+    assert batch.n_stepped.tolist() == [3, 3, 3]
+
+
+def test_a_simulation_shows_the_flights_of_a_ball():
+    walk = vrw.simulate(PARAMS, [2.0], 2, model=BALL_SYSTEM, n_samples=3)
+    half = 2.0 / GRAVITY
+    np.testing.assert_allclose(walk.time, half * np.array([0, 1, 2, 2, 3, 4]), rtol=1e-12)
+    top = 2.0 / GRAVITY
+    np.testing.assert_allclose(walk.height, [0, top, 0, 0, top, 0], atol=1e-12)
+    assert walk.velocity.attrs["units"] == "m/s"
+    with pytest.raises(TypeError, match=r"vrw\.walk"):
+        vrw.simulate(PARAMS, [2.0], 2, model=JuggledBall())
+
+
+@pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
+def test_every_start_is_in_the_basin_of_a_stable_gait(walker):
+    basin = vrw.basin(PARAMS, {"velocity": [0.5, 1.0, 5.0]}, model=walker)
+    assert basin.attractor.values.tolist() == [0, 0, 0]
+    np.testing.assert_allclose(basin.orbit_state.values[0, 0], [2.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: vrw.limit_cycle({"slope": 0.009}, model=SIMPLEST_WALKER), "starts="),
+        (lambda: vrw.sensitivities({"slope": 0.009}, model=SIMPLEST_WALKER), "starts="),
+        (lambda: vrw.limit_cycles(PARAMS, model=JuggledBall()), "one common length"),
+        (lambda: vrw.limit_cycle({"kick": np.ones(1)}, model=JuggledBall()), "limit_cycles"),
+        (lambda: vrw.walk(PARAMS | {"kick": np.ones(2)}, [2.0], 3, model=JuggledBall()), "shape"),
+        (lambda: vrw.basin(PARAMS, {"speed": 1.0}, model=JuggledBall()), "velocity"),
+        (lambda: vrw.first_passage(vrw.WheelParams(), 0.01, model=JuggledBall()), "of yours"),
+    ],
+)
+def test_what_is_missing_is_said_in_one_sentence(call, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        call()

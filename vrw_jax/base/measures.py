@@ -1,0 +1,144 @@
+"""Measures: measured quantities with their names, units and meanings, and measures of your own."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from vrw_jax.base.checks import check_callable, check_choice
+from vrw_jax.base.printing import format_mathtext
+
+
+@dataclasses.dataclass(frozen=True)
+class Measure:
+    """Measured quantity with its name, unit, symbol and description.
+
+    - `unit`: SI unit, "1" for a pure number;
+    - `equation`: equation or section of the paper, "" if there is none;
+    - `leg_dimension`: "leg" if the measure has one value per leg, otherwise "". Margins have values
+      for the locked legs 3 to n, `CONTACT_MEASURES` for every leg;
+    - `violation_text`: clause that states what a negative margin means, otherwise "";
+    - `is_shared`: whether the steps of every model have the measure;
+    - `is_integer_code`: whether the measure is an integer code or count without derivatives;
+    - `is_averaged_over_steps`, `is_largest_over_steps`: whether the measure of several steps is
+      their mean or their maximum instead of their sum;
+    - `function`, `phase`, `reduction`: function of a measure of your own, see `vrw.measure`.
+    """
+
+    name: str
+    unit: str
+    symbol: str
+    long_name: str
+    description: str
+    equation: str = ""
+    leg_dimension: str = ""
+    violation_text: str = ""
+    is_shared: bool = False
+    is_integer_code: bool = False
+    is_averaged_over_steps: bool = False
+    is_largest_over_steps: bool = False
+    function: Callable[..., Any] | None = None
+    phase: str = ""
+    reduction: str = ""
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Return the value of the function that `vrw.measure` decorates."""
+        assert self.function is not None
+        return self.function(*arguments)
+
+    @property
+    def mathtext(self) -> str:
+        """Return the symbol as Matplotlib mathtext, without dollar signs."""
+        return format_mathtext(self.symbol)
+
+    @property
+    def label_with_symbol(self) -> str:
+        """Return the long name followed by the symbol, or the long name alone if it contains the
+        symbol.
+        """
+        has_symbol = self.symbol in self.long_name
+        return self.long_name if has_symbol else f"{self.long_name} {self.symbol}"
+
+    @property
+    def display_unit(self) -> str:
+        """Return the unit to be printed, which is "" for a pure number."""
+        return "" if self.unit == "1" else self.unit
+
+    @property
+    def variable_attributes(self) -> dict[str, str]:
+        """Return the attributes for a dataset variable that contains this measure."""
+        measure_attributes = {
+            "units": self.unit,
+            "long_name": self.long_name,
+            "symbol": self.symbol,
+            "description": self.description,
+        }
+        return measure_attributes | ({"equation": self.equation} if self.equation else {})
+
+    def format_with_unit(self, measured_value: object) -> str:
+        """Return a value as text with the unit of this measure and six significant digits."""
+        return f"{float(np.asarray(measured_value)):.6g} {self.display_unit}".strip()
+
+
+def measure(
+    name: str,
+    *,
+    unit: str = "1",
+    meaning: str = "",
+    symbol: str = "",
+    phase: str = "",
+    reduction: str = "",
+) -> Callable[[Callable[..., Any]], Measure]:
+    """Declare a function as a measure of the gaits of your own walker.
+
+    A measure without a phase is a function of a step and of the parameters. A measure of a phase is
+    a function of the state and of the parameters, whose integral or mean over the phase is computed
+    with the motion, to the same accuracy. Give it to the walker, as `measures=(cost,)`. Its name
+    then works in sensitivities, scans and tuning, and it has derivatives.
+
+    Args:
+        name: name of the measure.
+        unit: SI unit, "1" for a pure number.
+        meaning: what is measured, for printed results and datasets.
+        symbol: symbol in figures; by default the name.
+        phase: name of the mode over which the function is integrated.
+        reduction: "integral" or "mean" over the phase.
+
+    Returns:
+        A decorator, which returns a `Measure` that is called like the function.
+
+    Raises:
+        TypeError, ValueError: if only one of phase and reduction is given, or the reduction is
+            unknown.
+
+    Examples:
+        >>> @vrw.measure("frequency", unit="1/s", meaning="steps per second")
+        ... def frequency(step, params):
+        ...     return 1.0 / step.duration
+        >>> frequency.unit
+        '1/s'
+    """
+    if phase:
+        check_choice("reduction", reduction, ("integral", "mean"))
+    elif reduction:
+        raise ValueError(
+            f"reduction is {reduction!r}, but there is no phase: name the phase over which the "
+            "measure is taken."
+        )
+
+    def declare(function: Callable[..., Any]) -> Measure:
+        check_callable("a measure", function, "of a step, or of a state, and parameters")
+        return Measure(
+            name,
+            unit,
+            symbol or name,
+            name.replace("_", " "),
+            meaning,
+            is_averaged_over_steps=True,
+            function=function,
+            phase=phase,
+            reduction=reduction,
+        )
+
+    return declare

@@ -1,0 +1,202 @@
+"""Interface of a walker: what steps, walks, gaits and studies need to know about it."""
+
+import abc
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, TypeGuard
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vrw_jax import lanes
+from vrw_jax.base.checks import check_reals, check_type
+from vrw_jax.base.measures import Measure
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
+
+
+class AdvanceResult(eqx.Module):
+    """Section state, durations and outcome at the end of a step, without indicators and margins.
+
+    - `section_state`: section coordinates at the end of the step;
+    - `durations`: durations of the phases of the step, s; for the wheel of DLS, SLS-I and SLS-II;
+    - `outcome`: an `Outcome`;
+    - `solver_steps`: number of attempted solver steps;
+    - `model_code`, `reason_code`: codes of the model that "auto" selected, and of the reason;
+    - `engine`: see `StepOptions`.
+
+    Examples:
+        >>> vrw.AdvanceResult(jnp.ones(1), jnp.ones(1)).outcome
+        0
+    """
+
+    section_state: Float[Array, "section ..."]
+    durations: Float[Array, "phases ..."]
+    outcome: Any = 0
+    solver_steps: Any = 0
+    model_code: Int[Array, "..."] | None = None
+    reason_code: Int[Array, "..."] | None = None
+    engine: str = eqx.field(static=True, default="")
+
+    @property
+    def duration(self) -> Array:
+        """Return the duration of the step, s."""
+        return jnp.sum(self.durations, 0)
+
+
+class AbstractWalker(abc.ABC):
+    """Walker: a step from section to section, and what functions need to know about it.
+
+    `HybridSystem` and the models of the wheel are walkers. If your step is neither, for example in
+    closed form, write a class with the method `advance`. What else a function needs is optional:
+
+    - `coordinates`: names and units of the section coordinates;
+    - `starts`: method that returns section coordinates from which the search for a gait begins, as
+      rows with the best first, for given parameters;
+    - `invariants`: functions of section coordinates and parameters that a step conserves;
+    - `measures`: measures of a gait, see `vrw.measure`.
+
+    Parameters are a tree of numbers, such as a dictionary or an `equinox.Module`.
+
+    Examples:
+        >>> class JuggledBall(vrw.AbstractWalker):
+        ...     def advance(self, params, x, options):
+        ...         v = params["restitution"] * x + params["kick"]
+        ...         return vrw.AdvanceResult(v, 2.0 * v / 9.81)
+        >>> params = {"restitution": 0.5, "kick": 1.0}
+        >>> gait = vrw.limit_cycle(params, model=JuggledBall(), guess=[1.0])
+        >>> print(f"{gait.section_state[0]:.3f} m/s, {gait.period:.3f} s")
+        2.000 m/s, 0.408 s
+    """
+
+    is_wheel: ClassVar[bool] = False
+    """Whether the walker is a model of the wheel, for which functions have methods of their own."""
+    coordinates: Mapping[str, str] = {}
+    starts: Callable[..., Any] | None = None
+    invariants: Sequence[Callable[..., Any]] = ()
+    measures: Sequence[Measure] = ()
+
+    @abc.abstractmethod
+    def advance(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
+        """Return the end of one step of one element from section coordinates `x`."""
+
+    def take_step(self, params: Any, x: Any, options: StepOptions) -> Any:
+        """Return all results of one step: those of `advance`, if there are no others."""
+        return self.advance(params, x, options)
+
+    def with_step_ground(self, params: Any, step_parameters: Any) -> tuple[Any, Any]:
+        """Return the walker and all its parameters in one step of a walk.
+
+        - `step_parameters`: those that differ from step to step; the others are in `params`.
+        """
+        return self, eqx.combine(step_parameters, params)
+
+    def evaluate_invariants(self, params: Any, x: Array) -> Array:
+        """Return the quantities that a step conserves."""
+        return jnp.stack([invariant(x, params) for invariant in self.invariants])
+
+    def measure_step(self, params: Any, x: Array, step: Any, options: StepOptions) -> dict:
+        """Return the values of `measures` for the step from `x`, by name."""
+        return {measure.name: jnp.asarray(measure(step, params)) for measure in self.measures}
+
+    def check_definition(self, params: Any, x: Any, name: str) -> None:
+        """Raise an error if functions of the walker do not fit to parameters and a start.
+
+        The arguments are shapes, and `name` is "x" for section coordinates.
+        """
+        end = jax.eval_shape(self.advance, params, x, StepOptions()).section_state
+        if end.shape != x.shape:
+            raise ValueError(
+                f"advance returns section coordinates of shape {end.shape} for {name} of shape "
+                f"{x.shape}: both must be the same."
+            )
+
+
+def is_own_walker(model: Any) -> TypeGuard[AbstractWalker]:
+    """Return whether a model is a walker of the user, and no model of the wheel."""
+    return isinstance(model, AbstractWalker) and not model.is_wheel
+
+
+def check_parameters(params: Any) -> Any:
+    """Return a tree of parameters as arrays, or raise an error."""
+    return jax.tree.map(lambda leaf: check_reals("a parameter", leaf), params)
+
+
+def check_arguments(
+    walker: AbstractWalker,
+    params: Any,
+    x: Any,
+    options: StepOptions | None,
+    max_axes: int,
+    name: str = "x",
+) -> tuple[Any, Array, StepOptions]:
+    """Return parameters, section coordinates and options of a step, or raise an error.
+
+    - `max_axes`: 2 if there may be a batch axis, and else 1.
+    """
+    options = StepOptions() if options is None else options
+    check_type("options", options, StepOptions, "give vrw.StepOptions()")
+    params, x = check_parameters(params), check_reals(name, x)
+    if not 1 <= x.ndim <= max_axes:
+        shapes = "(n,)" if max_axes == 1 else "(n,) or (batch, n)"
+        raise ValueError(f"{name} has shape {x.shape}, but its shape must be {shapes}.")
+    walker.check_definition(
+        jax.tree.map(lambda p: jax.ShapeDtypeStruct(p.shape[max_axes - 1 :], p.dtype), params),
+        jax.ShapeDtypeStruct(x.shape[-1:], x.dtype),
+        name,
+    )
+    options.check_tolerances(x.dtype)
+    return params, x, options
+
+
+def find_batch_axes(params: Any, x: Array) -> tuple:
+    """Return the axes of parameters, section coordinates and options in a batch."""
+    axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, params)
+    return axes, 0 if x.ndim == 2 else None, None
+
+
+@functools.lru_cache
+def compile_step(walker: AbstractWalker) -> Any:
+    """Return the compiled step, the same for each call, so that JAX traces it once."""
+    return lanes.jit(walker.take_step)
+
+
+def step_batch_of_walker(
+    walker: AbstractWalker, params: Any, x: Any, options: StepOptions | None
+) -> Any:
+    """Return one step of each element of a batch as NumPy arrays, computed on all cores."""
+    params, x, options = check_arguments(walker, params, x, options, 2)
+    in_axes = find_batch_axes(params, x)
+    return compile_step(walker).batch(params, x, options, in_axes=in_axes)
+
+
+def make_return_map(
+    walker: AbstractWalker, params: Any, options: StepOptions
+) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
+    """Return the map from section coordinates to those after one step, for Newton's method.
+
+    The map returns NaN if the step fails, so that its last state is not taken for a return.
+    """
+
+    def map_section_state(x: Array) -> Array:
+        step = walker.advance(params, x, options)
+        return step.section_state * jnp.where(step.outcome == Outcome.STEPPED, 1.0, jnp.nan)
+
+    return map_section_state
+
+
+def name_coordinates(walker: AbstractWalker, n: int) -> dict[str, str]:
+    """Return the names of the `n` section coordinates with their units.
+
+    Coordinates without names are numbered.
+    """
+    if not walker.coordinates:
+        return {f"x{i}": "1" for i in range(n)}
+    if len(walker.coordinates) != n:
+        raise ValueError(
+            f"coordinates names {', '.join(walker.coordinates)}, but the section has {n} "
+            "coordinates: name each."
+        )
+    return dict(walker.coordinates)
