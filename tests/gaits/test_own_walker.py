@@ -5,11 +5,15 @@ gait has v = k / (1 - e), the multiplier e and the period 2 v / g.
 """
 
 import dataclasses
+import operator
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from support.walkers import SIMPLEST_WALKER
 
 import vrw_jax as vrw
@@ -130,6 +134,109 @@ def test_every_start_is_in_the_basin_of_a_stable_gait(walker):
     basin = vrw.basin(PARAMS, {"velocity": [0.5, 1.0, 5.0]}, model=walker)
     assert basin.attractor.values.tolist() == [0, 0, 0]
     np.testing.assert_allclose(basin.orbit_state.values[0, 0], [2.0], atol=1e-6)
+
+
+def test_a_scan_has_the_closed_form_and_its_derivatives_and_knows_the_code(tmp_path):
+    """T = 2 k / (1 - e) / g, whose derivative by e is T / (1 - e)."""
+    design = vrw.grid({"kick": [0.5, 1.0, -1.0], "ball.restitution": [0.5, 0.6]})
+    names = ["period", "d period / d ball.restitution"]
+    scan = lambda walker: vrw.scan(
+        design, names, base=PARAMS, model=walker, store=tmp_path / "scan", chunk=2
+    )
+    result = scan(JuggledBall())
+    kick, e = np.meshgrid([0.5, 1.0], [0.5, 0.6], indexing="ij")
+    period = 2.0 * kick / (1.0 - e) / GRAVITY
+    np.testing.assert_allclose(result.period[:2], period, rtol=1e-10)
+    np.testing.assert_allclose(result[names[1]][:2], period / (1.0 - e), rtol=1e-9)
+    np.testing.assert_allclose(result.spectral_radius[:2], e, rtol=1e-9)
+    assert np.all(result.outcome[2] == vrw.Outcome.FELL_BACK)
+    assert np.all(np.isnan(result.period[2]))
+    assert result.period.attrs["units"] == "s"
+    xr.testing.assert_identical(scan(JuggledBall()), result)
+
+    class OtherBall(JuggledBall.__base__):
+        advance, starts = JuggledBall.advance, lambda self, params: jnp.array([1.5])
+        coordinates = {"velocity": "m/s"}  # noqa: RUF012
+
+    with pytest.raises(ValueError, match="the code of walker differs"):
+        scan(OtherBall())
+
+
+def test_a_sample_of_a_scan_does_not_depend_on_others():
+    kicks = np.linspace(0.5, 1.0, 70)
+    scan = lambda kicks: vrw.scan(vrw.samples(kick=kicks), base=PARAMS, model=BALL_SYSTEM).period
+    np.testing.assert_array_equal(scan(kicks)[65:], scan(kicks[65:]))
+
+
+def test_tuning_ends_at_the_limit_of_a_measure_with_its_multiplier():
+    """T = sqrt(8 h / g), so that at a height of 0.5 m the price is dT/dh = T / 2 h."""
+    bounds = {"kick": (0.5, 2.0), "ball.restitution": (0.2, 0.8)}
+    tuned = vrw.tune(
+        PARAMS, "period", [*bounds], bounds, {"height": (None, 0.5)}, model=JuggledBall()
+    )
+    period = np.sqrt(8.0 * 0.5 / GRAVITY)
+    assert tuned.converged
+    assert tuned.value == pytest.approx(period, rel=1e-6)
+    (height,) = tuned.active
+    assert (height.name, height.unit) == ("height", "m")
+    assert height.price == pytest.approx(period, rel=1e-5)
+    assert tuned.validation.is_feasible
+    assert "kick" in str(tuned)
+
+
+CALLS = {
+    "walker.step": lambda: BALL_SYSTEM.step(PARAMS, [2.0]),
+    "step_batch": lambda: BALL_SYSTEM.step_batch(PARAMS, [[2.0]]),
+    "simulate": lambda: BALL_SYSTEM.simulate(PARAMS, [0.0, 2.0], events=1),
+    "simulate_batch": lambda: BALL_SYSTEM.simulate_batch(PARAMS, [[0.0, 2.0]], events=1),
+    "vrw.step": lambda: vrw.step(PARAMS, [2.0], model=BALL_SYSTEM),
+    "vrw.walk": lambda: vrw.walk(PARAMS, [2.0], 3, model=BALL_SYSTEM),
+    "vrw.step_batch": lambda: vrw.step_batch(PARAMS, np.array([[2.0]]), model=BALL_SYSTEM),
+    "vrw.simulate": lambda: vrw.simulate(PARAMS, None, 2, model=BALL_SYSTEM, n_samples=3),
+    "vrw.basin": lambda: vrw.basin(PARAMS, {"velocity": [0.5, 5.0]}, model=BALL_SYSTEM),
+    "walker.return_map(params)": lambda: BALL_SYSTEM.return_map(PARAMS)(jnp.array([2.0])),
+    "vrw.solve_fixed_point": lambda: vrw.solve_fixed_point(
+        BALL_SYSTEM.return_map(PARAMS), jnp.array([1.0])
+    ),
+    "vrw.continue_map": lambda: vrw.continue_map(
+        lambda _, x, kick: BALL_SYSTEM.return_map(PARAMS | {"kick": kick})(x),
+        jnp.array([2.0]),
+        1.0,
+        (0.9, 1.1),
+    ),
+    "vrw.limit_cycle": lambda: vrw.limit_cycle(PARAMS, model=BALL_SYSTEM),
+    "vrw.limit_cycles": lambda: vrw.limit_cycles(PARAMS | {"kick": np.ones(1)}, model=BALL_SYSTEM),
+    "vrw.sensitivities": lambda: vrw.sensitivities(PARAMS, model=BALL_SYSTEM),
+    "vrw.continue_branch": lambda: vrw.continue_branch(
+        PARAMS,
+        "kick",
+        (0.9, 1.1),
+        model=BALL_SYSTEM,
+        cycle=vrw.limit_cycle(PARAMS, model=BALL_SYSTEM),
+    ),
+    "vrw.scan": lambda: vrw.scan(vrw.samples(kick=[1.0]), base=PARAMS, model=BALL_SYSTEM),
+    "vrw.tune": lambda: vrw.tune(
+        PARAMS, "period", ["kick"], {"kick": (0.9, 1.1)}, model=BALL_SYSTEM
+    ),
+}
+FOR_WHEELS_ONLY = ("vrw.first_passage", "vrw.smallest_disturbance", "vrw.gait_sensitivity")
+
+
+def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels():
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "own_walker.md").read_text()
+    table = page.partition("| function | needs |")[2].partition("\n\n")[0]
+    listed = {
+        name
+        for row in table.splitlines()[2:]
+        for name in re.findall(r"`([\w.()]+)`", row.split("|")[1])
+    }
+    assert listed == {*CALLS, *FOR_WHEELS_ONLY}
+    for call in CALLS.values():
+        assert call() is not None
+    for name in FOR_WHEELS_ONLY:
+        arguments = {"first_passage": (0.01,), "gait_sensitivity": ("speed",)}.get(name[4:], ())
+        with pytest.raises(TypeError, match="of yours"):
+            operator.attrgetter(name[4:])(vrw)(vrw.WheelParams(), *arguments, model=JuggledBall())
 
 
 @pytest.mark.parametrize(

@@ -353,7 +353,7 @@ def test_the_first_difference_is_named_by_its_path() -> None:
     ("make", "expected"),
     [
         (lambda: designs.grid(), "sweeps no parameter"),
-        (lambda: designs.grid(dampin=[1.0]), "did you mean 'damping'"),
+        (lambda: plan_scan(designs.grid(dampin=[1.0])), "did you mean 'damping'"),
         (lambda: designs.grid(damping=[]), "has no values"),
         (lambda: designs.samples({"damping": [1.0], "slope": [0.1, 0.2]}), "one length"),
         (lambda: designs.sobol({"damping": (2.0, 1.0)}, 4), "holds nothing"),

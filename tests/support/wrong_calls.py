@@ -914,7 +914,10 @@ def register_wrong_calls() -> None:
     )
     add_wrong_call("a design of nothing", lambda: vrw.grid(), "ValueError", "at least one")
     add_wrong_call(
-        "a design misspelt", lambda: vrw.grid(dampin=[1.0]), "ValueError", "did you mean"
+        "a design misspelt",
+        lambda: vrw.scan(vrw.grid(dampin=[1.0])),
+        "ValueError",
+        "did you mean",
     )
     add_wrong_call(
         "a grid with a value twice", lambda: vrw.grid(damping=[1.0, 1.0]), "ValueError", "twice"

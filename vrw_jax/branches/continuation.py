@@ -212,9 +212,9 @@ def continue_branch(
     unilateral contact would be selected.
 
     For a `HybridSystem` or another walker of yours, `params` are its parameters, `name` is that of
-    one of their entries, and `cycle` is the `HybridGait` at `params`. Special points are its bifurcations, the changes of its
-    sequence of events ("order_of_events_changes"), and the zeros of `margins`. A branch that ends
-    where an orbit touches a guard has the zero of a margin there.
+    one of their entries, and `cycle` is the `HybridGait` at `params`. Special points are its
+    bifurcations, the changes of its sequence of events ("order_of_events_changes"), and the zeros
+    of `margins`. A branch that ends where an orbit touches a guard has the zero of a margin there.
 
     Args:
         params: one wheel; its gait is on the branch.

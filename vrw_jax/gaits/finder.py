@@ -258,6 +258,10 @@ class AbstractGaitFinder(eqx.Module):
         """Return unit and description of a measure of the gaits."""
         return get_measure(name)
 
+    def measure_step(self, params: Any, start: Any, step: Any) -> dict[str, Array]:
+        """Return the measures of a step from a section state, or from that of a cycle, by name."""
+        return step.measures()
+
     @property
     def measure_reader(self) -> Callable:
         """Return a function of a measure's name, a cycle and a step that returns the measure."""

@@ -78,8 +78,8 @@ class HybridGait(NamedTuple):
 
     @property
     def warm_start(self) -> Array:
-        """Return the section coordinates, from which the search for a similar gait begins."""
-        return self.section_state
+        """Return guesses from which the search for a similar gait begins, shape (1, n)."""
+        return self.section_state[..., None, :]
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:

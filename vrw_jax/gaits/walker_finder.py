@@ -42,6 +42,7 @@ class ParameterizedWalker(eqx.Module):
     model_name: ClassVar[str] = "own_walker"
     own_parameters: ClassVar[None] = None
     is_compliant: ClassVar[bool] = True
+    is_wheel: ClassVar[bool] = False
 
     def __repr__(self) -> str:
         return repr(self.walker)
@@ -99,7 +100,12 @@ class WalkerFinder(AbstractGaitFinder):
     default_measures = readable_measures = differentiable_measures  # type: ignore[assignment]
 
     def get_measure(self, name: str) -> Measure:
+        name = name.removeprefix("-")  # of an upper bound
         return next(measure for measure in self.described_measures if measure.name == name)
+
+    def measure_step(self, params: Any, start: Any, step: Any) -> dict[str, Array]:
+        x = getattr(start, "section_state", start)
+        return self.model.walker.measure_step(params, jnp.asarray(x), step, self.step_options)
 
     def find_cycle(self, params: Any, cycle_guess: Any = None) -> HybridGait:  # type: ignore[override]
         guesses = self.model.walker.starts(params) if cycle_guess is None else cycle_guess  # type: ignore[misc]
@@ -122,6 +128,10 @@ class WalkerFinder(AbstractGaitFinder):
         )
         point = GaitBranchPoint(*coordinates, jnp.ones(1), cycle.fixed_point.jacobian)
         return Gait(cycle, cycle.last_step, derivatives, derivatives.last_step, point)
+
+    def precompile_programs(self, params: Any) -> None:
+        values = self.model.collect_parameter_values(params)
+        self.find_gait(values, self.make_initial_guess(values))
 
     def take_gait_step(self, params: Any, section_state: Array) -> Any:
         return compile_step(self.model.walker)(params, section_state, self.step_options)

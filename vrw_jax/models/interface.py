@@ -45,7 +45,7 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         True
     """
 
-    is_wheel: ClassVar[bool] = True
+    is_wheel = True  # type: ignore[misc]  # without annotation no field
     model_name: eqx.AbstractClassVar[str]
     """Name of the model that results report."""
     capabilities: eqx.AbstractClassVar[ModelCapabilities]

@@ -447,8 +447,11 @@ def describe_violation(margin_name: str) -> str:
 
 def describe_parameter(name: str, domain: ParameterDomain) -> Measure:
     """Return the parameter of a wheel, its ground or its leg force as a measure."""
-    description = domain.description or "Parameter of the leg force."
-    return MEASURES.get(name, Measure(name, domain.unit, domain.symbol, name, description))
+    if domain.description and name in MEASURES:
+        return MEASURES[name]
+    kind = "the leg force" if name.startswith(LEG_PREFIX) else "the walker"
+    description = domain.description or f"Parameter of {kind}."
+    return Measure(name, domain.unit, domain.symbol, name, description)
 
 
 def make_measure_attributes(variable_name: str) -> dict[str, object]:

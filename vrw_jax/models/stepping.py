@@ -113,7 +113,7 @@ def convert_model_argument(
     return model
 
 
-def require_compliant_model(model: AbstractWheel, computation_text: str, command_name: str) -> None:
+def require_compliant_model(model: Any, computation_text: str, command_name: str) -> None:
     """Raise a `TypeError` if springs and dampers do not affect the motion of a model.
 
     - `computation_text`: clause in the error message that states why compliant legs are required;

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vrw_jax.base.checks import format_name_suggestion
+from vrw_jax.base.measures import Measure
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
 from vrw_jax.models.capabilities import GaitMethod
@@ -169,11 +170,10 @@ class MeasureDerivative(NamedTuple):
         """Return the name of the dataset variable that contains the derivative."""
         return f"d_{self.measure_name}_d_{self.parameter_name}"
 
-    @property
-    def variable_attributes(self) -> dict[str, object]:
+    def describe_variable(
+        self, measure_description: Measure, parameter_description: Measure
+    ) -> dict[str, object]:
         """Return unit, long name, symbol and description of the derivative, by attribute name."""
-        measure_description = MEASURES[self.measure_name]
-        parameter_description = MEASURES[self.parameter_name]
         derivative_unit = f"{measure_description.unit}/({parameter_description.unit})"
         if parameter_description.unit == "1":
             derivative_unit = measure_description.unit
@@ -277,5 +277,7 @@ def get_variable_attributes(variable_name: str) -> dict[str, object]:
     return (
         make_measure_attributes(variable_name)
         if measure_derivative is None
-        else measure_derivative.variable_attributes
+        else measure_derivative.describe_variable(
+            MEASURES[measure_derivative.measure_name], MEASURES[measure_derivative.parameter_name]
+        )
     )

@@ -56,7 +56,7 @@ class EvaluationRequest(NamedTuple):
     """
 
     measure_names: tuple[str, ...]
-    base_wheel: WheelParams
+    base_wheel: Any
     wheel_model: Any
     step_options: StepOptions
     cycle_options: CycleOptions

@@ -13,6 +13,7 @@ import numpy as np
 
 from vrw_jax.base.checks import (
     check_int,
+    check_names,
     check_range,
     check_type,
     format_value,
@@ -21,8 +22,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.printing import format_quantity
-from vrw_jax.models.measures import LEG_PREFIX, make_measure_attributes
-from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, check_parameter_name
+from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES
 
 ParameterSamples = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
@@ -100,7 +100,6 @@ class AbstractSampleDesign(abc.ABC):
             parameter_name: xr.Variable(
                 (parameter_name,) if parameter_name in self.dims else self.dims,
                 parameter_values,
-                make_measure_attributes(parameter_name),
             )
             for parameter_name, parameter_values in self.values_by_parameter.items()
         }
@@ -201,12 +200,7 @@ def _merge_mapping_and_keywords(
             "the design sweeps no parameter, but a scan needs at least one: "
             f"choose from {', '.join(SWEEPABLE_PARAMETERS)}."
         )
-    for parameter_name in parameter_mapping:
-        # Only the model of the scan knows the parameters of a leg force.
-        if not str(parameter_name).startswith(LEG_PREFIX):
-            check_parameter_name(
-                parameter_name, SWEEPABLE_PARAMETERS, "parameter that can be swept"
-            )
+    check_names("the design", parameter_mapping, '"damping"')
     return parameter_mapping
 
 

@@ -27,6 +27,7 @@ from vrw_jax.gaits.attracting_gaits import find_slow_gaits
 from vrw_jax.gaits.finder import MeasureReader, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
+from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder
 from vrw_jax.lanes.batching import map_in_batches, map_in_numpy_batches
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.capabilities import GaitMethod
@@ -298,6 +299,69 @@ def evaluate_to_tolerance(
     return mask_failed_samples(measure_result.outcomes, sample_results | {"rung": model_codes})
 
 
+class WalkerScanEngine:
+    """Scan engine for a walker of the user and a fixed set of measures."""
+
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
+        self._request = evaluation_request
+        self._n_threads = n_threads or lanes.count_available_cores()
+        self._finder = make_walker_finder(
+            evaluation_request.wheel_model.walker,
+            evaluation_request.base_wheel,
+            evaluation_request.step_options,
+        )
+
+    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
+        """Return the value of each variable for all samples, by the name of the variable."""
+        rows = self._request.stack_parameter_rows(samples_by_parameter)
+        domains = self._finder.model.parameter_domains.values()
+        is_in_domain = np.all(
+            [domain.contains_parameter_value(x) for domain, x in zip(domains, rows.T, strict=True)],
+            axis=0,
+        )
+        blocks = np.split(rows, range(WALKER_BLOCK_SIZE, len(rows), WALKER_BLOCK_SIZE))
+        results_by_block = [self._evaluate_block(blocks[0])]  # It compiles for all threads.
+        with ThreadPoolExecutor(self._n_threads) as thread_pool:
+            results_by_block += thread_pool.map(self._evaluate_block, blocks[1:])
+        results = concatenate_results(results_by_block)
+        outcomes = np.where(is_in_domain, results.pop("outcome"), Outcome.BAD_INPUT)
+        return mask_failed_samples(outcomes, results)
+
+    @with_default_jax_settings  # It runs in a thread of its own.
+    def _evaluate_block(self, rows: np.ndarray) -> ValuesByVariable:
+        padded_rows = np.pad(rows, ((0, WALKER_BLOCK_SIZE - len(rows)), (0, 0)), "edge")
+        results = _evaluate_walkers(self._finder, self._request.measure_names, padded_rows)
+        return {name: np.asarray(values)[: len(rows)] for name, values in results.items()}
+
+
+WALKER_BLOCK_SIZE = 64
+"""Number of samples that one call computes, fixed so that the results for a sample do not depend on
+other samples. It is small, because a walker whose functions have no machine code is slow.
+"""
+
+
+@eqx.filter_jit
+def _evaluate_walkers(
+    finder: WalkerFinder, variable_names: tuple[str, ...], rows: Any
+) -> dict[str, Array]:
+    """Return outcomes, measures and derivatives for the gaits of some walkers, by name."""
+    read, guesses = finder.measure_reader, jax.vmap(finder.make_initial_guess)(rows)
+    derivatives = {name: parse_derivative(name) for name in variable_names}
+    if any(derivatives.values()):
+        gaits = finder.find_gaits(rows, guesses)
+        cycles, cycle_derivatives = gaits.cycle, gaits.cycle_derivatives
+    else:
+        cycles = jax.vmap(finder.find_cycle_from_values)(rows, guesses)
+    results = {"outcome": cycles.outcome, "spectral_radius": cycles.spectral_radius}
+    for name, derivative in derivatives.items():
+        if derivative is None:
+            results[name] = read(name, cycles)
+        else:
+            index = finder.model.parameter_names.index(derivative.parameter_name)
+            results[name] = read(derivative.measure_name, cycle_derivatives)[:, index]
+    return results
+
+
 class PassageScanEngine:
     """Scan engine that combines the results of another engine with measures of walks over random
     slopes.
@@ -361,6 +425,8 @@ def make_scan_engine(
         return functools.partial(evaluate_to_tolerance, evaluation_request)
     if evaluation_request.slope_standard_deviation is not None:
         return PassageScanEngine(evaluation_request, n_threads)
+    if not evaluation_request.wheel_model.is_wheel:
+        return WalkerScanEngine(evaluation_request, n_threads)
     gait_method = evaluation_request.wheel_model.capabilities.gait_method
     scan_engine_class: Any = SCAN_ENGINE_CLASSES[gait_method]
     return scan_engine_class(evaluation_request, n_threads)

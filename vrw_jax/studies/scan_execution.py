@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from vrw_jax.base.checks import check_callable, check_path
 from vrw_jax.base.lazy_xarray import xarray as xr
@@ -41,7 +42,6 @@ from vrw_jax.studies.scan_store import (
     read_stored_manifest,
 )
 from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE
-from vrw_jax.wheel.params import WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]
 """Function that is called with the progress of a scan after each chunk."""
@@ -63,7 +63,7 @@ def scan(
     design: AbstractSampleDesign,
     measures: Iterable[str] | None = None,
     *,
-    base: WheelParams | None = None,
+    base: Any = None,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
@@ -90,11 +90,15 @@ def scan(
     `rung`, the code of the model, and `reason`, the code of the reason for the choice of the model.
     With `UnilateralWheel` and "auto", `friction` may be a swept parameter.
 
+    For a walker of yours, which needs `starts`, the design has the names of its parameters, with
+    dots if they are nested. The measures are the period, the section coordinates and its own
+    `measures`. A store belongs to the walker's code.
+
     Args:
         design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
         measures: names of the measures; by default DLS fraction, speed and similar measures.
         base: wheel with the parameters that are not swept; by default that of Table 1 of the
-            paper.
+            paper. For a walker of yours, its parameters.
         model: model of the wheel; "auto" for the simplest valid model for each sample.
         options: numerical options of the gait steps that check the gaits.
         cycle_options: numerical options of the search for gaits. By default, the mesh of each

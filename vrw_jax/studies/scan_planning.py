@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax import lanes
@@ -19,13 +20,14 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_names, check_positive, check_type
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.walker import check_parameters, is_own_walker
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.walker_finder import ParameterizedWalker, make_walker_finder
 from vrw_jax.lanes.disk_cache import compute_source_digest
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.models.capabilities import ModelCapabilities
 from vrw_jax.models.measures import (
-    LEG_PREFIX,
     MARGIN_MEASURES,
     describe_parameter,
     make_locked_leg_coordinate,
@@ -33,7 +35,6 @@ from vrw_jax.models.measures import (
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.registry import describe_accepted_models
 from vrw_jax.models.stepping import (
-    ModelLike,
     convert_model_argument,
     convert_step_options,
     require_compliant_model,
@@ -46,6 +47,7 @@ from vrw_jax.studies.measure_catalog import (
     check_measure_names,
     get_variable_attributes,
     make_error_variable_name,
+    parse_derivative,
     select_measure_catalog,
 )
 from vrw_jax.studies.scan_collocation import EvaluationRequest
@@ -139,12 +141,12 @@ class ScanPlan:
                 for parameter_name in request.wheel_model.parameter_names
                 if parameter_name not in (FRICTION_NAME, *self.design.swept_parameters)
             }
-            | {"n_legs": base_wheel.n_legs},
+            | ({"n_legs": base_wheel.n_legs} if request.wheel_model.is_wheel else {}),
             "measures": list(request.measure_names),
             "model": _convert_settings_to_json(request.wheel_model),
             "options": _convert_settings_to_json(request.step_options),
             "cycle_options": _convert_settings_to_json(request.cycle_options),
-            "dtype": str(base_wheel.damping.dtype),
+            "dtype": str(jnp.result_type(*jax.tree.leaves(base_wheel))),
             "chunk": list(self.result_layout.chunk_shape),
         }
         if request.error_tolerance is not None:
@@ -156,8 +158,10 @@ class ScanPlan:
     @property
     def store_attributes(self) -> JsonObject:
         """Return the attributes that the labeled result and its store have."""
+        is_wheel = self.evaluation_request.wheel_model.is_wheel
+        walker_text = "the viscoelastic-legged rimless wheel" if is_wheel else "a walker"
         return {
-            "title": f"Steady gaits of the viscoelastic-legged rimless wheel over "
+            "title": f"Steady gaits of {walker_text} over "
             f"{', '.join(self.design.swept_parameters)}",
             "rule": "NaN, or -1 in an integer, where the outcome is not STEPPED.",
             MANIFEST_ATTRIBUTE: json.dumps(self.scan_settings),  # Other formats have no tables.
@@ -179,8 +183,8 @@ def plan_scan(
     design: AbstractSampleDesign,
     measures: Iterable[str] | None = None,
     *,
-    base: WheelParams | None = None,
-    model: ModelLike | None = None,
+    base: Any = None,
+    model: Any = None,
     options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
     chunk: int | None = None,
@@ -197,13 +201,27 @@ def plan_scan(
             f"design is a {type(design).__name__}, but it must say which samples: write "
             "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
         )
-    base = WheelParams() if base is None else base
-    check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
-    base.require_single_wheel("give numbers, and what varies in the design")
-    options, model = convert_step_options(options), convert_model_argument(model)
-    options.check_tolerances(np.dtype(base.damping.dtype))
-    gait_finder = make_finder(model, base.n_legs, cycle_options=cycle_options, step_options=options)
-    gait_finder.search_options.check_tolerances(np.dtype(base.damping.dtype))
+    options = convert_step_options(options)
+    if is_own_walker(model):
+        if base is None or tol is not None or slope_sd is not None:
+            raise ValueError(
+                "model is a walker of yours, so that tol and slope_sd, which belong to the wheel, "
+                "can't be given, and base must be: give base= the parameters of the walker."
+            )
+        base = check_parameters(base)
+        gait_finder: Any = make_walker_finder(model, base, options)
+        model = gait_finder.model
+    else:
+        base = WheelParams() if base is None else base
+        check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
+        base.require_single_wheel("give numbers, and what varies in the design")
+        model = convert_model_argument(model)
+        gait_finder = make_finder(
+            model, base.n_legs, cycle_options=cycle_options, step_options=options
+        )
+    dtype = np.dtype(jnp.result_type(*jax.tree.leaves(base)))
+    options.check_tolerances(dtype)
+    gait_finder.search_options.check_tolerances(dtype)
     default_chunk_size = (
         batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else N_PASSAGE_SAMPLES_PER_CHUNK
     )
@@ -220,8 +238,7 @@ def plan_scan(
             f"model={describe_accepted_models('scan', FRICTION_NAME)}."
         )
     for parameter_name in design.swept_parameters:
-        if parameter_name.startswith(LEG_PREFIX):
-            check_parameter_name(parameter_name, model.parameter_names, "parameter of this model")
+        check_parameter_name(parameter_name, model.parameter_names, "parameter of this model")
     if tol is not None:
         tol = check_positive("tol", tol)
         model_fields: dict[str, Any] = type(model).__dataclass_fields__
@@ -242,7 +259,13 @@ def plan_scan(
                 "tol and slope_sd are both given, but a scan to a tolerance has no measures of "
                 "walks over random slopes: drop one of them."
             )
-    measure_catalog = select_measure_catalog(model, tol, slope_sd)
+    if model.is_wheel:
+        measure_catalog = select_measure_catalog(model, tol, slope_sd)
+    else:
+        names = gait_finder.differentiable_measures
+        measure_catalog = MeasureCatalog(
+            names, ("outcome", "spectral_radius"), names, model.parameter_names, names, 64
+        )
     requested_measures = (
         measure_catalog.default_measures if measures is None else check_names("measures", measures)
     )
@@ -257,7 +280,7 @@ def plan_scan(
     evaluation_request = EvaluationRequest(
         measure_names, base, model, options, cycle_options, tol, slope_sd
     )
-    result_layout = _make_result_layout(design, variable_names, base, model, chunk)
+    result_layout = _make_result_layout(design, variable_names, base, gait_finder, dtype, chunk)
     return ScanPlan(
         design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
     )
@@ -285,13 +308,13 @@ def describe_computing_environment() -> JsonObject:
     }
 
 
-def _identify_code(leg_force: Any) -> str:
-    """Return the key of a law's code, without its parameters.
+def _identify_code(code: Any) -> str:
+    """Return the key of the code of a walker, or of a law without its parameters.
 
-    The key of a law that cannot be identified is new in each scan, which therefore never resumes.
+    The key of code that cannot be identified is new in each scan, which therefore never resumes.
     """
     try:
-        return make_key(jax.tree.structure(leg_force))
+        return make_key(code)
     except UnresolvableFunctionError as error:
         return f"{uuid.uuid4()}: {error}"
 
@@ -323,8 +346,8 @@ def describe_settings_difference(
         return ""
     if setting_name == "design.digest":
         return "the values of the swept parameters differ"
-    if setting_name == "model.leg_force":
-        return "the code of leg_force differs"
+    if setting_name in ("model.leg_force", "model.walker"):
+        return f"the code of {setting_name.removeprefix('model.')} differs"
     if setting_name == "code":
         return "the library's code differs"
     return f"{setting_name} is {stored_settings!r} there and {current_settings!r} here"
@@ -333,19 +356,34 @@ def describe_settings_difference(
 def _make_result_layout(
     design: AbstractSampleDesign,
     variable_names: Iterable[str],
-    base_wheel: WheelParams,
-    model: Any,
+    base_wheel: Any,
+    gait_finder: Any,
+    dtype: np.dtype,
     chunk_size: int,
 ) -> ResultLayout:
     """Return the layout of a scan's variables over the axes of a design.
 
     - `chunk_size`: largest number of samples in a chunk.
     """
-    locked_leg_coordinate = make_locked_leg_coordinate(base_wheel.n_legs)
+    model = gait_finder.model
+    locked_leg_coordinate = make_locked_leg_coordinate(getattr(base_wheel, "n_legs", 2))
+    domains = model.parameter_domains
+
+    def describe_variable(variable_name: str) -> dict[str, object]:
+        derivative = parse_derivative(variable_name)
+        if model.is_wheel or variable_name in ("outcome", "spectral_radius"):
+            return get_variable_attributes(variable_name)
+        if derivative is None:
+            return gait_finder.get_measure(variable_name).variable_attributes
+        parameter_name = derivative.parameter_name
+        return derivative.describe_variable(
+            gait_finder.get_measure(derivative.measure_name),
+            describe_parameter(parameter_name, domains[parameter_name]),
+        )
 
     def make_empty_variable(variable_name: str) -> xr.Variable:
         """Return a variable without results: NaN for every sample, or -1 for an integer."""
-        missing_value = np.array(np.nan, base_wheel.damping.dtype)
+        missing_value = np.array(np.nan, dtype)
         if variable_name in INTEGER_VARIABLE_DTYPES:
             missing_value = np.array(-1, INTEGER_VARIABLE_DTYPES[variable_name])
         dimension_names, shape = design.dims, design.shape
@@ -354,13 +392,15 @@ def _make_result_layout(
         return xr.Variable(
             dimension_names,
             np.broadcast_to(missing_value, shape),
-            get_variable_attributes(variable_name),
+            describe_variable(variable_name),
         )
 
-    result_coordinates = design.make_result_coordinates() | {"leg": locked_leg_coordinate}
+    result_coordinates = design.make_result_coordinates()
+    if model.is_wheel:
+        result_coordinates |= {"leg": locked_leg_coordinate}
     for parameter_name in design.swept_parameters:
         result_coordinates[parameter_name].attrs |= describe_parameter(
-            parameter_name, model.parameter_domains[parameter_name]
+            parameter_name, domains[parameter_name]
         ).variable_attributes
     return ResultLayout(
         sample_shape=design.shape,
@@ -384,6 +424,8 @@ INTEGER_VARIABLE_DTYPES = {
 def _convert_settings_to_json(settings_object: object) -> JsonObject:
     """Return the class name and the fields of `settings_object` as JSON values, by field name."""
     class_name = type(settings_object).__name__
+    if isinstance(settings_object, ParameterizedWalker):
+        return {"kind": class_name, "walker": _identify_code(settings_object.walker)}
     field_value_by_name: JsonObject = {"kind": STORED_NAME_BY_CLASS.get(class_name, class_name)}
     stored_name_by_field = STORED_NAME_BY_MODEL_FIELD | STORED_NAMES_BY_FIELD_OF_CLASS.get(
         class_name, {}
@@ -395,7 +437,7 @@ def _convert_settings_to_json(settings_object: object) -> JsonObject:
         if field_name == "leg_force":
             if field_value is None:
                 continue
-            field_value = _identify_code(field_value)
+            field_value = _identify_code(jax.tree.structure(field_value))
         elif isinstance(field_value, tuple):
             field_value = list(field_value)
         elif field_value is not None and not isinstance(field_value, bool | int | str):

@@ -17,10 +17,8 @@ from vrw_jax.base.checks import (
     check_reals,
     require_known_name,
 )
-from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder import AbstractGaitFinder, Gait, GaitFunction, GaitMeasureReader
 from vrw_jax.gaits.margin_defaults import default_margins
-from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.wheel.params import WheelParams
 
 ConstraintSpecification = Mapping[str, float | tuple[float | None, float | None]] | Sequence[str]
@@ -36,7 +34,7 @@ class WeightedMeasureSum:
     measure_reader: GaitMeasureReader
     measure_weights: tuple[tuple[str, float], ...]
 
-    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def __call__(self, cycle: Any, step: Any) -> Array:
         weighted_measures = [
             measure_weight * self.measure_reader(measure_name, cycle, step)
             for measure_name, measure_weight in self.measure_weights
@@ -50,7 +48,7 @@ class CycleObjective:
 
     cycle_function: Callable[[Any], Array]
 
-    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def __call__(self, cycle: Any, step: Any) -> Array:
         return self.cycle_function(cycle)
 
 
@@ -111,7 +109,7 @@ def _check_objective_value(objective_value: Any) -> None:
         )
 
 
-def zero_objective(cycle: AbstractCycle, step: AbstractStep) -> Array:
+def zero_objective(cycle: Any, step: Any) -> Array:
     """Return 0 for any gait, in place of an objective that is not compiled."""
     return jnp.zeros(())
 
@@ -129,7 +127,7 @@ class ObjectiveAndConstraints:
     measure_reader: GaitMeasureReader
     constraint_names: tuple[str, ...]
 
-    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def __call__(self, cycle: Any, step: Any) -> Array:
         objective_value = self.objective_function(cycle, step)
         _check_objective_value(objective_value)
         constraint_values = []
@@ -153,7 +151,7 @@ class GaitEvaluation(NamedTuple):
 
 
 def parse_constraint_margins(
-    params: WheelParams,
+    params: Any,
     constraints: ConstraintSpecification | None,
     gait_finder: AbstractGaitFinder,
 ) -> dict[str, float]:

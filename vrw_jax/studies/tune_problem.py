@@ -32,6 +32,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import check_parameters, is_own_walker
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
     Gait,
@@ -44,20 +45,19 @@ from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.margin_defaults import default_margins
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.walker_finder import make_walker_finder
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
-    MEASURES,
     SELECTION_MARGIN_NAMES,
     describe_parameter,
-    get_measure,
     make_flag_attributes,
-    make_labeled_variables,
     make_measure_attributes,
 )
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
+    convert_step_options,
     require_compliant_model,
     require_single_wheel,
 )
@@ -87,7 +87,6 @@ from vrw_jax.studies.tune_result import ActiveConstraint, TuneResult, WalkValida
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,
-    WheelParams,
     check_parameter_name,
 )
 
@@ -113,7 +112,7 @@ DEFAULT_MARGIN_TOLERANCE = 1e-2
 
 @announce_wait("the gait, objective and constraints with derivatives", "25 s")
 def tune(
-    params: WheelParams,
+    params: Any,
     objective: ObjectiveSpecification,
     free: Sequence[str],
     bounds: ParameterBounds,
@@ -142,8 +141,11 @@ def tune(
     {"slip": (0.0, 0.05)}. The model "auto" is the model that is selected for the gait of the start.
     If this is the paper's model, its margins are the constraints, so that the model stays valid.
 
+    For a walker of yours, which needs `starts`, the measures are the period, the section
+    coordinates and its own `measures`. There are no default constraints.
+
     Args:
-        params: the start, one wheel.
+        params: the start, one wheel, or the parameters of a walker of yours.
         objective: quantity to maximize: name of a measure, weights of measures by name, or a
             function of a LimitCycle. A function of two arguments also gets the cycle's StepResult.
             A `WheelObjective` is a function of the wheel that is not compiled.
@@ -216,7 +218,7 @@ def tune(
 class TuneProblem:
     """Validated tuning problem with its free parameters, objective and constraints."""
 
-    params: WheelParams
+    params: Any
     free_parameters: tuple[str, ...]
     lower_bounds: np.ndarray
     upper_bounds: np.ndarray
@@ -246,8 +248,9 @@ class TuneProblem:
         constraint_limits: dict[str, float] = {}
         for measure_name, min_value in self.constraint_margins.items():
             names = [measure_name]
-            if get_measure(measure_name).leg_dimension:
-                names = [f"{measure_name}[leg {leg}]" for leg in range(3, self.params.n_legs + 1)]
+            if self.gait_finder.get_measure(measure_name).leg_dimension:
+                n_legs = self.gait_finder.n_legs
+                names = [f"{measure_name}[leg {leg}]" for leg in range(3, n_legs + 1)]
             constraint_limits |= dict.fromkeys(names, min_value)
         return constraint_limits
 
@@ -276,10 +279,11 @@ class TuneProblem:
         )
         return parameter_values
 
-    def make_wheel(self, normalized_parameters: np.ndarray) -> WheelParams:
+    def make_wheel(self, normalized_parameters: np.ndarray) -> Any:
         """Return the wheel with these normalized free parameters, and with its leg force."""
         model, params = self.gait_finder.model.from_parameter_values(
-            jnp.asarray(self.denormalize_parameters(normalized_parameters)), self.params.n_legs
+            jnp.asarray(self.denormalize_parameters(normalized_parameters)),
+            self.gait_finder.n_legs,
         )
         return model.attach_leg_force(params)
 
@@ -427,7 +431,8 @@ class TuneProblem:
         best_gait = best_trial.gait_evaluation.gait
         params = self.make_wheel(best_trial.normalized_parameters)
         model: Any = self.gait_finder.model
-        if params.leg_force is not None:
+        leg_force = getattr(params, "leg_force", None)
+        if leg_force is not None:
             model = model.with_leg_force_of(params)
         unit_by_parameter = {name: x.unit for name, x in model.parameter_domains.items()}
         conditions = compute_optimality_conditions(
@@ -444,7 +449,8 @@ class TuneProblem:
             ActiveConstraint(
                 limited_name.removeprefix(UPPER_BOUND_PREFIX),
                 restore_sign_of_bound(limited_name, limit),
-                unit_by_parameter.get(limited_name) or get_measure(limited_name).unit,
+                unit_by_parameter.get(limited_name)
+                or self.gait_finder.get_measure(limited_name).unit,
                 low if low == high else np.nan,
                 (low, high),
             )
@@ -459,9 +465,9 @@ class TuneProblem:
         ]
         end_seconds = time.perf_counter()
         walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
-        step_measures = best_gait.step.measures()
+        step_measures = self.gait_finder.measure_step(params, best_gait.cycle, best_gait.step)
         return TuneResult(
-            params=params.attach_leg_force(None),
+            params=params if leg_force is None else params.attach_leg_force(None),
             model=model,
             status=maximization_result.status,
             objective=self.objective_label,
@@ -492,7 +498,7 @@ class TuneProblem:
             exploration=exploration_result,
         )
 
-    def _validate_tuned_wheel_by_walking(self, params: WheelParams, gait: Gait) -> WalkValidation:
+    def _validate_tuned_wheel_by_walking(self, params: Any, gait: Gait) -> WalkValidation:
         """Simulate a walk that starts near the section state of the gait, and return its
         validation.
         """
@@ -500,14 +506,14 @@ class TuneProblem:
         # The state is scaled down, not up, because no leg may be beyond its stopper.
         section_state = cycle_section_state * (1.0 - RELATIVE_START_DISPLACEMENT)
         is_gait_feasible, walk_outcome, n_steps_walked = True, Outcome.STEPPED, 0
-        default_margins_by_name = default_margins(params)
+        default_margins_by_name = default_margins(params) if self.gait_finder.model.is_wheel else {}
         for _ in range(N_STEPS_OF_WALK):
             step_result = self.gait_finder.take_gait_step(params, jnp.asarray(section_state))
             walk_outcome = Outcome(int(step_result.outcome))
             if walk_outcome != Outcome.STEPPED:
                 break
+            step_measures = self.gait_finder.measure_step(params, section_state, step_result)
             n_steps_walked, section_state = n_steps_walked + 1, np.array(step_result.section_state)
-            step_measures = step_result.measures()
             for constraint_name, min_constraint_value in self.constraint_margins.items():
                 measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
                 if measure_name not in step_measures:
@@ -542,14 +548,15 @@ class TuneProblem:
         trial_outcomes = [
             trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND for trial in trials
         ]
-        path_dataset_variables: dict[str, Any] = make_labeled_variables(
-            dict(zip(self.free_parameters, parameter_values.T, strict=True)), "evaluation"
-        )
         domains = self.gait_finder.model.parameter_domains
-        for parameter_name in self.free_parameters:
-            path_dataset_variables[parameter_name].attrs |= describe_parameter(
-                parameter_name, domains[parameter_name]
-            ).variable_attributes
+        path_dataset_variables: dict[str, Any] = {
+            name: (
+                "evaluation",
+                values,
+                describe_parameter(name, domains[name]).variable_attributes,
+            )
+            for name, values in zip(self.free_parameters, parameter_values.T, strict=True)
+        }
         path_dataset_variables |= {
             "objective": (
                 "evaluation",
@@ -579,7 +586,8 @@ class TuneProblem:
             "on_branch": ("evaluation", np.array([trial.is_on_branch for trial in trials])),
         }
         constraint_units = [
-            get_measure(constraint_name).unit for constraint_name in self.constraint_names
+            self.gait_finder.get_measure(constraint_name).unit
+            for constraint_name in self.constraint_names
         ]
         path_dataset_coordinates = {
             "evaluation": np.arange(len(trials)),
@@ -607,7 +615,7 @@ class TuneProblem:
 
 
 def make_tune_problem(
-    params: WheelParams,
+    params: Any,
     objective: ObjectiveSpecification,
     free: Sequence[str],
     bounds: ParameterBounds,
@@ -624,8 +632,13 @@ def make_tune_problem(
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
     """
-    require_single_wheel(params, "tune one after the other")
-    checked_model = convert_model_argument(model)
+    own_finder = None
+    if is_own_walker(model):
+        own_finder = make_walker_finder(model, params, convert_step_options(options))
+        params = check_parameters(params)
+    else:
+        require_single_wheel(params, "tune one after the other")
+    checked_model: Any = convert_model_argument(model) if own_finder is None else own_finder.model
     free_parameters, lower_bounds, upper_bounds = _check_parameter_bounds(
         params, free, bounds, checked_model
     )
@@ -634,7 +647,7 @@ def make_tune_problem(
             f"free is {free_parameters}, but a WheelObjective is a function of WheelParams, which "
             "do not contain a leg force: give a measure, or a function of the cycle."
         )
-    gait_finder = make_finder(
+    gait_finder: AbstractGaitFinder = own_finder or make_finder(
         convert_model_argument(resolve_model(params, checked_model)),
         params.n_legs,
         cycle_options=cycle_options,
@@ -651,15 +664,12 @@ def make_tune_problem(
         constraints = SELECTION_MARGIN_NAMES
     constraint_margins = parse_constraint_margins(params, constraints, gait_finder)
     objective_and_constraints = ObjectiveAndConstraints(
-        objective_function, type(gait_finder).read_measure, tuple(constraint_margins)
+        objective_function, gait_finder.measure_reader, tuple(constraint_margins)
     )
     if callable(objective):  # Errors of the objective are raised here, before compilation.
         cycle_template = jax.eval_shape(gait_finder.find_cycle, params)
-        section_state_template = jax.ShapeDtypeStruct(
-            (gait_finder.model.count_section_entries(params),), params.damping.dtype
-        )
         step_result_template = jax.eval_shape(
-            gait_finder.model.take_step, params, section_state_template, gait_finder.step_options
+            gait_finder.take_gait_step, params, cycle_template.section_state
         )
         jax.eval_shape(objective_and_constraints, cycle_template, step_result_template)
     wheel_objective = objective if isinstance(objective, WheelObjective) else None
@@ -686,7 +696,7 @@ def _parse_objective_function(
     if isinstance(objective, WheelObjective):
         return zero_objective, objective.label
     if callable(objective):
-        if not gait_finder.supports_cold_start:
+        if gait_finder.model.is_wheel and not gait_finder.supports_cold_start:
             raise TypeError(
                 "objective is a function, but with contact it must be a measure's name or "
                 f"weights of several: choose from {', '.join(gait_finder.differentiable_measures)}."
@@ -710,7 +720,7 @@ def _parse_objective_function(
     for measure_name, measure_weight in measure_weights.items():
         require_known_name(measure_name, gait_finder.readable_measures, "measure for objective")
         check_real(f"the weight of {measure_name}", measure_weight)
-        if MEASURES[measure_name].leg_dimension:
+        if gait_finder.get_measure(measure_name).leg_dimension:
             raise ValueError(
                 f"{measure_name} has one value for each locked leg, but an objective is one "
                 "number: give a function of the cycle and the step that reduces it."
@@ -720,12 +730,12 @@ def _parse_objective_function(
         for measure_name, measure_weight in measure_weights.items()
     )
     return WeightedMeasureSum(
-        type(gait_finder).read_measure, tuple(measure_weights.items())
+        gait_finder.measure_reader, tuple(measure_weights.items())
     ), objective_label.replace("+ -", "- ")
 
 
 def _check_parameter_bounds(
-    params: WheelParams, free: Sequence[str], bounds: ParameterBounds, model: Any
+    params: Any, free: Sequence[str], bounds: ParameterBounds, model: Any
 ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Return the names of the free parameters, and the arrays of their lower and upper bounds."""
     domain_by_parameter = model.parameter_domains

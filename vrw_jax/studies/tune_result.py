@@ -12,10 +12,8 @@ from vrw_jax.base.printing import (
     format_html_table,
     format_quantity,
 )
-from vrw_jax.models.measures import MEASURES, get_measure
 from vrw_jax.studies.tune_exploration import ExplorationResult
 from vrw_jax.studies.tune_maximization import TuneStatus
-from vrw_jax.wheel.params import WheelParams
 
 NO_ACTIVE_CONSTRAINT_TEXTS = {
     TuneStatus.CONVERGED: "nothing: a maximum inside all bounds and constraints",
@@ -106,7 +104,7 @@ class TuneResult:
         215.0 N s/m, True
     """
 
-    params: WheelParams
+    params: Any
     status: TuneStatus
     objective: str
     value: float
@@ -141,8 +139,6 @@ class TuneResult:
         free_parameter_names = self.path.attrs["free"].split()
 
         def describe_value(name: str) -> str:
-            if name in MEASURES:
-                return MEASURES[name].format_with_unit(getattr(self.params, name))
             value = self.model.get_parameter(self.params, name)
             return format_quantity(value, self.path[name].attrs["units"])
 
@@ -153,8 +149,7 @@ class TuneResult:
         if not self.path.sizes["constraint"]:
             feasibility_text = "no constraint to keep"
         active_constraint_texts = [
-            f"{parameter_name} at {get_measure(parameter_name).format_with_unit(constraint_limit)}"
-            for parameter_name, constraint_limit, *_ in self.active
+            f"{limit.name} at {format_quantity(limit.limit, limit.unit)}" for limit in self.active
         ]
         kink_texts = {
             "kink": f"{', '.join(self.kinks)}: the minimum occurs at several instants at once"
