@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import export, lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax.base.types import Scalar
@@ -53,32 +53,38 @@ error is 1e-5 and Newton's method converges quadratically.
 """
 
 
-class QuantityTimeDerivatives(NamedTuple):
-    """Value of a quantity at one state, and its first and second time derivatives."""
+class LocatedExtrema(NamedTuple):
+    """Extrema of quantities F in one phase, and of their rates R, each in the order of time.
 
-    quantity_value: Scalar
-    first_time_derivative: Scalar
-    second_time_derivative: Scalar
-
-
-class PhaseExtrema(NamedTuple):
-    """Extrema of a quantity F in one phase, and extrema of its rate R, each in the order of time.
-
-    All arrays have a fixed length. An element that is no extremum has false flags, and its times
-    and values are meaningless. The times carry no derivatives. The values nevertheless have exact
-    first derivatives, because F and R are stationary in time at their extrema. The values at the
-    ends have first derivatives, too, because the ends move with the motion.
+    Nothing here has derivatives. An element that is no extremum has false flags, and its time is
+    meaningless. The last two fields describe additional intervals that end at `times` and then at
+    `rate_times`: the accelerations at their Gauss nodes, and the inverse of the Jacobian by these
+    accelerations of the equations of motion at the nodes.
     """
 
-    extremum_times: Float[Array, " pieces"]  # since the start of the phase, s
-    extremum_values: Float[Array, " pieces"]
-    is_quantity_maximum: Bool[Array, " pieces"]
-    is_quantity_minimum: Bool[Array, " pieces"]
-    rate_extremum_times: Float[Array, " rates"]  # since the start of the phase, s
-    rate_extremum_values: Float[Array, " rates"]  # value of R at its extrema
-    is_rate_maximum: Bool[Array, " rates"]
-    end_values: Float[Array, "2"]  # value of F at the start and at the end of the phase
+    times: Float[Array, "quantities extrema"]  # since the start of the phase, s
+    is_maximum: Bool[Array, "quantities extrema"]
+    is_minimum: Bool[Array, "quantities extrema"]
+    rate_times: Float[Array, "quantities rate_extrema"]  # since the start of the phase, s
+    is_rate_maximum: Bool[Array, "quantities rate_extrema"]
+    node_accelerations: Float[Array, "quantities times unknowns"]
+    inverse_jacobian: Float[Array, "quantities times unknowns unknowns"]
 
+
+class ExtremumValues(NamedTuple):
+    """Values of quantities at their extrema, of their rates R at its extrema, and at both ends.
+
+    They have exact first derivatives, because F and R are stationary in time at their extrema, and
+    because the ends move with the motion.
+    """
+
+    values: Float[Array, "quantities extrema"]
+    rates: Float[Array, "quantities rate_extrema"]
+    ends: Float[Array, "quantities 2"]  # F at the start and at the end of the phase
+
+
+# Saved traces contain this named tuple.
+export.register_namedtuple_serialization(LocatedExtrema, serialized_name="vrw_jax.LocatedExtrema")
 
 FunctionOfCoordinatesAndRates = Callable[[Array, Array], Array]
 """Function that maps coordinates and rates, each of shape (coordinates,), to an array."""
@@ -164,86 +170,43 @@ class CollocatedPhaseMotion(NamedTuple):
             location_in_interval * interval_start_v + interval_lengths * position_increments
         ), interval_start_v + interval_lengths * rate_increments
 
-    def integrate_motion_to_time(
-        self, time_in_phase: Scalar, compute_acceleration: FunctionOfCoordinatesAndRates
-    ) -> tuple[Array, Array]:
-        """Return the coordinates and the rates at a time within the phase.
+    def begin_interval(
+        self, time: Scalar, compute_acceleration: FunctionOfCoordinatesAndRates
+    ) -> tuple[Array, Callable, Callable]:
+        """Return an additional interval from the last mesh boundary before a time to this time.
 
-        `time_in_phase` is the time since the start of the phase, in s. It is the end of an
-        additional mesh interval, which begins at the last mesh boundary before that time. Newton's
-        method solves for the node accelerations of the additional interval. The result is
-        differentiable with respect to the motion, but not with respect to the time.
+        The result contains a guess of the accelerations at its Gauss nodes, flat, and two functions
+        of these accelerations: the residual of the equations of motion, and the state (q, v) at the
+        end. They are differentiable by the motion, but not by the time, s since the phase's start.
         """
-        interval_index = find_mesh_intervals(self.interval_boundary_times, time_in_phase)
-        interval_start_q = self.interval_boundary_q[interval_index]
-        interval_start_v = self.interval_boundary_v[interval_index]
-        partial_interval_length = lax.stop_gradient(
-            time_in_phase - self.interval_boundary_times[interval_index]
+        interval_index = find_mesh_intervals(self.interval_boundary_times, time)
+        start_q, start_v = (
+            x[interval_index] for x in (self.interval_boundary_q, self.interval_boundary_v)
         )
+        h = lax.stop_gradient(time - self.interval_boundary_times[interval_index])
 
-        def compute_dynamics_residual(flat_accelerations: Array) -> Array:
-            node_accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
-            node_q = interval_start_q + partial_interval_length * (
-                GAUSS_NODES[:, None] * interval_start_v
-                + partial_interval_length * (DOUBLE_INTEGRATION_MATRIX @ node_accelerations)
+        def compute_residual(flat_accelerations: Array) -> Array:
+            accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
+            q = start_q + h * (
+                GAUSS_NODES[:, None] * start_v + h * (DOUBLE_INTEGRATION_MATRIX @ accelerations)
             )
-            node_v = interval_start_v + partial_interval_length * (
-                INTEGRATION_MATRIX @ node_accelerations
-            )
-            return (node_accelerations - jax.vmap(compute_acceleration)(node_q, node_v)).ravel()
+            v = start_v + h * (INTEGRATION_MATRIX @ accelerations)
+            return (accelerations - jax.vmap(compute_acceleration)(q, v)).ravel()
 
-        def refine_node_accelerations(flat_accelerations: Array, _: None) -> tuple[Array, None]:
-            # The tangents of the last iteration are exact because the Jacobian has none.
-            residual_jacobian = lax.stop_gradient(
-                jax.jacfwd(compute_dynamics_residual)(flat_accelerations)
-            )
-            return flat_accelerations - jnp.linalg.solve(
-                residual_jacobian, compute_dynamics_residual(flat_accelerations)
-            ), None
+        def compute_end(flat_accelerations: Array) -> tuple[Array, Array]:
+            accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
+            end_q = start_q + h * (start_v + h * (DOUBLE_END_WEIGHTS @ accelerations))
+            return end_q, start_v + h * (END_WEIGHTS @ accelerations)
 
-        node_accelerations = lax.scan(
-            refine_node_accelerations,
-            lax.stop_gradient(self.node_accelerations[interval_index].ravel()),
-            length=N_STATE_NEWTON_ITERATIONS,
-        )[0].reshape(N_GAUSS_NODES, -1)
-        return interval_start_q + partial_interval_length * (
-            interval_start_v + partial_interval_length * (DOUBLE_END_WEIGHTS @ node_accelerations)
-        ), interval_start_v + partial_interval_length * (END_WEIGHTS @ node_accelerations)
+        guess = lax.stop_gradient(self.node_accelerations[interval_index].ravel())
+        return guess, compute_residual, compute_end
 
 
 class _PiecewiseQuantityPolynomial(NamedTuple):
-    """Quantity in one phase as a polynomial of time in each mesh interval.
-
-    The coefficients carry no derivatives.
-    """
+    """Quantity in one phase as a polynomial of time in each mesh interval."""
 
     interval_boundary_times: Float[Array, " boundaries"]
     interval_coefficients: Float[Array, "intervals powers"]  # in powers of the location in [0, 1]
-
-    @classmethod
-    def interpolate_quantity(
-        cls,
-        phase_motion: CollocatedPhaseMotion,
-        compute_quantity: FunctionOfCoordinatesAndRates,
-    ) -> "_PiecewiseQuantityPolynomial":
-        """Interpolate samples of the quantity in each mesh interval."""
-        n_samples_per_interval = N_SAMPLES_PER_INTERVAL
-        chebyshev_angles = (
-            np.pi * (np.arange(n_samples_per_interval) + 0.5) / n_samples_per_interval
-        )
-        sample_locations = 0.5 - 0.5 * np.cos(chebyshev_angles)
-        sampled_states = [
-            phase_motion.evaluate_states_in_intervals(sample_location)
-            for sample_location in sample_locations
-        ]
-        q, v = jax.tree.map(lambda *states: jnp.stack(states, 1), *sampled_states)
-        sampled_values = jax.vmap(jax.vmap(compute_quantity))(q, v)
-        interpolation_matrix = np.linalg.inv(
-            sample_locations[:, None] ** np.arange(n_samples_per_interval)
-        )
-        return lax.stop_gradient(
-            cls(phase_motion.interval_boundary_times, sampled_values @ interpolation_matrix.T)
-        )
 
     def evaluate_polynomial_time_derivative(
         self, evaluation_times: Array, derivative_order: int
@@ -284,148 +247,170 @@ class _PiecewiseQuantityPolynomial(NamedTuple):
         return jnp.append(times_before_phase_end.ravel(), self.interval_boundary_times[-1])
 
 
-def find_quantity_extrema(
-    phase_motion: CollocatedPhaseMotion,
-    compute_acceleration: FunctionOfCoordinatesAndRates,
-    compute_quantity: FunctionOfCoordinatesAndRates,
-) -> PhaseExtrema:
-    """Find the extrema of a quantity inside a phase.
+def _sample_quantities(
+    motion: CollocatedPhaseMotion, compute_quantities: FunctionOfCoordinatesAndRates
+) -> Float[Array, "quantities intervals powers"]:
+    """Return the coefficients of the polynomials through samples of quantities in each interval."""
+    angles = np.pi * (np.arange(N_SAMPLES_PER_INTERVAL) + 0.5) / N_SAMPLES_PER_INTERVAL
+    locations = 0.5 - 0.5 * np.cos(angles)
+    states = [motion.evaluate_states_in_intervals(location) for location in locations]
+    q, v = jax.tree.map(lambda *states: jnp.stack(states, 1), *states)
+    samples = jax.vmap(jax.vmap(compute_quantities))(q, v)
+    interpolation = np.linalg.inv(locations[:, None] ** np.arange(N_SAMPLES_PER_INTERVAL))
+    return jnp.einsum("isq,ps->qip", samples, interpolation)
 
-    The values of the extrema have exact first derivatives.
+
+def locate_extrema(
+    motion: CollocatedPhaseMotion,
+    compute_acceleration: FunctionOfCoordinatesAndRates,
+    compute_quantities: FunctionOfCoordinatesAndRates,
+) -> LocatedExtrema:
+    """Locate the extrema of several quantities inside a phase.
 
     Args:
-        phase_motion: motion during the phase.
+        motion: motion during the phase.
         compute_acceleration: function that maps coordinates and rates to accelerations.
-        compute_quantity: function that maps coordinates and rates to the quantity, a scalar.
+        compute_quantities: function that maps them to the quantities, shape (quantities,).
     """
-    quantity_polynomial = _PiecewiseQuantityPolynomial.interpolate_quantity(
-        phase_motion, compute_quantity
-    )
-    phase_duration = quantity_polynomial.interval_boundary_times[-1]
-    sample_times = quantity_polynomial.sample_times_in_phase
-    sampled_second_rates = quantity_polynomial.evaluate_polynomial_time_derivative(sample_times, 2)
-    last_sample_index = len(sampled_second_rates) - 1
-    # An unused bracket has zero length and lies at the end of the phase.
-    bracket_start_indices = jnp.nonzero(
-        sampled_second_rates[:-1] * sampled_second_rates[1:] < 0.0,
-        size=MAX_RATE_EXTREMA_PER_PHASE,
-        fill_value=last_sample_index,
-    )[0]
-    is_rate_extremum = bracket_start_indices < last_sample_index
-    bracket_indices = jnp.stack(
-        [bracket_start_indices, jnp.minimum(bracket_start_indices + 1, last_sample_index)]
-    )
-    bracket_times = sample_times[bracket_indices]
-    bracket_second_rates = sampled_second_rates[bracket_indices]
-    rate_extremum_times = _bisect_zeros(
-        lambda t: quantity_polynomial.evaluate_polynomial_time_derivative(t, 2),
-        bracket_times,
-        bracket_second_rates[0],
-    )
-    second_rate_slopes = (bracket_second_rates[1] - bracket_second_rates[0]) / jnp.where(
-        is_rate_extremum, bracket_times[1] - bracket_times[0], 1.0
-    )
-    # The start and the end of the phase bound the extrema of R.
-    rate_extremum_times = jnp.concatenate(
-        [
-            0.0 * phase_duration[None],
-            jnp.where(is_rate_extremum, rate_extremum_times, phase_duration),
-            phase_duration[None],
-        ]
-    )
-    inverse_second_rate_slopes = jnp.where(
-        is_rate_extremum, 1.0 / jnp.where(second_rate_slopes == 0.0, 1.0, second_rate_slopes), 0.0
-    )
-    inverse_second_rate_slopes = jnp.pad(inverse_second_rate_slopes, 1)
-
-    def correct_extremum_times(
-        compute_time_corrections: Callable[[QuantityTimeDerivatives], Array], extremum_times: Array
-    ) -> tuple:
-        """Return the corrected times, and the time derivatives of the quantity at the corrected
-        times.
-
-        `compute_time_corrections` maps the time derivatives of the quantity to the error of each
-        time.
-        """
-
-        def evaluate_quantity_at_time(time_in_phase: Array) -> QuantityTimeDerivatives:
-            state_at_time = phase_motion.integrate_motion_to_time(
-                time_in_phase, compute_acceleration
-            )
-            return evaluate_quantity_time_derivatives(
-                compute_quantity, compute_acceleration, *state_at_time
-            )
-
-        def correct_extremum_times_once(
-            times_and_quantity_derivatives: tuple, _: None
-        ) -> tuple[tuple, None]:
-            corrected_times, quantity_derivatives = times_and_quantity_derivatives
-            time_corrections = lax.stop_gradient(compute_time_corrections(quantity_derivatives))
-            corrected_times = jnp.clip(corrected_times - time_corrections, 0.0, phase_duration)
-            return (corrected_times, jax.vmap(evaluate_quantity_at_time)(corrected_times)), None
-
-        return lax.scan(
-            correct_extremum_times_once,
-            (extremum_times, QuantityTimeDerivatives(*jnp.zeros((3, *extremum_times.shape)))),
-            length=N_TIME_CORRECTIONS,
-        )[0]
-
-    rate_extremum_times, derivatives_at_rate_extrema = correct_extremum_times(
-        lambda derivatives_at_times: (
-            derivatives_at_times.second_time_derivative * inverse_second_rate_slopes
-        ),
-        rate_extremum_times,
-    )
-    rates = derivatives_at_rate_extrema.first_time_derivative
-    has_extremum = (rates[:-1] * rates[1:] < 0.0) & (phase_duration > 0.0)
-    extremum_times = _bisect_zeros(
-        lambda t: quantity_polynomial.evaluate_polynomial_time_derivative(t, 1),
-        jnp.stack([rate_extremum_times[:-1], rate_extremum_times[1:]]),
-        rates[:-1],
-    )
-    compute_newton_correction = lambda derivatives_at_times: jnp.where(
-        has_extremum,
-        derivatives_at_times.first_time_derivative
-        / jnp.where(
-            derivatives_at_times.second_time_derivative == 0.0,
-            1.0,
-            derivatives_at_times.second_time_derivative,
-        ),
-        0.0,
-    )
-    extremum_times, derivatives_at_extrema = correct_extremum_times(
-        compute_newton_correction, extremum_times
-    )
-    return PhaseExtrema(
-        extremum_times=extremum_times,
-        extremum_values=derivatives_at_extrema.quantity_value,
-        is_quantity_maximum=has_extremum & (rates[:-1] > 0.0),
-        is_quantity_minimum=has_extremum & (rates[:-1] < 0.0),
-        rate_extremum_times=rate_extremum_times[1:-1],
-        rate_extremum_values=rates[1:-1],
-        is_rate_maximum=is_rate_extremum & (second_rate_slopes < 0.0) & (phase_duration > 0.0),
-        end_values=jax.vmap(compute_quantity)(
-            phase_motion.interval_boundary_q[np.array([0, -1])],
-            phase_motion.interval_boundary_v[np.array([0, -1])],
-        ),
-    )
-
-
-def evaluate_quantity_time_derivatives(
-    compute_quantity: FunctionOfCoordinatesAndRates,
-    compute_acceleration: FunctionOfCoordinatesAndRates,
-    q: Array,
-    v: Array,
-) -> QuantityTimeDerivatives:
-    """Return the value and the first two time derivatives of a quantity at the state (q, v)."""
+    phase_duration = motion.interval_boundary_times[-1]
 
     def append_time_derivative(function_of_state: Callable) -> Callable:
         return lambda q, v: jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
 
-    (quantity_value, first_time_derivative), (_, second_time_derivative) = append_time_derivative(
-        append_time_derivative(compute_quantity)
-    )(q, v)
-    return QuantityTimeDerivatives(quantity_value, first_time_derivative, second_time_derivative)
+    compute_time_derivatives = append_time_derivative(append_time_derivative(compute_quantities))
+
+    def evaluate_at(time: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the rates R and S of all quantities at a time, and the additional interval."""
+        guess, compute_residual, compute_end = motion.begin_interval(time, compute_acceleration)
+
+        def refine(accelerations: Array, _: None) -> tuple[Array, Array]:
+            inverse_jacobian = jnp.linalg.inv(jax.jacfwd(compute_residual)(accelerations))
+            residual = compute_residual(accelerations)
+            return accelerations - inverse_jacobian @ residual, inverse_jacobian
+
+        accelerations, inverse_jacobians = lax.scan(refine, guess, length=N_STATE_NEWTON_ITERATIONS)
+        (_, rates), (_, second_rates) = compute_time_derivatives(*compute_end(accelerations))
+        return rates, second_rates, accelerations, inverse_jacobians[-1]
+
+    def locate(coefficients: Array, quantity_index: Array) -> LocatedExtrema:
+        """Locate the extrema of one quantity with the given polynomials."""
+        polynomial = _PiecewiseQuantityPolynomial(motion.interval_boundary_times, coefficients)
+        rate_times, slopes = _locate_rate_extrema(polynomial)
+        is_rate_extremum = slopes != 0.0
+        # The start and the end of the phase bound the extrema of R.
+        starts = jnp.concatenate([jnp.zeros(1), rate_times, phase_duration[None]])
+        inverse_slopes = jnp.pad(jnp.where(is_rate_extremum, 1.0 / slopes, 0.0), 1)
+
+        def locate_next(carry: tuple, seeks_extrema: Array) -> tuple[tuple, tuple]:
+            """Locate the extrema of R, or of F between those of R in `carry`."""
+            times, rates, has_extremum = carry
+            bisected_times = _bisect_zeros(
+                lambda t: polynomial.evaluate_polynomial_time_derivative(t, 1),
+                jnp.stack([times[:-1], times[1:]]),
+                rates[:-1],
+            )
+            times = jnp.where(seeks_extrema, jnp.append(bisected_times, phase_duration), times)
+            has_extremum = (rates[:-1] * rates[1:] < 0.0) & (phase_duration > 0.0)
+
+            def correct(times_and_interval: tuple, _: None) -> tuple[tuple, None]:
+                times, (rates, second_rates, *_) = times_and_interval
+                newton_correction = jnp.where(
+                    jnp.append(has_extremum, False),
+                    rates / jnp.where(second_rates == 0.0, 1.0, second_rates),
+                    0.0,
+                )
+                correction = jnp.where(
+                    seeks_extrema, newton_correction, second_rates * inverse_slopes
+                )
+                times = jnp.clip(times - correction, 0.0, phase_duration)
+                rates, second_rates, *interval = jax.vmap(evaluate_at)(times)
+                quantity_rates = rates[:, quantity_index], second_rates[:, quantity_index]
+                return (times, (*quantity_rates, *interval)), None
+
+            n_unknowns = motion.node_accelerations[0].size
+            zeros = jnp.zeros_like(times)
+            no_interval = (
+                jnp.zeros((len(times), n_unknowns)),
+                jnp.zeros((len(times), n_unknowns, n_unknowns)),
+            )
+            (times, (rates, _, *interval)), _ = lax.scan(
+                correct, (times, (zeros, zeros, *no_interval)), length=N_TIME_CORRECTIONS
+            )
+            return (times, rates, has_extremum), (times, rates, interval)
+
+        no_extremum = jnp.zeros(len(starts) - 1, bool)
+        (times, _, has_extremum), (all_times, all_rates, intervals) = lax.scan(
+            locate_next, (starts, jnp.zeros_like(starts), no_extremum), np.array([False, True])
+        )
+        is_rising = all_rates[0, :-1] > 0.0
+        join = lambda x: jnp.concatenate([x[1, :-1], x[0, 1:-1]])
+        return LocatedExtrema(
+            times[:-1],
+            has_extremum & is_rising,
+            has_extremum & ~is_rising,
+            all_times[0, 1:-1],
+            is_rate_extremum & (slopes < 0.0) & (phase_duration > 0.0),
+            *map(join, intervals),
+        )
+
+    coefficients = _sample_quantities(motion, compute_quantities)
+    return jax.vmap(locate)(coefficients, jnp.arange(len(coefficients)))
+
+
+def _locate_rate_extrema(polynomial: _PiecewiseQuantityPolynomial) -> tuple[Array, Array]:
+    """Return where the second time derivative of the polynomials is zero, and its slope there.
+
+    Unused elements lie at the end of the phase, and their slope is zero.
+    """
+    times = polynomial.sample_times_in_phase
+    second_rates = polynomial.evaluate_polynomial_time_derivative(times, 2)
+    last = len(times) - 1
+    starts = jnp.nonzero(
+        second_rates[:-1] * second_rates[1:] < 0.0,
+        size=MAX_RATE_EXTREMA_PER_PHASE,
+        fill_value=last,
+    )[0]
+    brackets = jnp.stack([starts, jnp.minimum(starts + 1, last)])
+    is_used = starts < last
+    (first_rates, last_rates), (first_times, last_times) = second_rates[brackets], times[brackets]
+    roots = _bisect_zeros(
+        lambda t: polynomial.evaluate_polynomial_time_derivative(t, 2),
+        times[brackets],
+        first_rates,
+    )
+    slopes = (last_rates - first_rates) / jnp.where(is_used, last_times - first_times, 1.0)
+    return jnp.where(is_used, roots, times[-1]), jnp.where(is_used, slopes, 0.0)
+
+
+def evaluate_extrema(
+    motion: CollocatedPhaseMotion,
+    compute_acceleration: FunctionOfCoordinatesAndRates,
+    compute_quantities: FunctionOfCoordinatesAndRates,
+    extrema: LocatedExtrema,
+) -> ExtremumValues:
+    """Return the values of several quantities at their located extrema, with derivatives.
+
+    The arguments are those of `locate_extrema`. One Newton iteration with the constant Jacobian of
+    `extrema` gives the state at each extremum its derivatives.
+    """
+
+    def evaluate_at(time: Array, accelerations: Array, inverse_jacobian: Array) -> tuple:
+        _, compute_residual, compute_end = motion.begin_interval(time, compute_acceleration)
+        q, v = compute_end(accelerations - inverse_jacobian @ compute_residual(accelerations))
+        return jax.jvp(compute_quantities, (q, v), (v, compute_acceleration(q, v)))
+
+    times = jnp.concatenate([extrema.times, extrema.rate_times], 1)
+    values, rates = jax.vmap(jax.vmap(evaluate_at))(
+        times, extrema.node_accelerations, extrema.inverse_jacobian
+    )
+    # each quantity at its own times
+    values, rates = (jnp.einsum("qtq->qt", x) for x in (values, rates))
+    n_extrema = extrema.times.shape[1]
+    end_indices = np.array([0, -1])
+    ends = jax.vmap(compute_quantities)(
+        motion.interval_boundary_q[end_indices], motion.interval_boundary_v[end_indices]
+    )
+    return ExtremumValues(values[:, :n_extrema], rates[:, n_extrema:], ends.T)
 
 
 def _bisect_zeros(

@@ -5,72 +5,140 @@ phase. Impacts and changes of phase are no peaks. The largest force may also occ
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.collocation_search import CollocationSystem
-from vrw_jax.gaits.extrema import CollocatedPhaseMotion, PhaseExtrema, find_quantity_extrema
+from vrw_jax.gaits.extrema import (
+    CollocatedPhaseMotion,
+    ExtremumValues,
+    FunctionOfCoordinatesAndRates,
+    LocatedExtrema,
+    evaluate_extrema,
+    locate_extrema,
+)
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant, make_paper_phases
 
 
+class PhaseForces(NamedTuple):
+    """Motion in one phase, and functions of coordinates and rates: accelerations and forces.
+
+    The forces are the normal force on the fore foot and, in double support, also the total force.
+    """
+
+    motion: CollocatedPhaseMotion
+    compute_acceleration: FunctionOfCoordinatesAndRates
+    compute_forces: FunctionOfCoordinatesAndRates
+
+
+def _collect_phase_forces(
+    collocation_system: CollocationSystem, parameters: Array, solution: CollocationSolution
+) -> tuple[list[list[PhaseForces]], list[Scalar]]:
+    """Return the forces of each phase in each gait step, and the impulse of the next landing."""
+    symbols = collocation_system.make_wheel(parameters).symbols()
+    forces_by_step, landing_impulses = [], []
+    for step_index, phase_points in enumerate(
+        collocation_system.evaluate_phase_points(parameters, solution)
+    ):
+        phases = make_paper_phases(
+            symbols, phase_points[0].phase_start_point.held_constants[0], stop_at_lift_off=False
+        )
+        forces_by_step.append(
+            [
+                PhaseForces(
+                    CollocatedPhaseMotion.from_node_accelerations(
+                        mesh,
+                        jnp.stack(points.phase_start_point.q),
+                        jnp.stack(points.phase_start_point.v),
+                        duration,
+                        accelerations[step_index],
+                    ),
+                    functools.partial(_compute_acceleration, phase),
+                    functools.partial(_compute_forces, phase),
+                )
+                for mesh, phase, points, duration, accelerations in zip(
+                    collocation_system.phase_meshes,
+                    phases,
+                    phase_points,
+                    solution.durations[step_index],
+                    solution.accelerations,
+                    strict=True,
+                )
+            ]
+        )
+        end_point = phase_points[-1].phase_end_point
+        landing = transitions.resolve_landing(symbols, end_point.q[0], *end_point.v)
+        landing_impulses.append(landing.fore_impulse.normal)
+    return forces_by_step, landing_impulses
+
+
+def _compute_acceleration(phase: AbstractPhase, q: Array, v: Array) -> Array:
+    motion = phase.compute_motion(tuple(q), tuple(v))
+    return jnp.stack(phase.solve_acceleration(motion)[: phase.n_dof])
+
+
+def _compute_forces(phase: AbstractPhase, q: Array, v: Array) -> Array:
+    instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)))
+    fore_force = jnp.asarray(instant.fore_force.normal)
+    if instant.rear_force is None:
+        return fore_force[None]
+    return jnp.stack([fore_force, fore_force + instant.rear_force.normal])
+
+
 @functools.partial(jax.jit, static_argnums=0)
-def compute_force_peaks(
+def locate_force_extrema(
+    collocation_system: CollocationSystem, parameters: Array, solution: CollocationSolution
+) -> list[list[LocatedExtrema]]:
+    """Return where the forces of each phase in each gait step have extrema.
+
+    The result has no derivatives.
+    """
+    parameters, solution = lax.stop_gradient((parameters, solution))
+    forces_by_step, _ = _collect_phase_forces(collocation_system, parameters, solution)
+    return [[locate_extrema(*forces) for forces in step_forces] for step_forces in forces_by_step]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def evaluate_force_peaks(
     collocation_system: CollocationSystem,
     parameters: Array,
-    collocation_solution: CollocationSolution,
+    solution: CollocationSolution,
+    extrema_by_step: list[list[LocatedExtrema]],
 ) -> dict[str, Scalar]:
-    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name.
+    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, from its located extrema.
 
     Each measure is the largest value over the gait steps of the cycle.
     """
-    wheel_symbols = collocation_system.make_wheel(parameters).symbols()
-    peaks_by_step = []
-    phase_points_by_step = collocation_system.evaluate_phase_points(
-        parameters, collocation_solution
+    forces_by_step, landing_impulses = _collect_phase_forces(
+        collocation_system, parameters, solution
     )
-    for step_index, phase_points in enumerate(phase_points_by_step):
-        wheel_phases = make_paper_phases(
-            wheel_symbols,
-            phase_points[0].phase_start_point.held_constants[0],
-            stop_at_lift_off=False,
+    peaks_by_step = []
+    for step_forces, step_extrema, durations, landing_impulse in zip(
+        forces_by_step, extrema_by_step, solution.durations, landing_impulses, strict=True
+    ):
+        values = [
+            evaluate_extrema(*forces, extrema)
+            for forces, extrema in zip(step_forces, step_extrema, strict=True)
+        ]
+        fore_force, total_force = (
+            jax.tree.map(lambda x, index=index: x[min(index, len(x) - 1)], (step_extrema, values))
+            for index in range(2)
         )
-        phase_durations = collocation_solution.durations[step_index]
-        fore_force_extrema = []
-        total_force_extrema = []
-        for phase_index, (phase, points_of_phase) in enumerate(
-            zip(wheel_phases, phase_points, strict=True)
-        ):
-            collocated_phase = CollocatedPhaseMotion.from_node_accelerations(
-                collocation_system.phase_meshes[phase_index],
-                jnp.stack(points_of_phase.phase_start_point.q),
-                jnp.stack(points_of_phase.phase_start_point.v),
-                phase_durations[phase_index],
-                collocation_solution.accelerations[phase_index][step_index],
-            )
-            fore_force_extrema.append(
-                _find_force_extrema(phase, collocated_phase, includes_rear_force=False)
-            )
-            has_rear_foot = phase_index == 0
-            total_force_extrema.append(
-                _find_force_extrema(phase, collocated_phase, includes_rear_force=True)
-                if has_rear_foot
-                else fore_force_extrema[-1]
-            )
-        total_force_peaks = _summarize_force_extrema(total_force_extrema, phase_durations)
-        end_point = phase_points[-1].phase_end_point
-        landing_result = transitions.resolve_landing(wheel_symbols, end_point.q[0], *end_point.v)
+        total_force_peaks = _summarize_force_extrema(*total_force, durations)
         peaks_by_step.append(
             {
-                **_summarize_force_extrema(fore_force_extrema, phase_durations),
+                **_summarize_force_extrema(*fore_force, durations),
                 "n_total_force_peaks": total_force_peaks["n_force_peaks"],
                 "peak_total_force": total_force_peaks["peak_force"],
                 "smooth_peak_total_force": total_force_peaks["smooth_peak_force"],
-                "landing_impulse": landing_result.fore_impulse.normal,
+                "landing_impulse": landing_impulse,
             }
         )
     return jax.tree.map(
@@ -78,52 +146,42 @@ def compute_force_peaks(
     )
 
 
-def _find_force_extrema(
-    phase: AbstractPhase, collocated_phase: CollocatedPhaseMotion, includes_rear_force: bool
-) -> PhaseExtrema:
-    """Return the extrema of the normal force in a phase.
-
-    The force is that on the fore foot or, if `includes_rear_force` is true, the sum of the forces
-    on the two feet.
-    """
-
-    def evaluate_acceleration(q: Array, v: Array) -> Array:
-        return jnp.stack(
-            phase.solve_acceleration(phase.compute_motion(tuple(q), tuple(v)))[: phase.n_dof]
-        )
-
-    def evaluate_normal_force(q: Array, v: Array) -> Array:
-        phase_instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)))
-        normal_force = jnp.asarray(phase_instant.fore_force.normal)
-        if includes_rear_force and phase_instant.rear_force is not None:
-            normal_force = normal_force + phase_instant.rear_force.normal
-        return normal_force
-
-    return find_quantity_extrema(collocated_phase, evaluate_acceleration, evaluate_normal_force)
+def compute_force_peaks(
+    collocation_system: CollocationSystem, parameters: Array, solution: CollocationSolution
+) -> dict[str, Scalar]:
+    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, inside a larger program."""
+    extrema = locate_force_extrema(collocation_system, parameters, solution)
+    return evaluate_force_peaks(collocation_system, parameters, solution, extrema)
 
 
 def _summarize_force_extrema(
-    extrema_of_phases: list[PhaseExtrema], phase_durations: Array
+    extrema_of_phases: list[LocatedExtrema],
+    values_of_phases: list[ExtremumValues],
+    phase_durations: Array,
 ) -> dict[str, Scalar]:
-    """Return the measures of a force over a gait step, from the force's extrema in each phase.
-
-    The force is that on the fore foot, or the total force.
+    """Return the measures of one force over a gait step, from the force's extrema in each phase.
 
     The measures are those of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name.
     """
-    phase_start_times = jnp.cumsum(phase_durations) - phase_durations
-    shifted_extrema = [
-        step_extrema._replace(
-            extremum_times=step_extrema.extremum_times + phase_start_time,
-            rate_extremum_times=step_extrema.rate_extremum_times + phase_start_time,
+    start_times = jnp.cumsum(phase_durations) - phase_durations
+    extrema, values = (
+        jax.tree.map(lambda *by_phase: jnp.concatenate(by_phase), *phases)
+        for phases in (
+            [
+                extrema._replace(
+                    times=extrema.times + start_time,
+                    rate_times=extrema.rate_times + start_time,
+                    node_accelerations=(),
+                    inverse_jacobian=(),
+                )
+                for extrema, start_time in zip(extrema_of_phases, start_times, strict=True)
+            ],
+            values_of_phases,
         )
-        for step_extrema, phase_start_time in zip(extrema_of_phases, phase_start_times, strict=True)
-    ]
-    step_extrema = jax.tree.map(
-        lambda *values_by_phase: jnp.concatenate(values_by_phase), *shifted_extrema
     )
-    is_peak = step_extrema.is_quantity_maximum
-    peak_forces = jnp.where(is_peak, step_extrema.extremum_values, -jnp.inf)
+    extremum_values = values.values
+    is_peak = extrema.is_maximum
+    peak_forces = jnp.where(is_peak, extremum_values, -jnp.inf)
     extremum_indices = jnp.arange(len(peak_forces))
     find_highest_peak_force = lambda extremum_mask: jnp.max(
         jnp.where(extremum_mask, peak_forces, -jnp.inf), axis=1
@@ -132,23 +190,17 @@ def _summarize_force_extrema(
         find_highest_peak_force(extremum_indices < extremum_indices[:, None]),
         find_highest_peak_force(extremum_indices > extremum_indices[:, None]),
     )
-    is_force_trough = step_extrema.is_quantity_minimum & jnp.isfinite(lower_neighbor_peak_force)
+    is_force_trough = extrema.is_minimum & jnp.isfinite(lower_neighbor_peak_force)
     force_trough_depths = jnp.where(
         is_force_trough,
-        jnp.where(is_force_trough, lower_neighbor_peak_force, 0.0) - step_extrema.extremum_values,
+        jnp.where(is_force_trough, lower_neighbor_peak_force, 0.0) - extremum_values,
         0.0,
     )
-    first_peak_time = jnp.min(jnp.where(is_peak, step_extrema.extremum_times, jnp.inf))
-    is_later_rate_maximum = step_extrema.is_rate_maximum & (
-        step_extrema.rate_extremum_times > first_peak_time
-    )
+    first_peak_time = jnp.min(jnp.where(is_peak, extrema.times, jnp.inf))
+    is_later_rate_maximum = extrema.is_rate_maximum & (extrema.rate_times > first_peak_time)
     has_phase_occurred = jnp.repeat(phase_durations > 0.0, 2)
-    candidate_forces = jnp.append(
-        peak_forces, jnp.where(has_phase_occurred, step_extrema.end_values, -jnp.inf)
-    )
-    largest_force_rate = jnp.max(
-        jnp.where(is_later_rate_maximum, step_extrema.rate_extremum_values, -jnp.inf)
-    )
+    candidate_forces = jnp.append(peak_forces, jnp.where(has_phase_occurred, values.ends, -jnp.inf))
+    largest_force_rate = jnp.max(jnp.where(is_later_rate_maximum, values.rates, -jnp.inf))
     return {
         "n_force_peaks": jnp.sum(is_peak).astype(phase_durations.dtype),
         # The maximum of tied forces has one-sided derivatives. Selection returns one of them.

@@ -26,7 +26,7 @@ from vrw_jax.gaits.collocation_search import (
 )
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import attach_monodromy_derivatives, solve_cycle_with_derivatives
-from vrw_jax.gaits.force_peaks import compute_force_peaks
+from vrw_jax.gaits.force_peaks import evaluate_force_peaks, locate_force_extrema
 from vrw_jax.gaits.gauss import N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
@@ -185,11 +185,13 @@ class LimitCycle(AbstractCycle):
         )
 
     def _locate_force_peaks(self) -> dict[str, Array]:
-        return evaluate_by_saved_trace(
-            self.map_over_batch_axes(functools.partial(compute_force_peaks, self.system)),
-            self.parameters,
-            self.collocation_state.solution,
+        locate, evaluate = (
+            self.map_over_batch_axes(functools.partial(function, self.system))
+            for function in (locate_force_extrema, evaluate_force_peaks)
         )
+        gait = self.parameters, self.collocation_state.solution
+        extrema = evaluate_by_saved_trace(locate, *lax.stop_gradient(gait))
+        return evaluate_by_saved_trace(evaluate, *gait, extrema)
 
     @property
     def margins(self) -> Margins:
