@@ -253,3 +253,15 @@ def test_xla_computes_without_machine_code(monkeypatch):
     compiled = lanes.jit(halve_until_small, xla_block_size=8)
     assert_equal_trees(compiled.batch(X, K), expected)
     assert_equal_trees(compiled(X[0], K[0]), jax.tree.map(lambda x: x[0], expected))
+
+
+def test_indices_out_of_range_and_powers_of_special_values_agree_with_jax():
+    indices = np.array([-7, 0, 2, 5])
+    fill_integer = lanes.jit(lambda i: jnp.arange(3).at[i].get(mode="fill"))
+    expected = jnp.arange(3).at[indices].get(mode="fill")
+    np.testing.assert_array_equal(fill_integer.batch(indices), expected)
+    bases, exponents = map(
+        np.ravel, np.meshgrid([0.0, 1.0, 2.0, -2.0, np.nan], [0.0, 2.0, -1.0, np.nan])
+    )
+    powers = lanes.jit(lambda x, y: jnp.power(x, y)).batch(bases, exponents)
+    np.testing.assert_allclose(powers, jnp.power(bases, exponents), rtol=1e-15)  # one rounding

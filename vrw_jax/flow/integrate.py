@@ -267,7 +267,7 @@ def _integrate_to_event(
             jnp.stack(phase.evaluate_margins(start_state)),
             options,
         )
-    is_straggler = (
+    is_event_too_late = (
         has_guard_crossed & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
     )
     event_guard_index = jnp.where(
@@ -279,10 +279,10 @@ def _integrate_to_event(
         state=end_state,
         duration=duration,
         end_guard_index=jnp.where(
-            is_crossing_event_unresolved | is_straggler, -1, event_guard_index
+            is_crossing_event_unresolved | is_event_too_late, -1, event_guard_index
         ),
         is_timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
-        | is_straggler,
+        | is_event_too_late,
         is_unfinished=integrator_state.is_running,
         n_tried_steps=integrator_state.n_tried_steps
         + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),

@@ -71,8 +71,8 @@ is extrapolated linearly over the correction, with an error of its square, which
 STALLED_CORRECTION_RATIO = 0.9
 """Ratio of successive corrections of the event's time above which a correction is round-off.
 
-The value is chosen because Newton's method at least halves the corrections. The exception is a
-triple root, at which it reduces them to two thirds.
+The value is chosen because Newton's method halves the corrections, or reduces them to two thirds at
+a triple root. Round-off does neither.
 """
 
 
@@ -98,8 +98,7 @@ class _EventSearch(NamedTuple):
         search with the remaining bracket).
 
         A proposal outside the bracket is replaced by the bracket's midpoint. The proposal has
-        derivatives. After k proposals in the range of quadratic convergence, derivatives are
-        accurate to order 2^k - 1.
+        derivatives, see `_attach_event_derivatives`.
         """
         is_guard_falling = self.is_guard_crossing & (guard_rates < 0.0)
         time_to_zero = -guard_values / jnp.where(is_guard_falling, guard_rates, -1.0)
@@ -117,7 +116,7 @@ class _EventSearch(NamedTuple):
             jnp.argmin(proposed_step_lengths),
             lowest_guard_index,
         ).astype(jnp.int32)
-        # This happens at the start of the step.
+        # At the start of a step, a crossing guard may be zero and rise.
         is_guard_rising = (guard_values == 0.0) & (guard_rates > 0.0)
         is_step_before_event = jnp.all(
             jnp.where(self.is_guard_crossing, (guard_values > 0.0) | is_guard_rising, True)
@@ -157,7 +156,7 @@ class _PhaseState(NamedTuple):
     """State of the loop that integrates a phase."""
 
     step_purpose: Int[Array, ""]  # a StepPurpose
-    last_accepted_step_end: SolverStepEnd  # the last accepted solver step
+    last_accepted_step_end: SolverStepEnd
     last_step_start: SolverStepEnd  # end of the solver step before the last accepted one
     next_step_length: Scalar  # length of the next solver step, s
     controller_state: Any
@@ -513,7 +512,7 @@ def _try_solver_step(
 class _StepAssessment(NamedTuple):
     """Acceptance of a tried solver step, crossing guards, and length of the next step."""
 
-    is_accepted: Bool[Array, ""]  # whether the step is accepted
+    is_accepted: Bool[Array, ""]
     has_guard_crossed: Bool[Array, ""]  # whether the step brackets an event
     is_guard_crossing: Bool[Array, " n_guards"]  # guards that are not positive at the step's end
     is_step_too_short: Bool[Array, ""]

@@ -1,7 +1,8 @@
 """Single Runge-Kutta steps with an error estimate, for the search that integrates a phase.
 
 A stepper takes one step at a time, so that the search decides about the length of each. Explicit
-methods are computed here, for JAX and for machine code. Implicit methods are those of diffrax.
+methods are computed here, for JAX and for machine code. diffrax takes the steps of implicit
+methods, and of all methods with `engine="diffrax"`.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class AbstractStepper(abc.ABC):
     def step(
         self, y: StateArray, memory: Any, h: Scalar
     ) -> tuple[StateArray, StateArray, StateArray, Any]:
-        """Return the state after `h`, s, its time derivative, its error, and the next memory."""
+        """Return the state after a step of `h`, s, its derivative, the error, and the memory."""
 
     @abc.abstractmethod
     def control(

@@ -1,7 +1,7 @@
 """Search again for gaits that the first search missed: from the ends of walks, on finer meshes.
 
 Each wheel has its own mesh, which is refined until the gait is accurate. The result of a wheel
-therefore does not depend on other wheels. Batches are computed by NumPy, because JAX would compile
+therefore does not depend on other wheels. NumPy selects and joins wheels, because JAX would compile
 a program for each number of wheels.
 """
 
@@ -92,6 +92,11 @@ def search_further(
     roots = select_tree_rows(collocation_state, coarse_wheels)
     gaits_by_mesh = []
     for refinement_index in range(1 + (MAX_MESH_REFINEMENTS if can_refine_mesh else 0)):
+        if refinement_index:
+            finer_finder = gait_finder.with_finer_mesh()
+            if len(coarse_wheels):
+                roots = transfer_to_mesh(gait_finder, finer_finder, roots, batch_sizes)
+            gait_finder = finer_finder
         starts_by_origin, wheels_by_origin = [], [walking_wheels]
         if len(walking_wheels):
             starts_by_origin.append(
@@ -132,10 +137,6 @@ def search_further(
             else:
                 coarse_wheels = np.concatenate([coarse_wheels, searched_wheels[is_coarse]])
                 roots = concatenate_tree_rows(roots, new_roots)
-        finer_finder = gait_finder.with_finer_mesh()
-        if can_refine_mesh and len(coarse_wheels):
-            roots = transfer_to_mesh(gait_finder, finer_finder, roots, batch_sizes)
-        gait_finder = finer_finder
     return gaits_by_mesh
 
 

@@ -47,17 +47,24 @@ def _gather(
     dimension_numbers: Any,
     slice_sizes: Any,
     mode: Any,
+    fill_value: Any,
     **_: Any,
 ) -> jax.Array:
     _require_no_batch(dimension_numbers.operand_batching_dims)
+    if fill_value is None and jnp.issubdtype(x.dtype, jnp.inexact):
+        fill_value = jnp.nan
+    elif fill_value is None:
+        fill_value = x.dtype == bool or (
+            jnp.iinfo(x.dtype).min if x.dtype.kind == "i" else jnp.iinfo(x.dtype).max
+        )
     windows = []
     for index in indices.reshape(-1, indices.shape[-1]):
         starts, is_inside = _locate_window(x, index, dimension_numbers.start_index_map, slice_sizes)
         window = lax.squeeze(
             lax.dynamic_slice(x, starts, slice_sizes), dimension_numbers.collapsed_slice_dims
         )
-        if mode == lax.GatherScatterMode.FILL_OR_DROP and jnp.issubdtype(x.dtype, jnp.floating):
-            window = jnp.where(is_inside, window, jnp.nan)
+        if mode == lax.GatherScatterMode.FILL_OR_DROP:
+            window = jnp.where(is_inside, window, jnp.asarray(fill_value, x.dtype))
         windows.append(window)
     gathered = jnp.stack(windows).reshape(*indices.shape[:-1], *windows[0].shape)
     n_batch = indices.ndim - 1
@@ -108,7 +115,9 @@ def _require_no_batch(batching_dims: Sequence[int]) -> None:
 
 
 def _expm1(x: jax.Array, **_: Any) -> jax.Array:
-    """Return exp(x) - 1 by W. Kahan's quotient, in which the errors of both logarithms cancel."""
+    """Return exp(x) - 1 by W. Kahan's quotient (u - 1) / log(u), in which the rounding error of
+    u = exp(x) cancels.
+    """
     u = jnp.exp(x)
     is_small, is_minus_one = u == 1.0, u - 1.0 == -1.0
     is_simple = is_small | is_minus_one | jnp.isinf(u)
@@ -136,11 +145,12 @@ def _pow(x: jax.Array, y: jax.Array, **_: Any) -> jax.Array:
     if not jnp.issubdtype(y.dtype, jnp.floating):
         y = y.astype(x.dtype)
     magnitude = jnp.exp(y * jnp.log(jnp.where(x == 0.0, 1.0, jnp.abs(x))))
-    at_zero = jnp.where(y == 0.0, 1.0, jnp.where(y > 0.0, 0.0, jnp.inf))
+    at_zero = jnp.where(y > 0.0, 0.0, jnp.where(y < 0.0, jnp.inf, y))
     half = 0.5 * y
     is_odd = half != jnp.floor(half)
     of_negative = jnp.where(y == jnp.floor(y), jnp.where(is_odd, -magnitude, magnitude), jnp.nan)
-    return jnp.where(x == 0.0, at_zero, jnp.where(x < 0.0, of_negative, magnitude))
+    power = jnp.where(x == 0.0, at_zero, jnp.where(x < 0.0, of_negative, magnitude))
+    return jnp.where((y == 0.0) | (x == 1.0), 1.0, power)
 
 
 def _cbrt(x: jax.Array, **_: Any) -> jax.Array:

@@ -3,8 +3,8 @@
 Two functions with equal keys compute the same, also in different processes, so that compiled code
 may be shared by key. A key follows closures, default arguments, global names, attributes of modules
 and of objects, and the functions among them. Functions of the libraries in `TRUSTED_LIBRARIES` do
-not change while a process runs, so their names and closures suffice. If the value that a function
-uses cannot be found without running the function, the function has no key.
+not change while a process runs, so the globals that they read are not followed. If the value that a
+function uses cannot be found without running the function, the function has no key.
 """
 
 import dataclasses
@@ -141,7 +141,7 @@ def make_key(*values: Any) -> str:
 def make_key_with_origin(*values: Any) -> tuple[str, bool]:
     """Return the key of `make_key`, and whether only libraries define the functions in it.
 
-    Such a key holds as long as the process runs.
+    If only libraries do, the key holds as long as the process runs.
     """
     digester = _Digester()
     for value in values:
@@ -152,9 +152,9 @@ def make_key_with_origin(*values: Any) -> tuple[str, bool]:
 def lift_numbers(function: Callable) -> tuple[list[Any], Callable[[Sequence[Any]], Callable]]:
     """Return the numbers in the closure of a user's function, and how to replace them.
 
-    The numbers are floats, and NumPy and JAX arrays of floats, in closures and in pytrees,
-    partially applied functions and methods there. The second result returns the function with other
-    values for these numbers, so that they can be arguments of a compiled function.
+    The numbers are floats and arrays of floats. They are found in closures, and in pytrees,
+    partially applied functions and bound methods there. The second result returns the function with
+    other values for these numbers, so that they can be arguments of a compiled function.
     """
     numbers: list[Any] = []
 
@@ -317,7 +317,7 @@ class _Digester:
         if owner is not None and not isinstance(owner, types.ModuleType | type):
             self.add(owner)
         elif isinstance(owner, types.ModuleType):
-            self.require_trusted_module(owner.__name__)
+            self.require_pure_module(owner.__name__)
         self.write("builtin", getattr(function, "__module__", None), name)
 
     def add_class(self, value: type) -> None:
@@ -349,7 +349,7 @@ class _Digester:
         if not isinstance(value, types.ModuleType):
             return self.add(value)
         if is_trusted(value.__name__):
-            self.require_trusted_module(value.__name__, attribute_chain)
+            self.require_pure_module(value.__name__, attribute_chain)
             return self.write("module", value.__name__, tuple(attribute_chain[:1]))
         if not attribute_chain:
             raise UnresolvableFunctionError(f"it uses the module {value.__name__} as a value")
@@ -358,20 +358,23 @@ class _Digester:
             raise UnresolvableFunctionError(f"the module {value.__name__} has no {name}")
         return self.add_module_value(vars(value)[name], inner_chain)
 
-    def require_trusted_module(self, module_name: str, attribute_chain: Sequence[str] = ()) -> None:
+    def require_pure_module(self, module_name: str, attribute_chain: Sequence[str] = ()) -> None:
         """Raise an error if a library's function may depend on more than its arguments."""
         library = module_name.split(".")[0].lstrip("_")  # `_operator` is `operator` in C.
-        is_opaque = library not in TRUSTED_LIBRARIES and library not in PURE_STANDARD_MODULES
-        for name in (*module_name.split("."), *attribute_chain):
-            if is_opaque or name in OPAQUE_NAMES:
-                raise UnresolvableFunctionError(f"it uses {module_name}.{name}")
+        full_name = ".".join([module_name, *attribute_chain])
+        names = set(full_name.split("."))
+        if library == "jax":
+            names.discard("random")  # Its functions have no hidden state.
+        is_pure = library in TRUSTED_LIBRARIES or library in PURE_STANDARD_MODULES
+        if not is_pure or names & OPAQUE_NAMES:
+            raise UnresolvableFunctionError(f"it uses {full_name}")
 
     def add_function(self, function: types.FunctionType) -> None:
         if function.__code__ in transparent_wrapper_codes:
             return self.add(function.__wrapped__)  # type: ignore[attr-defined]
         if _is_trusted_function(function):
             module_name = function.__globals__["__name__"]
-            self.require_trusted_module(module_name, function.__qualname__.split("."))
+            self.require_pure_module(module_name, function.__qualname__.split("."))
             self.write("function", module_name, _digest_code(function.__code__))
         else:
             self.reaches_user_code = True
@@ -417,7 +420,7 @@ class _Digester:
         for module_name in facts.imported_modules:
             if not is_trusted(module_name):
                 raise UnresolvableFunctionError(f"it imports {module_name} when it runs")
-            self.require_trusted_module(module_name)
+            self.require_pure_module(module_name)
         for constant in facts.inner_codes:
             self.add_code(constant, function)
 

@@ -274,7 +274,8 @@ def jit(function: Callable[..., PyTree], *, xla_block_size: int = 1024) -> "Lane
     Use it where one call does little and batches have thousands of elements, above all if each
     element takes its own number of loop iterations. `jax.jit(jax.vmap(f))` runs a loop until the
     slowest element ends, and stores intermediate results in memory. Machine code computes a few
-    elements at a time in vector registers, and each such group ends by itself.
+    elements at a time in vector registers, and each such group ends by itself. If the function
+    contains a JAX primitive without machine code, XLA computes it, with one warning.
 
     Args:
         function: JAX function of pytrees of numbers and arrays, written for one element. Other
@@ -285,10 +286,6 @@ def jit(function: Callable[..., PyTree], *, xla_block_size: int = 1024) -> "Lane
     Returns:
         A `LaneFunction`, which is called like `function`. `jax.vmap`, `jit`, `grad`, `jacfwd`,
         `jacrev` and `hessian` apply to it. Its method `batch` uses all cores.
-
-    Raises:
-        Nothing at once. If the function contains a JAX primitive without machine code, XLA computes
-        it, with one warning.
 
     Examples:
         >>> square_root = lanes.jit(lambda x: jnp.sqrt(x))
