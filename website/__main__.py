@@ -36,9 +36,11 @@ LINK_PATTERN = re.compile(r"(\]\()(?!https?:|#|mailto:)([^)#\s]+)")
 
 
 def write_generated_pages() -> None:
-    """Write the pages in `docs` that are generated from the sources."""
+    """Write the pages in `docs` that are generated from the sources, where they have changed."""
     for place, generate_page in GENERATED_PAGES.items():
-        (DOCS / place).write_text(generate_page(), encoding="utf-8")
+        page = generate_page()
+        if (DOCS / place).read_text(encoding="utf-8") != page:
+            (DOCS / place).write_text(page, encoding="utf-8")
 
 
 def prepare(*, execute: bool) -> None:
