@@ -62,6 +62,7 @@ from vrw_jax.studies.tolerance_request import measure_to_tolerance
 from vrw_jax.studies.tune_objective import WheelObjective
 from vrw_jax.studies.tune_problem import tune
 from vrw_jax.studies.tune_result import TuneResult
+from vrw_jax.wheel.laws import AlternatingLegs, SpringDamper
 from vrw_jax.wheel.parameter_sets import ParameterSet, parameter_sets
 from vrw_jax.wheel.params import WheelParams
 
@@ -70,6 +71,7 @@ __all__ = (
     "AbstractWalker",
     "AbstractWheel",
     "AdvanceResult",
+    "AlternatingLegs",
     "ArclengthOptions",
     "BasinShare",
     "Branch",
@@ -97,6 +99,7 @@ __all__ = (
     "SpecialPoint",
     "SpecialPointCurve",
     "SpecialPointMap",
+    "SpringDamper",
     "StepBatchResult",
     "StepOptions",
     "StepResult",

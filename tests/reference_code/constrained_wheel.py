@@ -47,8 +47,13 @@ class Wheel:
         object.__setattr__(self, "pack", pack)
 
     def spring_damper(self, q: Array, v: Array) -> Array:
-        """Viscoelastic force tau_ve, eq. (3), or that of another law of the legs."""
+        """Viscoelastic force tau_ve, eq. (3), or that of another law, and a torque on the hub.
+
+        All parts turn with theta, so that the virtual work of the torque is torque times its
+        variation.
+        """
         tau = np.zeros(5)
+        tau[2] = self.params["hub_torque"](v[2]) if "hub_torque" in self.params else 0.0
         tau[3:] = self.leg_force(q[3:], v[3:])
         return tau
 

@@ -79,4 +79,4 @@ def test_tuning_moves_a_parameter_of_the_law_to_its_bound():
     cycle = vrw.limit_cycle(PARAMS, model=tuned.model)
     assert abs(tuned.value - cycle.dls_fraction) < 1e-10
     assert "leg.c2 70 N s^2/m^2" in str(tuned)
-    assert tuned.params.leg_force is None
+    assert tuned.params.laws is None

@@ -25,7 +25,7 @@ from vrw_jax.wheel import (
     transitions,
 )
 from vrw_jax.wheel.dynamics import compute_double_support_circle
-from vrw_jax.wheel.params import NO_LEG_FORCE
+from vrw_jax.wheel.params import NO_LAWS
 
 PARAMS = vrw.WheelParams()
 SYMBOLS = PARAMS.symbols()
@@ -180,9 +180,7 @@ def test_resets_agree_with_the_collisions():
     before = sls1.compute_motion(q, v)
     hit = transitions.resolve_stopper_collision(SYMBOLS, before).motion_after
     np.testing.assert_array_equal(jnp.stack(sls1.reset_motion(before)), jnp.stack(hit))
-    constants = sequence.compute_phase_constants(
-        PARAMS.n_legs, NO_LEG_FORCE, *stack_parameters(PARAMS)
-    )
+    constants = sequence.compute_phase_constants(PARAMS.n_legs, NO_LAWS, *stack_parameters(PARAMS))
     following = (
         sequence.make_post_impact_sequence(PARAMS.n_legs)
         .phases[1]
@@ -222,9 +220,7 @@ def end_by_lane_engine():
 def end_by_cycle_collocation():
     """Apply Newton's method to the angle of the event."""
     phase = sequence.make_post_impact_sequence(PARAMS.n_legs).phases[2]
-    constants = sequence.compute_phase_constants(
-        PARAMS.n_legs, NO_LEG_FORCE, *stack_parameters(PARAMS)
-    )
+    constants = sequence.compute_phase_constants(PARAMS.n_legs, NO_LAWS, *stack_parameters(PARAMS))
     _, q, v = make_state_at(2)
     event = lambda theta: phase.end_event_function(constants, PhasePoint((), (theta, q[1]), v))
     theta = q[0]

@@ -43,7 +43,7 @@ from vrw_jax.app.figure_style import (
 )
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import SpecialPointCurve
-from vrw_jax.models.measures import LEG_PREFIX, MARGIN_MEASURES, MEASURES, describe_violation
+from vrw_jax.models.measures import LAW_PREFIXES, MARGIN_MEASURES, MEASURES, describe_violation
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
 from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS
 from vrw_jax.studies.sensitivity_indices import sobol_indices
@@ -62,7 +62,7 @@ def _list_swept_parameters(
 ) -> list[str]:
     """Return the parameters among the names in an order, and then those of leg forces."""
     texts = list(map(str, names))
-    law_names = [name for name in texts if name.startswith(LEG_PREFIX)]
+    law_names = [name for name in texts if name.startswith(LAW_PREFIXES)]
     return [name for name in parameter_order if name in texts] + law_names
 
 

@@ -33,6 +33,7 @@ from vrw_jax.studies.scan_design import MAX_LISTED_SAMPLES
 from vrw_jax.wheel.parameter_sets import parameter_sets
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
+    LAW_NAMES,
     PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     WheelParams,
@@ -439,12 +440,14 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
     model_settings = {
         setting_name: setting_value
         for setting_name, setting_value in tables["model"].items()
-        if setting_name not in ("name", LEG_FORCE_KEY)
+        if setting_name not in ("name", *LAW_NAMES)
     }
-    leg_settings = {}
-    if LEG_FORCE_KEY in tables["model"]:
-        leg_settings[LEG_FORCE_KEY] = _load_leg_force(tables["model"][LEG_FORCE_KEY])
-    default_model = model_class(**leg_settings)
+    law_settings = {
+        law_name: _load_law(law_name, tables["model"][law_name])
+        for law_name in LAW_NAMES
+        if law_name in tables["model"]
+    }
+    default_model = model_class(**law_settings)
     parameter_names = default_model.parameter_names
     sample_design = None
     if design_kinds:
@@ -461,7 +464,7 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
     checked_config = Config(
         wheel_values=_parse_wheel_table(tables["wheel"]),
         model_name=model_name,
-        model_settings=leg_settings | _parse_with_default_types(model_settings, default_settings),
+        model_settings=law_settings | _parse_with_default_types(model_settings, default_settings),
         step_option_values=_parse_with_default_types(tables["options"], default_options),
         scan=ScanConfig.from_table(tables["scan"], default_model),
         gait=GaitConfig.from_table(tables["gait"]),
@@ -520,20 +523,25 @@ def _parse_wheel_table(config_table: ConfigTable) -> dict[str, float | int]:
     return parameter_values
 
 
-LEG_FORCE_KEY = "leg_force"
-"""Key of a law of the legs in the table `[model]`."""
+def _load_law(law_name: str, location: object) -> Any:
+    """Return the law that a text such as "my_leg.py:leg" names, from the Python file.
 
-
-def _load_leg_force(location: object) -> Any:
-    """Return the law that a text such as "my_leg.py:leg" names, from the Python file."""
-    file_name, _, law_name = str(location).rpartition(":")
-    if not isinstance(location, str) or not file_name.endswith(".py") or not law_name:
+    A torque may also be a number.
+    """
+    if (
+        law_name == "hub_torque"
+        and isinstance(location, int | float)
+        and not isinstance(location, bool)
+    ):
+        return float(location)
+    file_name, _, name_in_file = str(location).rpartition(":")
+    if not isinstance(location, str) or not file_name.endswith(".py") or not name_in_file:
         raise _make_value_error(
-            LEG_FORCE_KEY, location, 'a Python file and a name in it, as "my_leg.py:leg"'
+            law_name, location, 'a Python file and a name in it, as "my_leg.py:leg"'
         )
     if not Path(file_name).is_file():
         raise ValueError(
-            f"{LEG_FORCE_KEY} names the file {file_name}, which {Path.cwd()} does not contain: "
+            f"{law_name} names the file {file_name}, which {Path.cwd()} does not contain: "
             "give its path from the current folder."
         )
     module_spec = importlib.util.spec_from_file_location(Path(file_name).stem, file_name)
@@ -541,12 +549,12 @@ def _load_leg_force(location: object) -> Any:
     assert module_spec.loader is not None  # The name of the file ends in .py.
     module = importlib.util.module_from_spec(module_spec)
     module_spec.loader.exec_module(module)
-    if not hasattr(module, law_name):
+    if not hasattr(module, name_in_file):
         raise ValueError(
-            f"{LEG_FORCE_KEY} is {location}, but {file_name} does not define {law_name}: write "
-            f"{law_name} = ... there."
+            f"{law_name} is {location}, but {file_name} does not define {name_in_file}: write "
+            f"{name_in_file} = ... there."
         )
-    law = getattr(module, law_name)
+    law = getattr(module, name_in_file)
     return law() if isinstance(law, type) else law
 
 

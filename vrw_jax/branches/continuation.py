@@ -328,8 +328,8 @@ def continue_branches(
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
     check_parameter_name(name, model.parameter_names, "parameter")
-    params = model.attach_leg_force(params)
-    if check_int("period_n", period_n) > 1 and cycle is None:
+    params = model.attach_laws(params)
+    if check_int("period_n", period_n) > model.leg_period and cycle is None:
         raise ValueError(
             f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
             "many beside the gait of one step: give cycle=vrw.limit_cycle(..., guess=...)."
@@ -339,7 +339,11 @@ def continue_branches(
         check_arclength_options(options),
     )
     gait_finder = make_finder(
-        model, params.n_legs, cycle_options=cycle_options, step_options=step_options
+        model,
+        params.n_legs,
+        period_n=period_n,
+        cycle_options=cycle_options,
+        step_options=step_options,
     )
     has_force_peaks = FORCE_PEAK_MEASURES.keys() <= set(gait_finder.differentiable_measures)
     if check_bool("force_peaks", force_peaks) and not has_force_peaks:

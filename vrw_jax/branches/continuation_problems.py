@@ -170,8 +170,9 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         columns = tuple(map(jnp.asarray, values.T))
         model, params = self.model.from_parameter_values(columns, self.n_legs)
         steps = []
-        for _ in range(self.period_n):
-            steps.append(model.take_steps(params, states, self.step_options))
+        for k in range(self.period_n):
+            step_params = model.select_params(params, k)
+            steps.append(model.take_steps(step_params, states, self.step_options))
             states = steps[-1].section_state
         return jax.tree.map(lambda *leaves: np.stack(leaves, 1), *steps)
 

@@ -91,7 +91,7 @@ class CollocationFinder(AbstractGaitFinder):
             self.period_n,
             self.cycle_options,
             self.model.stop_at_lift_off,
-            jax.tree.structure(self.model.leg_force),
+            jax.tree.structure(self.model.own_parameters),
         )
 
     def with_finer_mesh(self) -> "CollocationFinder":
@@ -114,7 +114,7 @@ class CollocationFinder(AbstractGaitFinder):
     def find_cycle(
         self, params: WheelParams, cycle_guess: Any = None, starts_only_from_guess: bool = False
     ) -> LimitCycle:
-        params = self.model.attach_leg_force(params)
+        params = self.model.attach_laws(params)
         if isinstance(cycle_guess, LimitCycle) and cycle_guess.system == self.collocation_system:
             cycle_guess = cycle_guess.collocation_state
         elif cycle_guess is not None and not isinstance(cycle_guess, CollocationState):
@@ -123,7 +123,7 @@ class CollocationFinder(AbstractGaitFinder):
             cycle_guess = self.guess_cycle_from_state(*lax.stop_gradient((params, section_state)))
         return dataclasses.replace(
             solve_limit_cycle(params, self.collocation_system, cycle_guess, starts_only_from_guess),
-            model=self.model.with_leg_force_of(params),
+            model=self.model.with_laws(params.laws),
         )
 
     def find_cycles(
@@ -140,7 +140,7 @@ class CollocationFinder(AbstractGaitFinder):
         """Compute a guess of the cycle from a walk of `period_n` gait steps that starts at
         `section_state`.
         """
-        params = self.model.attach_leg_force(params)
+        params = self.model.attach_laws(params)
         walk_samples = sample_walk_in_time(self.model, params, section_state, self.period_n)
         return guess_cycle_from_walk(self.collocation_system, params, walk_samples)
 

@@ -46,7 +46,7 @@ from vrw_jax.gaits.phase_sequence import (
 )
 from vrw_jax.lanes.batching import BatchFunction
 from vrw_jax.wheel.params import (
-    NO_LEG_FORCE,
+    NO_LAWS,
     PARAMETER_NAMES,
     WheelParams,
     make_wheel_from_parameters,
@@ -64,14 +64,12 @@ class CollocationSystem(NamedTuple):
     period_n: int
     cycle_options: CycleOptions
     stop_at_lift_off: bool = True  # whether the normal force must be positive in an admissible gait
-    leg_force_structure: Any = NO_LEG_FORCE
+    law_structure: Any = NO_LAWS
 
     @property
     def phase_sequence(self) -> PhaseSequence:
         """Return the phases of one gait step and the functions that describe them."""
-        return make_post_impact_sequence(
-            self.n_legs, self.stop_at_lift_off, self.leg_force_structure
-        )
+        return make_post_impact_sequence(self.n_legs, self.stop_at_lift_off, self.law_structure)
 
     @property
     def phase_meshes(self) -> tuple[PhaseMesh, ...]:
@@ -88,13 +86,21 @@ class CollocationSystem(NamedTuple):
         """Return the function that maps the parameters to the constants of the
         equations of motion.
         """
-        return functools.partial(compute_phase_constants, self.n_legs, self.leg_force_structure)
+        return functools.partial(compute_phase_constants, self.n_legs, self.law_structure)
 
-    def make_wheel(self, parameters: Array) -> WheelParams:
-        """Return the wheel with the parameters on the first axis, in SI units."""
-        return make_wheel_from_parameters(
-            parameters, self.n_legs, leg_force_structure=self.leg_force_structure
+    @property
+    def has_alternating_legs(self) -> bool:
+        """Return whether the laws of the legs alternate from step to step."""
+        return self.phase_sequence.constants_of_step is not None
+
+    def make_wheel(self, parameters: Array, step_index: Array | int = 0) -> WheelParams:
+        """Return the wheel in a gait step, with the parameters on the first axis, in SI units."""
+        params = make_wheel_from_parameters(
+            parameters, self.n_legs, law_structure=self.law_structure
         )
+        if params.laws is None:
+            return params
+        return params.attach_laws(params.laws.exchange_legs(step_index % 2))
 
     def is_beyond_border(self, failed_check: Any, has_dls: Any) -> Any:
         """Return for each wheel whether its root shows that it is just beyond the border of its
@@ -109,9 +115,7 @@ class CollocationSystem(NamedTuple):
         - `failed_check`: `CollocationState.failed_check` of the root;
         - `has_dls`: whether the root has double support.
         """
-        is_paper_wheel = (
-            self.n_legs == WheelParams().n_legs and self.leg_force_structure == NO_LEG_FORCE
-        )
+        is_paper_wheel = self.n_legs == WheelParams().n_legs and self.law_structure == NO_LAWS
         return is_paper_wheel & (
             (failed_check == REAR_FORCE_CHECK_CODES[0])
             | (failed_check == REAR_FORCE_CHECK_CODES[1])
@@ -153,7 +157,7 @@ class CollocationSystem(NamedTuple):
             section_state, phase_points = reconstruct_gait_step(
                 self.phase_sequence,
                 self.phase_meshes,
-                phase_constants,
+                self.phase_sequence.select_constants(phase_constants, (step_index % 2,)),
                 section_state,
                 collocation_solution.durations[step_index],
                 tuple(x[step_index] for x in collocation_solution.accelerations),
@@ -205,13 +209,12 @@ class CollocationSystem(NamedTuple):
         """Return the lowest acceleration of the rear foot at take-off over the gait steps of one
         wheel, m/s^2.
         """
-        s = self.make_wheel(parameters).symbols()
         points_by_step = self.evaluate_phase_points(parameters, collocation_solution)
         return jnp.min(
             jnp.stack(
                 [
-                    compute_takeoff_acceleration(s, sls1_points)
-                    for _, sls1_points, _ in points_by_step
+                    compute_takeoff_acceleration(self.make_wheel(parameters, k).symbols(), points)
+                    for k, (_, points, _) in enumerate(points_by_step)
                 ]
             )
         )
@@ -517,12 +520,13 @@ def find_first_failed_check(
     and margins at the transitions must be positive.
     """
     phase_sequence = collocation_system.phase_sequence
-    phase_constants = collocation_system.phase_constants_function(*parameters)
+    first_phase_constants = collocation_system.phase_constants_function(*parameters)
     collocation_solution = collocation_state.solution
 
     def check_step_admissibility(loop_carry: tuple, step_inputs: tuple) -> tuple:
         section_state, failed_check = loop_carry
-        phase_durations, accelerations_by_phase, is_phase_active = step_inputs
+        phase_durations, accelerations_by_phase, is_phase_active, *parity = step_inputs
+        phase_constants = phase_sequence.select_constants(first_phase_constants, parity)
         is_phase_active = is_phase_active > 0.5
         next_section_state, phase_points = reconstruct_gait_step(
             phase_sequence,
@@ -560,6 +564,7 @@ def find_first_failed_check(
         collocation_solution.durations,
         collocation_solution.accelerations,
         collocation_state.is_phase_active,
+        *phase_sequence.list_parities(collocation_system.period_n, parameters.dtype),
     )
     loop_carry = (
         collocation_solution.section_state,
@@ -653,7 +658,7 @@ def _run_search_attempt(
         stack_parameters(table_1_wheel).astype(parameters.dtype)[:, None],
         (n_wheel_parameters, *parameters.shape[1:]),
     )
-    if collocation_system.leg_force_structure != NO_LEG_FORCE:
+    if collocation_system.law_structure != NO_LAWS:
         # The homotopy begins with the paper's force, so the share of the law is zero there.
         share_index = len(parameters) - N_LAW_SCALES
         table_1_parameters = jnp.concatenate(
@@ -800,10 +805,11 @@ def search_all_attempts(
     """
     n_lanes = parameters.shape[-1]
     first_attempt_index = jnp.asarray(0 if search_guess else N_GUESS_ATTEMPTS, jnp.int32)
-    # For several gait steps, the homotopy would continue a gait of one step, which decides nothing.
+    # For several gait steps, the homotopy would continue a gait of one step, which decides nothing,
+    # unless the legs alternate.
     n_attempts = (
         len(list_search_attempts(collocation_system.cycle_options))
-        if collocation_system.period_n == 1
+        if collocation_system.period_n == 1 or collocation_system.has_alternating_legs
         else N_DIRECT_ATTEMPTS
     )
     if starts_only_from_guess:

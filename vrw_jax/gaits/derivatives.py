@@ -37,7 +37,7 @@ from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models import unit_scaling as scales
 from vrw_jax.wheel.params import (
-    NO_LEG_FORCE,
+    NO_LAWS,
     PARAMETER_DOMAINS,
     PARAMETER_NAMES,
     compute_symbols,
@@ -115,7 +115,7 @@ def _compute_monodromy_tangents(
             directions,
         )
 
-    if collocation_system.leg_force_structure != NO_LEG_FORCE:
+    if collocation_system.law_structure != NO_LAWS:
         # The numbers of a law may have any units, so that units determine nothing.
         return compute_monodromy_jvps((parameter_tangents, state_tangents))[1]
     hub_mass_index = PARAMETER_NAMES.index("hub_mass")
@@ -244,7 +244,7 @@ def _search_in_scaled_units(
             parameters, PARAMETER_DOMAINS.values(), strict=False
         )
     ]
-    if collocation_system.leg_force_structure != NO_LEG_FORCE:
+    if collocation_system.law_structure != NO_LAWS:
         # A law is evaluated in SI units.
         scales = jnp.ones_like(time_unit), wheel_units.length_unit, time_unit
         scaled_parameters += [*parameters[len(PARAMETER_NAMES) :], *scales]

@@ -55,6 +55,12 @@ def make_finder(
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = convert_model_argument(model)
+    if period_n % resolved_model.leg_period:
+        raise ValueError(
+            f"period_n is {period_n}, but the legs alternate, so that a gait repeats after an even "
+            "number of steps: give period_n=2 to vrw.limit_cycle, vrw.limit_cycles or "
+            "vrw.continue_branch."
+        )
     finder_class: Any = FINDER_CLASS_BY_METHOD[resolved_model.capabilities.gait_method]
     search_options = {}
     if finder_class.options_type is CycleOptions:

@@ -42,11 +42,11 @@ def _collect_phase_forces(
     collocation_system: CollocationSystem, parameters: Array, solution: CollocationSolution
 ) -> tuple[list[list[PhaseForces]], list[Scalar]]:
     """Return the forces of each phase in each gait step, and the impulse of the next landing."""
-    symbols = collocation_system.make_wheel(parameters).symbols()
     forces_by_step, landing_impulses = [], []
     for step_index, phase_points in enumerate(
         collocation_system.evaluate_phase_points(parameters, solution)
     ):
+        symbols = collocation_system.make_wheel(parameters, step_index).symbols()
         phases = make_paper_phases(
             symbols, phase_points[0].phase_start_point.held_constants[0], stop_at_lift_off=False
         )

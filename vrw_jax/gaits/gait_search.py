@@ -173,9 +173,10 @@ def limit_cycle(
         return find_hybrid_gait(model, params, guess, period_n, options)
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, period_n)
-    params = gait_finder.model.attach_leg_force(params)
+    params = gait_finder.model.attach_laws(params)
     fills_missing_gait_with_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
-    if guess is None and period_n > 1 and not gait_finder.is_multistable:
+    has_unique_gait = gait_finder.is_multistable or gait_finder.model.leg_period == period_n
+    if guess is None and period_n > 1 and not has_unique_gait:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
@@ -235,7 +236,7 @@ def limit_cycles(
             "out, or map vrw.limit_cycle over the batch."
         )
     checked_model: Any = convert_model_argument(model, allows_friction_arrays=True)
-    params = checked_model.attach_leg_force(params)
+    params = checked_model.attach_laws(params)
     batch_shape = np.broadcast_shapes(*(np.shape(x) for x in jax.tree.leaves(params)))
     if not batch_shape:
         model = resolve_model(params, model)
@@ -259,8 +260,8 @@ def limit_cycles(
     else:  # NumPy is used because JAX would compile a program for each batch size.
         params = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), batch_shape), params)
         params, first_wheel_params = jax.device_put((params, select_tree_rows(params, 0)))
-    if getattr(checked_model, "leg_force", None) is not None:
-        model = checked_model.with_leg_force_of(first_wheel_params)
+    if params.laws is not None:
+        model = checked_model.with_laws(first_wheel_params.laws)
     gait_finder = resolve_finder(first_wheel_params, model, options, period_n)
     return _search_with_fallbacks(gait_finder, params, None, options is None, which)
 
@@ -394,7 +395,8 @@ def _search_with_fallbacks(
             can_refine_mesh,
         ),
     )
-    if gait_finder.period_n > 1 and section_state is not None:
+    has_equal_steps = gait_finder.model.leg_period == 1
+    if gait_finder.period_n > 1 and has_equal_steps and section_state is not None:
         finder_and_starts = _choose_first_step(
             gait_finder, *params_and_cycle, section_state, finder_and_starts
         )

@@ -270,18 +270,18 @@ def _solve_limit_cycle(
     zero_without_gait = lambda value_of_gait: jnp.where(has_cycle, value_of_gait, 0.0)
     parameters = jnp.where(has_cycle, parameters, table_1_parameters)
 
-    wheel_symbols = collocation_system.make_wheel(parameters).symbols()
     period_n = collocation_system.period_n
+    get_symbols = lambda k: collocation_system.make_wheel(parameters, k).symbols()
     # The states are theta, its rate and the rate of L1. At touchdown, L1 follows from theta.
     step_end_states = collocation_state.gait_step_end_states
     touchdown_states = jnp.concatenate([step_end_states[:, :1], step_end_states[:, 2:]], 1)
     # The landing at the start of a step follows the state at the end of the previous step.
     landing_results = jax.vmap(
-        lambda touchdown_state: transitions.resolve_landing(wheel_symbols, *touchdown_state)
+        lambda touchdown_state: transitions.resolve_landing(get_symbols(0), *touchdown_state)
     )(jnp.roll(touchdown_states, 1, 0))
     fore_force, rear_force = jax.vmap(
-        lambda landing_result: transitions.compute_landing_forces(wheel_symbols, landing_result)
-    )(landing_results)
+        lambda k, landing: transitions.compute_landing_forces(get_symbols(k), landing)
+    )(jnp.arange(period_n), landing_results)
 
     select_step_values = lambda values_by_step: zero_without_gait(
         values_by_step[0] if period_n == 1 else values_by_step
@@ -360,8 +360,9 @@ def sample_walk_in_time(
         [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
     )
 
-    def sample_next_step(section_state: Array, _: None) -> tuple[Array, tuple]:
-        step_trajectory = model.sample_step(params, section_state, step_options, n_samples)
+    def sample_next_step(section_state: Array, k: Array) -> tuple[Array, tuple]:
+        step_params = model.select_params(params, k)
+        step_trajectory = model.sample_step(step_params, section_state, step_options, n_samples)
         step_samples = (
             transitions.resolve_landing(wheel_symbols, *section_state).foot_distance,
             step_trajectory.durations,
@@ -369,7 +370,7 @@ def sample_walk_in_time(
         )
         return step_trajectory.section_state, step_samples
 
-    _, step_samples = lax.scan(sample_next_step, section_state, None, length=n_steps)
+    _, step_samples = lax.scan(sample_next_step, section_state, jnp.arange(n_steps))
     return WalkSamples(post_impact_state, *step_samples)
 
 
@@ -378,11 +379,13 @@ def guess_cycle_from_walk(
     collocation_system: CollocationSystem, params: WheelParams, walk_samples: WalkSamples
 ) -> CollocationState:
     """Compute the guess of a cycle from the samples of a walk with `period_n` gait steps."""
-    wheel_symbols = params.symbols()
 
     def sample_node_accelerations(
-        foot_distance: Scalar, sampled_states: Array
+        foot_distance: Scalar, sampled_states: Array, step_index: Array
     ) -> tuple[Array, ...]:
+        wheel_symbols = collocation_system.make_wheel(
+            stack_parameters(params), step_index
+        ).symbols()
         wheel_phases = make_paper_phases(wheel_symbols, foot_distance, stop_at_lift_off=False)
         accelerations_by_phase = []
         sample_times = jnp.linspace(0.0, 1.0, sampled_states.shape[1])
@@ -408,7 +411,9 @@ def guess_cycle_from_walk(
         walk_samples.phase_durations.dtype
     )
     phase_accelerations = jax.vmap(sample_node_accelerations)(
-        walk_samples.landing_distances, walk_samples.sampled_states
+        walk_samples.landing_distances,
+        walk_samples.sampled_states,
+        jnp.arange(collocation_system.period_n),
     )
     guessed_solution = CollocationSolution(
         walk_samples.post_impact, walk_samples.phase_durations, phase_accelerations

@@ -15,7 +15,7 @@ The last axis of each array contains the batch elements, which are independent w
 the code depends on values.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -92,12 +92,29 @@ class PhaseSequence(NamedTuple):
     `section_size` is the number of section coordinates. `step_start_map` maps (constants, section
     state) to the start point of the first phase. `margins_function` maps (constants, points of all
     phases, flags of active phases) to the margins, which are positive if the gait is admissible.
+    `constants_of_step` maps (constants, parity) to the constants of a gait step, if they alternate.
+    The parity is 1 for the second of two gait steps, and 0 for the first.
     """
 
     section_size: int
     step_start_map: Callable[[PhaseConstants, Vector], PhasePoint]
     phases: tuple[CollocationPhase, ...]
     margins_function: Callable[[PhaseConstants, "tuple[PhasePoints, ...]", Array], Vector]
+    constants_of_step: Callable[[PhaseConstants, Any], PhaseConstants] | None = None
+
+    def list_parities(self, n_gait_steps: int, dtype: Any) -> tuple[Array, ...]:
+        """Return the parity of each gait step as an input of a loop, or nothing."""
+        if self.constants_of_step is None:
+            return ()
+        return (jnp.asarray(np.arange(n_gait_steps) % 2, dtype),)
+
+    def select_constants(
+        self, phase_constants: PhaseConstants, parity: Sequence[Any]
+    ) -> PhaseConstants:
+        """Return the constants of a gait step, whose parity is the only entry if they alternate."""
+        if self.constants_of_step is None:
+            return phase_constants
+        return self.constants_of_step(phase_constants, *parity)
 
 
 class CollocationSolution(NamedTuple):
@@ -502,6 +519,18 @@ class _LinearizationContext(NamedTuple):
         )
         return next_phase_start, duration_tangents, eliminate_duration_tangent
 
+    def select_gait_step(self, parity: Sequence[Array]) -> "_LinearizationContext":
+        """Return the context with the constants of a gait step, see `list_parities`."""
+        if not parity:
+            return self
+        select_constants = self.phase_sequence.select_constants
+        return self._replace(
+            compute_phase_constants=lambda *parameters: select_constants(
+                self.compute_phase_constants(*parameters), parity
+            ),
+            phase_constants=select_constants(self.phase_constants, parity),
+        )
+
     def linearize_gait_step(
         self, section_state_and_tangents: tuple, gait_step_inputs: tuple
     ) -> tuple:
@@ -511,7 +540,8 @@ class _LinearizationContext(NamedTuple):
         the tangents of the phase durations and of the node accelerations.
         """
         section_state, section_tangents = section_state_and_tangents
-        phase_durations, accelerations_by_phase, is_phase_active = gait_step_inputs
+        phase_durations, accelerations_by_phase, is_phase_active, *parity = gait_step_inputs
+        self = self.select_gait_step(parity)
 
         def evaluate_gait_step_start(section_state: Array, *phase_constants: Array) -> tuple:
             return _stack_phase_point(
@@ -606,7 +636,12 @@ def linearize_cycle(
         section_state,
         jnp.broadcast_to(section_unit_tangents, (n_tangents, *section_state.shape)),
     )
-    gait_step_inputs = (trial_solution.durations, trial_solution.accelerations, is_phase_active)
+    gait_step_inputs = (
+        trial_solution.durations,
+        trial_solution.accelerations,
+        is_phase_active,
+        *phase_sequence.list_parities(len(trial_solution.durations), float_dtype),
+    )
     if trial_solution.durations.shape[0] == 1:
         (section_state_after_cycle, section_tangents_after_cycle), gait_step_tangent_outputs = (
             linearization_context.linearize_gait_step(

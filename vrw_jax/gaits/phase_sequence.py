@@ -25,11 +25,12 @@ from vrw_jax.gaits.phase_collocation import (
 )
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import rotate_to_rear_leg
-from vrw_jax.wheel.leg_force import ScaledLegForce
+from vrw_jax.wheel.laws import scale_laws
 from vrw_jax.wheel.params import (
-    NO_LEG_FORCE,
+    NO_LAWS,
     PARAMETER_NAMES,
     Symbols,
+    WheelLaws,
     compute_symbols,
 )
 from vrw_jax.wheel.phases import PAPER_PHASES, TRANSITION_ASSUMPTIONS, Assumption, PhaseInstant
@@ -42,41 +43,59 @@ The other fields follow from the number of legs.
 
 
 N_LAW_SCALES = 3
-"""Number of the values after those of a law: its share, and the units of length and time."""
+"""Number of the values after those of the laws: their share, and the units of length and time."""
 
 
-def count_phase_constants(leg_force_structure: Any) -> int:
+def count_phase_constants(law_structure: Any) -> int:
     """Return the number of constants on flat ground."""
-    if leg_force_structure == NO_LEG_FORCE:
+    if law_structure == NO_LAWS:
         return N_SYMBOL_CONSTANTS
-    return N_SYMBOL_CONSTANTS + leg_force_structure.num_leaves + N_LAW_SCALES
+    return N_SYMBOL_CONSTANTS + law_structure.num_leaves + N_LAW_SCALES
 
 
 def compute_phase_constants(
-    n_legs: int, leg_force_structure: Any, *parameters: Elementwise
+    n_legs: int, law_structure: Any, *parameters: Elementwise
 ) -> PhaseConstants:
     """Return the combinations of parameters that occur in the formulas of all phases.
 
     The arguments are the parameters in the order of `stack_parameters`. In a search, the values of
-    `ScaledLegForce` follow those of a law.
+    `scale_laws` follow those of the laws.
     """
     n_wheel_parameters = len(PARAMETER_NAMES)
     wheel_symbols: tuple[Any, ...] = compute_symbols(n_legs, *parameters[:n_wheel_parameters])
     constants = (*wheel_symbols[:N_SYMBOL_CONSTANTS], *parameters[n_wheel_parameters:])
-    n_missing_scales = count_phase_constants(leg_force_structure) - len(constants)
+    n_missing_scales = count_phase_constants(law_structure) - len(constants)
     return constants + (jnp.ones_like(parameters[0]),) * n_missing_scales
 
 
-def _restore_symbols(
-    n_legs: int, leg_force_structure: Any, phase_constants: PhaseConstants
-) -> Symbols:
+def exchange_legs(
+    law_structure: Any, phase_constants: PhaseConstants, parity: Any
+) -> PhaseConstants:
+    """Return the constants of a later step of a wheel whose legs may alternate.
+
+    - `parity`: 1 if the number of steps until then is odd, otherwise 0.
+    """
+    end = N_SYMBOL_CONSTANTS + law_structure.num_leaves
+    laws = jax.tree.unflatten(law_structure, phase_constants[N_SYMBOL_CONSTANTS:end])
+    law_values = jax.tree.leaves(laws.exchange_legs(parity))
+    return (*phase_constants[:N_SYMBOL_CONSTANTS], *law_values, *phase_constants[end:])
+
+
+def has_alternating_legs(law_structure: Any) -> bool:
+    """Return whether the laws of the legs alternate from step to step."""
+    if law_structure == NO_LAWS:
+        return False
+    return jax.tree.unflatten(law_structure, [0.0] * law_structure.num_leaves).leg_period == 2
+
+
+def _restore_symbols(n_legs: int, law_structure: Any, phase_constants: PhaseConstants) -> Symbols:
     """Return all symbols of a wheel, computed from the symbols that vary between wheels."""
-    leg_force = None
-    if leg_force_structure != NO_LEG_FORCE:
-        n_constants = count_phase_constants(leg_force_structure)
-        *law_values, share, length_unit, time_unit = phase_constants[N_SYMBOL_CONSTANTS:n_constants]
-        law = jax.tree.unflatten(leg_force_structure, law_values)
-        leg_force = ScaledLegForce(law, share, length_unit, time_unit)
+    laws = WheelLaws()
+    if law_structure != NO_LAWS:
+        n_constants = count_phase_constants(law_structure)
+        law_constants = phase_constants[N_SYMBOL_CONSTANTS:n_constants]
+        law_values, scales = law_constants[:-N_LAW_SCALES], law_constants[-N_LAW_SCALES:]
+        laws = scale_laws(jax.tree.unflatten(law_structure, law_values), *scales)
     leg_angle = 2.0 * math.pi / n_legs
     symbol_values: tuple[Any, ...] = (
         *phase_constants[:N_SYMBOL_CONSTANTS],
@@ -84,13 +103,14 @@ def _restore_symbols(
         math.sin(leg_angle),
         math.cos(leg_angle),
         leg_angle,
-        leg_force,
+        laws.leg,
+        laws.hub,
     )
     return Symbols(*symbol_values)
 
 
 def _make_collocation_phase(
-    n_legs: int, stop_at_lift_off: bool, leg_force_structure: Any, phase_index: int
+    n_legs: int, stop_at_lift_off: bool, law_structure: Any, phase_index: int
 ) -> CollocationPhase:
     """Describe the phase with index `phase_index` by functions.
 
@@ -98,12 +118,12 @@ def _make_collocation_phase(
     follow, the angle by which the next line of the ground is steeper, rad.
     """
     phase_class = PAPER_PHASES[phase_index]
-    n_constants = count_phase_constants(leg_force_structure)
+    n_constants = count_phase_constants(law_structure)
 
     def make_instant(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhaseInstant:
         tilt = phase_constants[n_constants:]
         wheel_phase = phase_class(
-            _restore_symbols(n_legs, leg_force_structure, phase_constants),
+            _restore_symbols(n_legs, law_structure, phase_constants),
             phase_point.held_constants,
             True,
             compute_sine_cosine(*tilt) if tilt else (),
@@ -141,7 +161,7 @@ def _make_collocation_phase(
 
     def reset_to_section(phase_constants: PhaseConstants, phase_point: PhasePoint) -> PhasePoint:
         (theta, _), (dtheta, dL1) = phase_point.q, phase_point.v
-        s = _restore_symbols(n_legs, leg_force_structure, phase_constants)
+        s = _restore_symbols(n_legs, law_structure, phase_constants)
         if tilt := phase_constants[n_constants:]:
             theta = theta - tilt[0]
         return PhasePoint((), transitions.resolve_two_foot_landing(s, theta, dtheta, dL1), ())
@@ -179,18 +199,18 @@ between phases and of the mesh follow.
 
 @functools.cache
 def make_post_impact_sequence(
-    n_legs: int, stop_at_lift_off: bool = True, leg_force_structure: Any = NO_LEG_FORCE
+    n_legs: int, stop_at_lift_off: bool = True, law_structure: Any = NO_LAWS
 ) -> PhaseSequence:
     """Build the sequence DLS, SLS-I and SLS-II on the plane section (theta+, dtheta+) after the
     impact.
     """
     collocation_phases = tuple(
-        _make_collocation_phase(n_legs, stop_at_lift_off, leg_force_structure, phase_index)
+        _make_collocation_phase(n_legs, stop_at_lift_off, law_structure, phase_index)
         for phase_index in range(len(PAPER_PHASES))
     )
 
     def make_start_point(phase_constants: PhaseConstants, section_state: Vector) -> PhasePoint:
-        s = _restore_symbols(n_legs, leg_force_structure, phase_constants)
+        s = _restore_symbols(n_legs, law_structure, phase_constants)
         sine, cosine = compute_sine_cosine(section_state[0])
         foot_distance = s.L0 * s.sin_alpha / rotate_to_rear_leg(s, sine, cosine).cos
         return PhasePoint((foot_distance,), section_state[:1], section_state[1:])
@@ -206,7 +226,7 @@ def make_post_impact_sequence(
         )
         (theta, _), (dtheta, dL1) = sls2_points.phase_end_point.q, sls2_points.phase_end_point.v
         landing_result = transitions.resolve_landing(
-            _restore_symbols(n_legs, leg_force_structure, phase_constants), theta, dtheta, dL1
+            _restore_symbols(n_legs, law_structure, phase_constants), theta, dtheta, dL1
         )
         return (
             jnp.where(is_phase_active[0], lift_off_guard, -lift_off_guard),
@@ -214,4 +234,12 @@ def make_post_impact_sequence(
             sls1_points.phase_end_point.v[2],
         )
 
-    return PhaseSequence(2, make_start_point, collocation_phases, evaluate_transition_margins)
+    return PhaseSequence(
+        2,
+        make_start_point,
+        collocation_phases,
+        evaluate_transition_margins,
+        functools.partial(exchange_legs, law_structure)
+        if has_alternating_legs(law_structure)
+        else None,
+    )

@@ -74,7 +74,7 @@ class ParameterizedWalker(eqx.Module):
         """Return the walker and its parameters with the given values."""
         return self, jax.tree.unflatten(self.structure, list(values))
 
-    def attach_leg_force(self, params: Any) -> Any:
+    def attach_laws(self, params: Any) -> Any:
         """Return the parameters, which contain all of a leg's law."""
         return params
 

@@ -62,12 +62,13 @@ class AbstractWheel(AbstractWalker, eqx.Module):
     """
 
     def __new__(cls, *_: Any, **settings: Any) -> "AbstractWheel":
-        """Raise a `TypeError` if a model with the paper's legs is given a leg force."""
-        if "leg_force" in settings and "leg_force" not in cls.__dataclass_fields__:
-            raise TypeError(
-                f"leg_force is given, but a {cls.__name__} has no law of its own for the legs: "
-                "give vrw.ViscoelasticWheel(leg_force=...)."
-            )
+        """Raise a `TypeError` if a model with the paper's laws is given another law."""
+        for law_name, place in {"leg_force": "legs", "hub_torque": "hub"}.items():
+            if law_name in settings and law_name not in cls.__dataclass_fields__:
+                raise TypeError(
+                    f"{law_name} is given, but a {cls.__name__} has no law of its own for the "
+                    f"{place}: give vrw.ViscoelasticWheel({law_name}=...)."
+                )
         return super().__new__(cls)
 
     def __repr__(self) -> str:
@@ -112,7 +113,7 @@ class AbstractWheel(AbstractWalker, eqx.Module):
 
     @property
     def own_parameter_domains(self) -> dict[str, ParameterDomain]:
-        """Return the domains of these parameters by name: friction, or those of a leg force."""
+        """Return the domains of these parameters by name: friction, or those of laws."""
         return {}
 
     @property
@@ -128,8 +129,8 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         """Return the names of `parameter_domains`."""
         return (*PARAMETER_NAMES, *self.own_parameter_domains)
 
-    def attach_leg_force(self, params: WheelParams) -> WheelParams:
-        """Return the parameters with the leg force of this model, unless they have one already."""
+    def attach_laws(self, params: WheelParams) -> WheelParams:
+        """Return the parameters with the laws of this model, unless they have laws already."""
         return params
 
     def list_parameter_values(self, params: WheelParams) -> list[Any]:
@@ -138,10 +139,8 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         return [*wheel_values, *self._list_own_values(params)]
 
     def _list_own_values(self, params: WheelParams) -> list[Any]:
-        """Return the values of the own parameters, which are those of an attached leg force."""
-        return jax.tree.leaves(
-            self.own_parameters if params.leg_force is None else params.leg_force
-        )
+        """Return the values of the own parameters, which are those of attached laws."""
+        return jax.tree.leaves(self.own_parameters if params.laws is None else params.laws)
 
     def get_parameter(self, params: WheelParams, parameter_name: str) -> Any:
         """Return the value of one parameter of `parameter_names`."""
@@ -175,7 +174,7 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         return eqx.tree_at(lambda model: model.own_parameters, self, own_parameters)
 
     def without_values(self) -> "AbstractWheel":
-        """Return the model with 1 as the value of each parameter of its leg force."""
+        """Return the model with 1 as the value of each parameter of its laws."""
         return self
 
     def with_parameter(
@@ -189,8 +188,8 @@ class AbstractWheel(AbstractWalker, eqx.Module):
             own_values = self._list_own_values(params)
             own_values[list(self.own_parameter_domains).index(parameter_name)] = parameter_value
             model = self._replace_own_parameters(own_values)
-            if params.leg_force is not None:
-                params = params.attach_leg_force(model.own_parameters)
+            if params.laws is not None:
+                params = params.attach_laws(model.own_parameters)
             return model, params
         return self, eqx.tree_at(
             lambda wheel: getattr(wheel, parameter_name), params, parameter_value
@@ -294,6 +293,17 @@ class AbstractWheel(AbstractWalker, eqx.Module):
             return None
         line_slopes = complete_ground_line_slopes(params.slope, n_steps)
         return (jnp.stack([line_slopes[:-1], line_slopes[1:]], axis=-1),)
+
+    @property
+    def leg_period(self) -> int:
+        """Return the number of steps after which the legs have the same parameters again."""
+        return 1
+
+    def select_params(self, params: WheelParams, step_index: Array | int) -> WheelParams:
+        """Return the parameters in a step of a walk, which differ from step to step if the legs
+        alternate.
+        """
+        return params
 
     def with_step_ground(
         self, params: WheelParams, step_ground: StepGroundValues

@@ -355,17 +355,17 @@ PARAMETER_MEASURES = _index_measures_by_name(
 """Parameters of the wheel as measures, for the axes of a scan."""
 
 
-LEG_PREFIX = "leg."
-"""Beginning of the names of the parameters of a leg force."""
+LAW_PREFIXES = ("leg.", "hub.")
+"""Beginnings of the names of the parameters of laws."""
 
 
 class _MeasureTable(dict[str, Measure]):
-    """Table of measures that also describes the parameters of leg forces, without their units."""
+    """Table of measures that also describes the parameters of laws, without their units."""
 
     def __missing__(self, name: str) -> Measure:
-        if not name.startswith(LEG_PREFIX):
+        if not name.startswith(LAW_PREFIXES):
             raise KeyError(name)
-        return Measure(name, "1", name.rpartition(".")[2], name, "Parameter of the leg force.")
+        return Measure(name, "1", name.rpartition(".")[2], name, "Parameter of a law.")
 
 
 MEASURES: dict[str, Measure] = _MeasureTable(
@@ -449,7 +449,7 @@ def describe_parameter(name: str, domain: ParameterDomain) -> Measure:
     """Return the parameter of a wheel, its ground or its leg force as a measure."""
     if domain.description and name in MEASURES:
         return MEASURES[name]
-    kind = "the leg force" if name.startswith(LEG_PREFIX) else "the walker"
+    kind = "a law" if name.startswith(LAW_PREFIXES) else "the walker"
     description = domain.description or f"Parameter of {kind}."
     return Measure(name, domain.unit, domain.symbol, name, description)
 

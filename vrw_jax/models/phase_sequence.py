@@ -38,6 +38,7 @@ from vrw_jax.wheel.ground import (
     compute_foot_distance_for_length,
     compute_line_slope,
 )
+from vrw_jax.wheel.laws import compute_motor_work
 from vrw_jax.wheel.outcomes import replace_rest_outcome
 from vrw_jax.wheel.params import MAX_SI_VALUE, PARAMETER_DOMAINS, Symbols, WheelParams
 from vrw_jax.wheel.phases import (
@@ -326,6 +327,10 @@ def make_step_result(
         dynamics.compute_mechanical_energy(s, m).total_energy
         for m in (landing_result.motion_after, motion_at_step_end)
     )
+    damping_loss = initial_energy - final_energy - stopper_collision.energy_loss
+    if s.hub_torque is not None:
+        turned_angle = phase_end_results[2].q[0] - landing_result.theta_after_landing
+        damping_loss = damping_loss + compute_motor_work(s, turned_angle)
     fore_force, rear_force = transitions.compute_landing_forces(s, landing_result)
     advance_result = make_advance_result(phase_sequence, engine)
     margins, required_friction = _make_margins_and_required_friction(
@@ -348,11 +353,7 @@ def make_step_result(
         energy=EnergyLoss(
             landing=zero_unless_begun(landing_result.energy_loss),
             stopper=jnp.where(has_stopper_collision, stopper_collision.energy_loss, 0.0),
-            damping=jnp.where(
-                phase_sequence.outcome == Outcome.STEPPED,
-                initial_energy - final_energy - stopper_collision.energy_loss,
-                0.0,
-            ),
+            damping=jnp.where(phase_sequence.outcome == Outcome.STEPPED, damping_loss, 0.0),
         ),
         outcome=advance_result.outcome,
         solver_steps=advance_result.solver_steps,

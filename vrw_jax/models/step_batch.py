@@ -71,7 +71,7 @@ from vrw_jax.models.walk_batch import (
 )
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
-    NO_LEG_FORCE,
+    NO_LAWS,
     PARAMETER_NAMES,
     WheelParams,
     make_wheel_from_parameters,
@@ -264,7 +264,7 @@ def _check_parameter_shapes(
     n_steps: int,
 ) -> list[np.ndarray]:
     """Return each parameter as a scalar or an array over the batch, in the order of
-    `PARAMETER_NAMES`, and after them those of a leg force.
+    `PARAMETER_NAMES`, and after them those of the laws.
 
     The slope, and with unilateral contact the friction, may have a second axis over gait steps.
     Raise ValueError if the shapes of states and parameters do not fit.
@@ -375,6 +375,9 @@ def _step_batch_without_contact(
         active_lanes = walk_batch.find_walking_lanes()
         if is_ground_uneven:
             parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
+        if k > 0 and model.leg_period == 2:
+            turns = parameter_matrix[model.parameter_names.index("leg.turn")]
+            turns[:] = turns < 0.5
         for solver_index, (_, take_lane_steps) in engine_by_solver.items():
             lane_indices = active_lanes[solver_indices[active_lanes] == solver_index]
             if not len(lane_indices):
@@ -462,7 +465,7 @@ def _select_batch_engine(
     ) -> tuple[np.ndarray, ...]:
         compiled_step = _compile_lane_step(
             model.stop_at_lift_off,
-            jax.tree.structure(model.leg_force),
+            find_law_structure(model, n_legs),
             n_legs,
             input_indices,
             len(ground_inputs),
@@ -479,13 +482,13 @@ def _select_batch_engine(
 @functools.cache
 def _compile_lane_step(
     stop_at_lift_off: bool,
-    leg_force_structure: Any,
+    law_structure: Any,
     n_legs: int,
     input_indices: tuple[int, ...],
     n_ground_inputs: int,
 ) -> CompiledBatchFunction:
     """Return a compiled gait step of lanes, a function of options and inputs."""
-    n_law_parameters = leg_force_structure.num_leaves
+    n_law_parameters = law_structure.num_leaves
     n_parameters = len(PARAMETER_NAMES) + n_law_parameters
 
     def step_lanes(
@@ -500,7 +503,7 @@ def _compile_lane_step(
                 lane_step_inputs[:n_parameters],
                 n_legs,
                 *lane_step_inputs[n_parameters + 3 :],
-                leg_force_structure=leg_force_structure,
+                law_structure=law_structure,
             )
             x = lane_step_inputs[n_parameters : n_parameters + 3]
             step_result, is_unfinished = advance_gait_step(
@@ -515,7 +518,7 @@ def _compile_lane_step(
         # With respect to all inputs, two columns follow from the units, which a law may not have.
         differentiates_all_inputs = (
             len(input_indices) == len(lane_step_inputs) <= N_STEP_INPUTS + 1
-            and leg_force_structure == NO_LEG_FORCE
+            and law_structure == NO_LAWS
         )
         compute_jacobian_of_columns = (
             complete_jacobian_columns if differentiates_all_inputs else compute_jacobian_columns
@@ -603,6 +606,11 @@ def _step_lanes_by_diffrax(
     )
 
 
+def find_law_structure(model: AbstractWheel, n_legs: int) -> Any:
+    """Return the structure of a model's laws, whose values follow the parameters of the wheel."""
+    return jax.tree.structure(model.attach_laws(WheelParams(n_legs=n_legs)).laws)
+
+
 @eqx.filter_jit
 def _step_elements_by_vmap(
     model: AbstractWheel,
@@ -619,8 +627,8 @@ def _step_elements_by_vmap(
     - `step_input_matrix`: inputs of the step, shape (elements, inputs);
     - `input_indices`: indices of the inputs with respect to which the Jacobian is computed.
     """
-    leg_force_structure: Any = jax.tree.structure(getattr(model, "leg_force", None))
-    n_parameters = len(PARAMETER_NAMES) + leg_force_structure.num_leaves
+    law_structure: Any = find_law_structure(model, n_legs)
+    n_parameters = len(PARAMETER_NAMES) + law_structure.num_leaves
 
     def step_one_element(step_inputs: Array) -> tuple[Array, ...]:
         def step_with_varied_inputs(varied_inputs: Array) -> tuple[Array, tuple[Array, ...]]:
@@ -629,7 +637,7 @@ def _step_elements_by_vmap(
                 updated_step_inputs[:n_parameters],
                 n_legs,
                 *updated_step_inputs[n_parameters + 3 :],
-                leg_force_structure=leg_force_structure,
+                law_structure=law_structure,
             )
             x = updated_step_inputs[n_parameters : n_parameters + 3]
             step_result = model.advance(params, x, options)

@@ -95,7 +95,8 @@ class EnergyLoss(AbstractMeasureGroup):
     """Mechanical energy that the wheel loses in the step, J. Each part is positive for a loss.
 
     - `landing`, `stopper`: loss in the landing and in the collision of Leg 2 with its stopper;
-    - `damping`: loss in the dampers of the legs.
+    - `damping`: loss in the dampers of the legs. A hub torque that varies with the rate counts as
+      a damper, so that its work reduces this loss.
 
     Examples:
         >>> step = vrw.step(vrw.WheelParams(damping=150.0), vrw.paper_start())

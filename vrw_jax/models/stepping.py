@@ -20,7 +20,6 @@ from vrw_jax import lanes
 from vrw_jax.base.checks import check_int, check_reals, check_type, format_value
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import list_parameters
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
@@ -45,7 +44,7 @@ from vrw_jax.models.registry import describe_accepted_models
 from vrw_jax.models.step_results import SectionState, StepResult
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.params import WheelParams
+from vrw_jax.wheel.params import WheelLaws, WheelParams, list_law_parameters
 
 SectionStateLike = Array | np.ndarray | Sequence[float]
 """Section state in any form that users may pass.
@@ -103,11 +102,12 @@ def convert_model_argument(
             "number, or vary it in a design of vrw.scan; vrw.step_batch takes one for each "
             "element, vrw.walk one for each of its steps."
         )
-    for law_parameter in list_parameters(getattr(model, "leg_force", None), "leg"):
+    laws = model.own_parameters if isinstance(model.own_parameters, WheelLaws) else None
+    for law_parameter in list_law_parameters(laws):
         if jnp.ndim(law_parameter.value) and not allows_friction_arrays:
             raise ValueError(
                 f"{law_parameter.name} has shape {jnp.shape(law_parameter.value)}, but this call "
-                "is for one law of the legs: give one number; vrw.step_batch and vrw.limit_cycles "
+                "is for one wheel: give one number; vrw.step_batch and vrw.limit_cycles "
                 "take one for each element."
             )
     return model

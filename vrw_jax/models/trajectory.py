@@ -359,7 +359,7 @@ def specify_phase_trajectory(
     def sample_phase_step(x: Array, k: int) -> SampledStep:
         step_model, step_params = models_and_wheels[k]
         trajectory = _sample_step(step_model, step_params, x, options, n_samples)
-        step_params = step_model.attach_leg_force(step_params)
+        step_params = step_model.attach_laws(step_params)
         s = jax.tree.map(float, select_stance_line(step_params, x)[0]).symbols()
         phase_durations = np.asarray(trajectory.durations)
         state, energies, foot_forces = (

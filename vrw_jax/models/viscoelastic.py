@@ -23,7 +23,7 @@ from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.parameters import ParameterDomain, list_parameters
+from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
@@ -41,7 +41,7 @@ from vrw_jax.flow.tableaus import (
 )
 from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
 from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
-from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.interface import AbstractWheel, StepGroundValues
 from vrw_jax.models.phase_sequence import (
     PhaseResult,
     PhaseRunner,
@@ -60,11 +60,13 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import Motion
-from vrw_jax.wheel.leg_force import convert_leg_force
+from vrw_jax.wheel.laws import convert_hub_torque, convert_leg_force
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
+    WheelLaws,
     WheelParams,
     compute_wheel_units,
+    list_law_parameters,
     require_known_friction,
 )
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant
@@ -86,6 +88,10 @@ class ViscoelasticWheel(AbstractWheel):
     - `leg_force`: force along a leg in N, as a function `f(L, dL, params)` of its length in m, its
       rate in m/s and the parameters of the wheel. A positive force pushes the hub away from the
       foot. None means the paper's force, k (L* - L) - c dL. See docs/howto/own_leg.md;
+    - `hub_torque`: torque of a motor on the hub in N m, as a number or a function
+      `f(dtheta, params)` of the rate of the wheel in rad/s. A positive torque drives the wheel
+      forward. The torque is external, or acts against a body that slides along with the hub and
+      does not turn. See docs/howto/own_leg.md;
     - `stop_at_lift_off`: whether a step fails if the ground would have to pull on Leg 1, because
       the model does not describe bouncing. If False, the step continues formally, as the paper's
       steps do after scuffing, and the margins report the violation.
@@ -112,32 +118,75 @@ class ViscoelasticWheel(AbstractWheel):
         static=True, converter=functools.partial(check_bool, "stop_at_lift_off"), default=True
     )
     leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
+    hub_torque: Any = eqx.field(converter=convert_hub_torque, default=None)
 
     @property
-    def own_parameters(self) -> Any:
-        return self.leg_force
+    def own_parameters(self) -> WheelLaws | None:
+        has_laws = self.leg_force is not None or self.hub_torque is not None
+        return WheelLaws(self.leg_force, self.hub_torque) if has_laws else None
 
     @property
     def own_parameter_domains(self) -> dict[str, ParameterDomain]:
-        return {x.name: x.domain for x in list_parameters(self.leg_force, "leg")}
+        return {x.name: x.domain for x in list_law_parameters(self.own_parameters)}
 
-    def attach_leg_force(self, params: WheelParams) -> WheelParams:
-        if self.leg_force is None or params.leg_force is not None:
+    def explain_impossible_gait(self, params: WheelParams) -> str:
+        torque = getattr(self.hub_torque, "torque", None)
+        has_motor = self.hub_torque is not None and not (torque is not None and torque <= 0.0)
+        return "" if has_motor else super().explain_impossible_gait(params)
+
+    def attach_laws(self, params: WheelParams) -> WheelParams:
+        if params.laws is not None or self.own_parameters is None:
             return params
-        return params.attach_leg_force(self.leg_force)
+        if self.own_parameters.leg_period == 2 and params.n_legs % 2:
+            raise ValueError(
+                f"n_legs is {params.n_legs}, but legs alternate only if their number is even: give "
+                "an even number, or one law for all legs."
+            )
+        return params.attach_laws(self.own_parameters)
 
-    def without_values(self) -> "ViscoelasticWheel":
-        return eqx.tree_at(
-            lambda model: model.leg_force,
-            self,
-            jax.tree.map(jnp.ones_like, self.leg_force),
-            is_leaf=lambda x: x is None,
+    @property
+    def leg_period(self) -> int:
+        return WheelLaws(self.leg_force).leg_period
+
+    def select_params(self, params: WheelParams, step_index: Array | int) -> WheelParams:
+        laws = self.attach_laws(params).laws
+        if laws is None or self.leg_period == 1:
+            return params
+        return params.attach_laws(laws.exchange_legs(step_index % 2))
+
+    def split_ground_by_step(
+        self, params: WheelParams, n_steps: int, heights: Array | None = None
+    ) -> StepGroundValues | None:
+        step_ground = super().split_ground_by_step(params, n_steps, heights)
+        if self.leg_period == 1:
+            return step_ground
+        return (jnp.arange(n_steps), *(step_ground or ()))
+
+    def with_step_ground(
+        self, params: WheelParams, step_ground: StepGroundValues
+    ) -> tuple[AbstractWheel, WheelParams]:
+        if self.leg_period == 1:
+            return super().with_step_ground(params, step_ground)
+        step_index, *ground = step_ground
+        params = self.select_params(params, step_index)
+        return super().with_step_ground(params, tuple(ground)) if ground else (self, params)
+
+    def _replace_own_parameters(self, values: Any) -> "ViscoelasticWheel":
+        return self.with_laws(
+            jax.tree.unflatten(jax.tree.structure(self.own_parameters), list(values))
         )
 
-    def with_leg_force_of(self, params: WheelParams) -> "ViscoelasticWheel":
-        """Return the model with the leg force that `attach_leg_force` has added to parameters."""
+    def without_values(self) -> "ViscoelasticWheel":
+        return self.with_laws(jax.tree.map(jnp.ones_like, self.own_parameters))
+
+    def with_laws(self, laws: WheelLaws | None) -> "ViscoelasticWheel":
+        """Return the model with other laws, such as those that `attach_laws` has added."""
+        laws = laws or WheelLaws()
         return eqx.tree_at(
-            lambda model: model.leg_force, self, params.leg_force, is_leaf=lambda x: x is None
+            lambda model: (model.leg_force, model.hub_torque),
+            self,
+            (laws.leg, laws.hub),
+            is_leaf=lambda x: x is None,
         )
 
     def compute_default_start(self, params: WheelParams) -> SectionState:
@@ -155,7 +204,7 @@ class ViscoelasticWheel(AbstractWheel):
     def take_steps(self, params: WheelParams, x: np.ndarray, options: StepOptions) -> Any:
         if not can_use_batch_kernel(options):
             return super().take_steps(params, x, options)
-        params = self.attach_leg_force(params)
+        params = self.attach_laws(params)
         run_steps = _compile_lane_steps(self.stop_at_lift_off, self.friction).run
         to_lanes_last = lambda leaf: np.ascontiguousarray(np.moveaxis(np.asarray(leaf), 0, -1))
         steps = run_steps(*jax.tree.map(to_lanes_last, (params, x)), options)
@@ -164,7 +213,7 @@ class ViscoelasticWheel(AbstractWheel):
     def sample_step(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
-        params = self.attach_leg_force(params)
+        params = self.attach_laws(params)
         if can_use_batch_kernel(options):
             sample_lane_steps = functools.partial(
                 _sample_lane_steps, self.stop_at_lift_off, n_samples
@@ -206,7 +255,7 @@ class ViscoelasticWheel(AbstractWheel):
         phase_state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
-        params = self.attach_leg_force(params)
+        params = self.attach_laws(params)
         if can_use_batch_kernel(options):
             finish_lane_steps = functools.partial(
                 _finish_lane_steps, self.stop_at_lift_off, phase_index
@@ -233,10 +282,10 @@ def _compute_step(
     options: StepOptions,
     records_margins: bool,
 ) -> Any:
-    if model.leg_force is not None:
-        # Programs take the numbers of the leg force as part of the parameters.
-        params = model.attach_leg_force(params)
-        model = dataclasses.replace(model, leg_force=None)
+    if model.own_parameters is not None:
+        # Programs take the numbers of the laws as part of the parameters.
+        params = model.attach_laws(params)
+        model = model.with_laws(None)
     return _compile_step(model, _select_engine(options), records_margins)(params, x, options)
 
 

@@ -213,7 +213,7 @@ class CollocationScanEngine:
         for _, sample_indices, mesh_search in search_further(
             self._find_gaits_from_starts,
             self._gait_finder,
-            model.attach_leg_force(params),
+            model.attach_laws(params),
             first_search,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
             # A mesh that the user has chosen is fixed.

@@ -60,7 +60,7 @@ from vrw_jax.studies.scan_store import (
     choose_chunk_shape,
 )
 from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE, JsonObject
-from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, check_parameter_name
+from vrw_jax.wheel.params import FRICTION_NAME, LAW_NAMES, WheelParams, check_parameter_name
 
 MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples in a scan.
@@ -346,7 +346,7 @@ def describe_settings_difference(
         return ""
     if setting_name == "design.digest":
         return "the values of the swept parameters differ"
-    if setting_name in ("model.leg_force", "model.walker"):
+    if setting_name == "model.walker" or setting_name.removeprefix("model.") in LAW_NAMES:
         return f"the code of {setting_name.removeprefix('model.')} differs"
     if setting_name == "code":
         return "the library's code differs"
@@ -434,7 +434,7 @@ def _convert_settings_to_json(settings_object: object) -> JsonObject:
         field_value = getattr(settings_object, field_name)
         if isinstance(field_value, StepOptions | ModelCapabilities):
             continue  # Options are recorded separately, and capabilities are code.
-        if field_name == "leg_force":
+        if field_name in LAW_NAMES:
             if field_value is None:
                 continue
             field_value = _identify_code(jax.tree.structure(field_value))

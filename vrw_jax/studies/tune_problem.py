@@ -280,12 +280,12 @@ class TuneProblem:
         return parameter_values
 
     def make_wheel(self, normalized_parameters: np.ndarray) -> Any:
-        """Return the wheel with these normalized free parameters, and with its leg force."""
+        """Return the wheel with these normalized free parameters, and with its laws."""
         model, params = self.gait_finder.model.from_parameter_values(
             jnp.asarray(self.denormalize_parameters(normalized_parameters)),
             self.gait_finder.n_legs,
         )
-        return model.attach_leg_force(params)
+        return model.attach_laws(params)
 
     @property
     def normalized_start(self) -> np.ndarray:
@@ -431,9 +431,9 @@ class TuneProblem:
         best_gait = best_trial.gait_evaluation.gait
         params = self.make_wheel(best_trial.normalized_parameters)
         model: Any = self.gait_finder.model
-        leg_force = getattr(params, "leg_force", None)
-        if leg_force is not None:
-            model = model.with_leg_force_of(params)
+        laws = getattr(params, "laws", None)
+        if laws is not None:
+            model = model.with_laws(laws)
         unit_by_parameter = {name: x.unit for name, x in model.parameter_domains.items()}
         conditions = compute_optimality_conditions(
             best_trial,
@@ -467,7 +467,7 @@ class TuneProblem:
         walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
         step_measures = self.gait_finder.measure_step(params, best_gait.cycle, best_gait.step)
         return TuneResult(
-            params=params if leg_force is None else params.attach_leg_force(None),
+            params=params if laws is None else params.attach_laws(None),
             model=model,
             status=maximization_result.status,
             objective=self.objective_label,

@@ -22,7 +22,12 @@ from jaxtyping import Array, Float
 
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
-from vrw_jax.wheel.leg_force import compute_leg_potential, evaluate_leg_force
+from vrw_jax.wheel.laws import (
+    compute_leg_potential,
+    evaluate_hub_torque,
+    evaluate_leg_force,
+    evaluate_stopper_preload,
+)
 from vrw_jax.wheel.params import Symbols
 
 
@@ -205,7 +210,7 @@ def compute_leg_forces(s: Symbols, motion: Motion) -> tuple[Elementwise, Element
     if s.leg_force is not None:
         return (
             evaluate_leg_force(s, motion.L1, motion.dL1),
-            evaluate_leg_force(s, motion.L2, motion.dL2),
+            evaluate_leg_force(s, motion.L2, motion.dL2, 2),
         )
     spring_preload = s.k * s.Ls
     return (
@@ -217,7 +222,8 @@ def compute_leg_forces(s: Symbols, motion: Motion) -> tuple[Elementwise, Element
 def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     """Return the mass matrix and the applied forces for a motion.
 
-    The applied forces are gravity, the forces along the legs, and the inertial forces.
+    The applied forces are gravity, the forces along the legs, the torque on the hub, and the
+    inertial forces.
     """
     sin, cos, L1, L2, dtheta, dL1, dL2 = motion
     mass_matrix = compute_mass_matrix(s, L1, L2)
@@ -229,11 +235,17 @@ def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     fore_gravity_moment = s.g * s.m * s.L0 + s.g * s.Mh * L1
     rear_gravity_moment = s.g * s.m * s.L0 - s.g * s.m * L2
     leg_force_1, leg_force_2 = compute_leg_forces(s, motion)
+    applied_moment_theta = (
+        fore_gravity_moment * fore_leg.sin
+        + rear_gravity_moment * rear_leg.sin
+        - 2.0 * (half_dM11_dL1 * dL1 + half_dM11_dL2 * dL2) * dtheta
+    )
+    if s.hub_torque is not None:
+        # Hub and legs turn together, so that the work of the torque is torque times dtheta.
+        applied_moment_theta = applied_moment_theta + evaluate_hub_torque(s, dtheta)
     return EquationTerms(
         mass_matrix=mass_matrix,
-        applied_moment_theta=fore_gravity_moment * fore_leg.sin
-        + rear_gravity_moment * rear_leg.sin
-        - 2.0 * (half_dM11_dL1 * dL1 + half_dM11_dL2 * dL2) * dtheta,
+        applied_moment_theta=applied_moment_theta,
         applied_force_L1=leg_force_1
         + half_dM11_dL1 * dtheta * dtheta
         - coriolis_factor * dL2
@@ -364,6 +376,8 @@ def compute_double_support_equation(
         generalized_force = generalized_force - hub_circle_diameter * (
             leg_force_1 * rear_leg.sin + leg_force_2 * motion.sin_theta
         )
+    if s.hub_torque is not None:
+        generalized_force = generalized_force + evaluate_hub_torque(s, dtheta)
     return SingleDofEquation(
         constant_inertia + 2.0 * sin_squared_rate_coefficient * cos, generalized_force
     )
@@ -508,10 +522,9 @@ def compute_stopper_force(
     The spring presses the leg against the stopper with the force k (L* - L0), or that of a user's
     law at rest. The weight and the acceleration of the leg's mass reduce the force.
     """
-    spring_force = (
-        s.k * (s.Ls - s.L0) if s.leg_force is None else evaluate_leg_force(s, s.L0, 0.0 * s.L0)
-    )
-    leg_angles = s.alpha * (np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1)) - 1)
+    legs = np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1))
+    spring_force = s.k * (s.Ls - s.L0) if s.leg_force is None else evaluate_stopper_preload(s, legs)
+    leg_angles = s.alpha * (legs - 1)
     fore_leg = rotate_to_vertical(s, motion.sin_theta, motion.cos_theta)
     # Gravity is subtracted from the acceleration of the hub, in the frame of Leg 1.
     radial_hub_acceleration = (
@@ -564,8 +577,9 @@ def compute_mechanical_energy(s: Symbols, motion: Motion) -> Energy:
     else:
         elastic_energy = (
             compute_leg_potential(s, motion.L1)
-            + compute_leg_potential(s, motion.L2)
-            + (s.n - 2) * compute_leg_potential(s, s.L0)
+            + compute_leg_potential(s, motion.L2, 2)
+            + (0.5 * s.n - 1.0)
+            * (compute_leg_potential(s, s.L0) + compute_leg_potential(s, s.L0, 2))
         )
     return Energy(compute_kinetic_energy(s, motion), s.g * mass_height_moment, elastic_energy)
 

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 from vrw_jax.base.checks import check_int, check_reals, format_value, require_known_name
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.options import StepOptions, make_real_field
-from vrw_jax.base.parameters import ParameterDomain, list_parameters
+from vrw_jax.base.parameters import ModuleParameter, ParameterDomain, list_parameters
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
 
@@ -87,6 +87,40 @@ class Symbols(NamedTuple):
     alpha: float
     leg_force: Any = None
     """Force along a leg as a function of its length and rate; None for the paper's force."""
+    hub_torque: Any = None
+    """Torque on the hub as a function of its rate; None without a motor."""
+
+
+class WheelLaws(eqx.Module):
+    """Laws that a user gives instead of the paper's; None where there is none."""
+
+    leg: Any = None
+    hub: Any = None
+
+    @property
+    def leg_period(self) -> int:
+        """Return the number of steps after which each leg has its first law again."""
+        return 2 if hasattr(self.leg, "exchange") else 1
+
+    def exchange_legs(self, parity: Any) -> "WheelLaws":
+        """Return the laws as they are in a later step of a walk.
+
+        - `parity`: 1 if the number of steps until then is odd, otherwise 0.
+        """
+        if self.leg_period == 1:
+            return self
+        return WheelLaws(self.leg.exchange(parity > 0.5), self.hub)
+
+
+LAW_NAMES = ("leg_force", "hub_torque")
+"""Settings of a model that are laws."""
+
+
+def list_law_parameters(laws: WheelLaws | None) -> Iterator[ModuleParameter]:
+    """Yield the parameters of laws, whose names begin with `leg.` and `hub.`."""
+    if laws is not None:
+        yield from list_parameters(laws.leg, "leg")
+        yield from list_parameters(laws.hub, "hub")
 
 
 _check_n_legs = functools.partial(
@@ -135,9 +169,9 @@ class WheelParams(AbstractPrintable):
     slope: Scalar = make_real_field("slope", 0.30)
     gravity: Scalar = make_real_field("gravity", 9.81)
     n_legs: int = eqx.field(static=True, converter=_check_n_legs, default=8)
-    leg_force: Any = eqx.field(init=False, default_factory=lambda: None)
-    """Force along a leg of the model that computes with these parameters, see `attach_leg_force`.
-    None means the paper's force.
+    laws: WheelLaws | None = eqx.field(init=False, default_factory=lambda: None)
+    """Laws of the model that computes with these parameters, see `attach_laws`. None means the
+    paper's.
     """
 
     def __new__(cls, *_: Any, **given_parameters: Any) -> "WheelParams":
@@ -285,29 +319,29 @@ class WheelParams(AbstractPrintable):
         relative_values = _square_relative_parameters(value_by_parameter, self.n_legs)
         for squared_relative_value in relative_values.values():
             is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
-        for law_parameter in list_parameters(self.leg_force, "leg"):
+        for law_parameter in list_law_parameters(self.laws):
             is_in_all_domains &= law_parameter.domain.contains_parameter_value(law_parameter.value)
         return is_in_all_domains
 
-    def attach_leg_force(self, leg_force: Any) -> "WheelParams":
-        """Return these parameters with the force of a model, so that all equations contain it.
+    def attach_laws(self, laws: WheelLaws | None) -> "WheelParams":
+        """Return these parameters with the laws of a model, so that all equations contain them.
 
-        None is the paper's force.
+        None means the paper's laws.
         """
-        if leg_force is self.leg_force:
+        if laws is self.laws:
             return self
-        return eqx.tree_at(lambda p: p.leg_force, self, leg_force, is_leaf=lambda x: x is None)
+        return eqx.tree_at(lambda p: p.laws, self, laws, is_leaf=lambda x: x is None)
 
     def make_table_1_wheel(self) -> "WheelParams":
         """Return the wheel in Table 1 of the paper with as many legs.
 
-        The parameters of its leg force have their defaults.
+        The parameters of its laws have their defaults.
         """
-        law_defaults = [x.default for x in list_parameters(self.leg_force, "leg")]
-        default_law = jax.tree.unflatten(
-            jax.tree.structure(self.leg_force), list(map(jnp.asarray, law_defaults))
+        law_defaults = [x.default for x in list_law_parameters(self.laws)]
+        default_laws = jax.tree.unflatten(
+            jax.tree.structure(self.laws), list(map(jnp.asarray, law_defaults))
         )
-        return WheelParams(n_legs=self.n_legs).attach_leg_force(default_law)
+        return WheelParams(n_legs=self.n_legs).attach_laws(default_laws)
 
     def scaled(
         self,
@@ -360,7 +394,10 @@ class WheelParams(AbstractPrintable):
         """Return the parameters by their symbols in the paper, and quantities that several formulas
         share.
         """
-        return compute_symbols(self.n_legs, **self._parameters)._replace(leg_force=self.leg_force)
+        laws = self.laws or WheelLaws()
+        return compute_symbols(self.n_legs, **self._parameters)._replace(
+            leg_force=laws.leg, hub_torque=laws.hub
+        )
 
 
 def _square_relative_parameters(
@@ -481,35 +518,35 @@ def require_known_friction(given_friction: Any) -> float:
     return float(given_friction)
 
 
-NO_LEG_FORCE = jax.tree.structure(None)
-"""Structure of the leg force of wheels with the paper's force."""
+NO_LAWS = jax.tree.structure(None)
+"""Structure of the laws of wheels with the paper's force and without a motor."""
 
 
 def stack_parameters(params: WheelParams) -> Array:
     """Return the floating-point parameters of a wheel as one array.
 
-    The first axis has the order of `PARAMETER_NAMES`, with the parameters of the leg force after
+    The first axis has the order of `PARAMETER_NAMES`, with the parameters of the laws after
     them.
     """
     wheel_values = [getattr(params, parameter_name) for parameter_name in PARAMETER_NAMES]
-    return jnp.stack([*wheel_values, *jax.tree.leaves(params.leg_force)])
+    return jnp.stack([*wheel_values, *jax.tree.leaves(params.laws)])
 
 
 def make_wheel_from_parameters(
     parameter_values: Array | tuple[Array, ...],
     n_legs: int,
     *ground: Elementwise,
-    leg_force_structure: Any = NO_LEG_FORCE,
+    law_structure: Any = NO_LAWS,
 ) -> WheelParams:
     """Return a wheel from its floating-point parameters in the order of `stack_parameters`.
 
     - `ground`: values that describe uneven ground in addition to the slope. The parameter `slope`
       then has all of them on a leading axis, see `models.phase_sequence.select_stance_line`;
-    - `leg_force_structure`: structure of the leg force as a pytree.
+    - `law_structure`: structure of the laws as a pytree.
     """
     value_by_name = dict(zip(PARAMETER_NAMES, parameter_values, strict=False))
-    wheel_params = WheelParams(**value_by_name, n_legs=n_legs).attach_leg_force(
-        jax.tree.unflatten(leg_force_structure, list(parameter_values[len(PARAMETER_NAMES) :]))
+    wheel_params = WheelParams(**value_by_name, n_legs=n_legs).attach_laws(
+        jax.tree.unflatten(law_structure, list(parameter_values[len(PARAMETER_NAMES) :]))
     )
     if not ground:
         return wheel_params

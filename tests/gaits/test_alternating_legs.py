@@ -1,0 +1,113 @@
+"""Gaits of a wheel with two different legs in turn, against a five-coordinate code."""
+
+import jax
+import numpy as np
+import pytest
+from reference_code import five_coordinates
+
+import vrw_jax as vrw
+
+PARAMS = vrw.WheelParams()
+FIRST, SECOND = {"damping": 150.0}, {"damping": 170.0, "stiffness": 520.0}
+
+
+def make_wheel(first=FIRST, second=SECOND, **turn):
+    legs = vrw.AlternatingLegs(vrw.SpringDamper(**first), vrw.SpringDamper(**second), **turn)
+    return vrw.ViscoelasticWheel(leg_force=legs)
+
+
+def make_reference_params(*laws):
+    """Return parameters of the reference code with one law for Leg 1 and one for Leg 2."""
+    k, c = (np.array([(TABLE | law)[name] for law in laws]) for name in ("stiffness", "damping"))
+
+    def leg_force(length, rate):
+        if np.ndim(length) == 0:  # the preload of a leg on its stopper
+            return k[0] * (1.02 - length) - c[0] * rate
+        return k * (1.02 - length) - c * rate
+
+    return five_coordinates.TABLE_1 | {"leg_force": leg_force}
+
+
+TABLE = five_coordinates.TABLE_1
+
+
+@pytest.fixture(scope="module")
+def cycle():
+    return vrw.limit_cycle(PARAMS, model=make_wheel(), period_n=2)
+
+
+def test_a_gait_of_two_legs_is_a_fixed_point_of_two_steps_in_five_coordinates(cycle):
+    x = np.asarray(cycle.section_state)
+    for k, laws in enumerate([(FIRST, SECOND), (SECOND, FIRST)]):
+        reference = five_coordinates.step(make_reference_params(*laws), x)
+        np.testing.assert_allclose(reference["durations"], cycle.durations[k], atol=1e-10)
+        assert abs(reference["lambda_plus"][3] - cycle.indicators.lambda_4[k]) < 1e-8
+        x = reference["section_state"]
+    np.testing.assert_allclose(x, cycle.section_state, atol=1e-10)
+    assert int(cycle.minimal_period) == 2
+
+
+def test_multipliers_are_those_of_two_steps_in_five_coordinates(cycle):
+    def advance_twice(x):
+        for laws in [(FIRST, SECOND), (SECOND, FIRST)]:
+            x = five_coordinates.return_map(make_reference_params(*laws), x)
+        return x
+
+    jacobian = five_coordinates.jacobian(advance_twice, np.asarray(cycle.section_state))
+    multipliers = sorted(np.linalg.eigvals(jacobian), key=abs)[::-1][:2]
+    np.testing.assert_allclose(cycle.multipliers, multipliers, atol=1e-7)
+
+
+def test_walks_and_batches_take_the_legs_in_turn(cycle):
+    walk = vrw.walk(PARAMS, cycle.section_state, 4, model=make_wheel())
+    np.testing.assert_allclose(walk.steps.durations[:2], cycle.durations, atol=1e-9)
+    np.testing.assert_allclose(walk.steps.section_state[-1], cycle.section_state, atol=1e-8)
+    for n_steps in (2, 3):
+        batch = vrw.step_batch(PARAMS, cycle.section_state[None], n_steps, model=make_wheel())
+        expected = walk.steps.section_state[n_steps - 1]
+        np.testing.assert_allclose(batch.section_state[0], expected, atol=1e-9)
+    other = vrw.step(PARAMS, walk.steps.section_state[0], model=make_wheel(turn=1.0))
+    np.testing.assert_allclose(other.section_state, walk.steps.section_state[1], atol=1e-9)
+    trajectory = vrw.simulate(PARAMS, cycle.section_state, 2, model=make_wheel())
+    assert abs(float(trajectory.time[-1]) - cycle.period) < 1e-8
+
+
+def test_equal_legs_have_the_gait_of_the_wheel():
+    law = {"damping": 150.0}
+    cycle = vrw.limit_cycle(PARAMS, model=make_wheel(law, law), period_n=2)
+    expected = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
+    np.testing.assert_allclose(cycle.section_state, expected.section_state, atol=1e-9)
+    np.testing.assert_allclose(cycle.multipliers, expected.multipliers**2, atol=1e-8)
+    assert int(cycle.minimal_period) == 1
+
+
+def test_derivatives_and_branches_by_a_parameter_of_one_leg_are_those_of_gaits():
+    def measure_period(damping):
+        model = make_wheel({"damping": damping})
+        return vrw.limit_cycle(PARAMS, model=model, period_n=2).period
+
+    difference = (measure_period(150.1) - measure_period(149.9)) / 0.2
+    np.testing.assert_allclose(jax.grad(measure_period)(150.0), difference, rtol=1e-6)
+    branch = vrw.continue_branch(
+        PARAMS, "leg.first.damping", (148.0, 152.0), model=make_wheel(), period_n=2
+    )
+    periods = branch.dataset.period.values[[0, -1]]
+    expected = [measure_period(value) for value in branch.values[[0, -1]]]
+    np.testing.assert_allclose(periods, expected, atol=1e-9)
+
+
+def test_force_peaks_and_stoppers_see_both_legs(cycle):
+    walk = vrw.simulate(PARAMS, cycle.section_state, 2, model=make_wheel(), n_samples=2001)
+    assert abs(float(cycle.measure("peak_force")) - float(walk.lambda_2.max())) < 1e-2
+    step = vrw.step(PARAMS, cycle.section_state, model=make_wheel())
+    stiff = vrw.step(PARAMS, cycle.section_state, model=make_wheel(second=FIRST | {
+        "stiffness": 520.0, "damping": 170.0, "natural_length": 1.03}))  # fmt: skip
+    preloads = step.margins.locked_stopper_force - stiff.margins.locked_stopper_force
+    assert np.all(np.abs(preloads[1::2]) > 4.0)  # every second leg is pressed by 5.2 N more
+
+
+def test_what_two_legs_cannot_do_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="a gait repeats after an even number of steps"):
+        vrw.limit_cycle(PARAMS, model=make_wheel())
+    with pytest.raises(ValueError, match="n_legs is 7, but legs alternate only if"):
+        vrw.step(vrw.WheelParams(n_legs=7), vrw.paper_start(), model=make_wheel())

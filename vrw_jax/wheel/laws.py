@@ -1,0 +1,302 @@
+"""Laws that a user gives: the force along a leg, and the torque on the hub.
+
+A law of a leg is a function `f(L, dL, params)` of the length of the leg and of its rate. A law of
+the hub is a function `f(dtheta, params)` of the rate at which the wheel turns. Laws are equinox
+modules, whose fields are parameters with derivatives.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.base.checks import check_reals, format_value
+from vrw_jax.base.parameters import list_parameters, parameter
+from vrw_jax.base.types import Elementwise
+from vrw_jax.wheel.params import PARAMETER_DOMAINS, Symbols, WheelLaws, WheelUnits
+
+
+class LawParameters(NamedTuple):
+    """Parameters of the wheel that a law may use: those of `WheelParams` except the slope."""
+
+    hub_mass: Elementwise
+    leg_mass: Elementwise
+    leg_com: Elementwise
+    locked_length: Elementwise
+    natural_length: Elementwise
+    stiffness: Elementwise
+    damping: Elementwise
+    gravity: Elementwise
+    n_legs: int
+
+
+class FunctionLaw(eqx.Module):
+    """Law by a function without parameters of its own."""
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.function(*arguments)
+
+
+class ConstantTorque(eqx.Module):
+    """Torque on the hub that does not depend on the motion."""
+
+    torque: Any = parameter(0.0, unit="N m", symbol="tau", meaning="torque on the hub")
+
+    def __call__(self, dtheta: Elementwise, params: LawParameters) -> Elementwise:
+        return self.torque + 0.0 * dtheta
+
+
+def _make_law_module(law: Any) -> Any:
+    return FunctionLaw(law) if callable(law) and not isinstance(law, eqx.Module) else law
+
+
+class AlternatingLegs(eqx.Module):
+    """Two laws of the legs in turn: every second leg has the first law, and the others the second.
+
+    Give the object as `leg_force` of `ViscoelasticWheel`. The wheel needs an even number of legs.
+    Its gaits repeat after an even number of steps.
+
+    - `first`, `second`: forces along the legs, as functions `f(L, dL, params)`; the names of their
+      parameters begin with `leg.first.` and `leg.second.`;
+    - `turn`: 0 if the leg that lands at the start of a walk has the first law, 1 if the second.
+
+    Examples:
+        >>> legs = vrw.AlternatingLegs(vrw.SpringDamper(damping=150.0), vrw.SpringDamper())
+        >>> vrw.ViscoelasticWheel(leg_force=legs).parameter_names[-1]
+        'leg.turn'
+    """
+
+    first: Any = eqx.field(converter=_make_law_module)
+    second: Any = eqx.field(converter=_make_law_module)
+    turn: Any = parameter(0.0, domain=(0.0, 2.0), meaning="the law of the landing leg, 0 or 1,")
+
+    def __call__(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> Elementwise:
+        forces = self.first(L, dL, params), self.second(L, dL, params)
+        return jnp.where(self.turn < 0.5, *forces)
+
+    def exchange(self, has_changed: Any = True) -> "AlternatingLegs":
+        """Return the laws as the next leg sees them, if `has_changed`."""
+        is_first = (self.turn < 0.5) ^ has_changed
+        return eqx.tree_at(lambda legs: legs.turn, self, jnp.where(is_first, 0.0 * self.turn, 1.0))
+
+
+class SpringDamper(eqx.Module):
+    """The paper's spring and damper as a law of a leg, with parameters of its own.
+
+    - `stiffness`, `damping`, `natural_length`: parameters of the law, in N/m, N s/m and m. The
+      defaults are those of Table 1 of the paper.
+
+    Examples:
+        >>> model = vrw.ViscoelasticWheel(leg_force=vrw.SpringDamper(damping=150.0))
+        >>> step = vrw.step(vrw.WheelParams(), vrw.paper_start(), model=model)
+        >>> print(f"{step.period:.3f} s")
+        0.714 s
+    """
+
+    stiffness: Any = parameter(500.0, unit="N/m", symbol="k", domain=(0.0, np.inf))
+    damping: Any = parameter(200.0, unit="N s/m", symbol="c", domain=(0.0, np.inf))
+    natural_length: Any = parameter(1.02, unit="m", symbol="L*", domain=(0.0, np.inf))
+
+    def __call__(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> Elementwise:
+        return self.stiffness * (self.natural_length - L) - self.damping * dL
+
+
+class ScaledLegForce(eqx.Module):
+    """User's law of a leg in other units of length and time, on the way from the paper's force.
+
+    A search continues gaits with the paper's force to gaits with the law, whose share grows to 1.
+    """
+
+    law: Any  # in SI units
+    share: Elementwise
+    length_unit: Elementwise
+    time_unit: Elementwise
+
+    def __call__(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> Elementwise:
+        units = WheelUnits(self.length_unit, self.time_unit, 1.0)
+        si_force = self.law(
+            L * units.length_unit, dL * units.velocity_unit, _convert_to_si(params, units)
+        )
+        paper_force = params.stiffness * (params.natural_length - L) - params.damping * dL
+        return self.share * (si_force / units.acceleration_unit) + (1.0 - self.share) * paper_force
+
+    def exchange(self) -> "ScaledLegForce":
+        return eqx.tree_at(lambda scaled: scaled.law, self, _exchange_legs(self.law))
+
+
+class ScaledHubTorque(eqx.Module):
+    """User's law of the hub in other units, whose share grows from 0 to 1 in a search."""
+
+    law: Any  # in SI units
+    share: Elementwise
+    length_unit: Elementwise
+    time_unit: Elementwise
+
+    def __call__(self, dtheta: Elementwise, params: LawParameters) -> Elementwise:
+        units = WheelUnits(self.length_unit, self.time_unit, 1.0)
+        si_torque = self.law(dtheta * units.rate_unit, _convert_to_si(params, units))
+        return self.share * (si_torque / (units.acceleration_unit * units.length_unit))
+
+
+def scale_laws(laws: WheelLaws, *scales: Elementwise) -> WheelLaws:
+    """Return laws in other units of length and time, see `ScaledLegForce`.
+
+    - `scales`: share of the laws, and the units of length and time in SI units.
+    """
+    return WheelLaws(
+        None if laws.leg is None else ScaledLegForce(laws.leg, *scales),
+        None if laws.hub is None else ScaledHubTorque(laws.hub, *scales),
+    )
+
+
+def _convert_to_si(params: LawParameters, units: WheelUnits) -> LawParameters:
+    return params._replace(
+        **{
+            name: getattr(params, name) * units.compute_unit_in_si(PARAMETER_DOMAINS[name].unit)
+            for name in params._fields
+            if name != "n_legs"
+        }
+    )
+
+
+def _collect_law_parameters(s: Symbols) -> LawParameters:
+    return LawParameters(s.Mt - s.n * s.m, s.m, s.a, s.L0, s.Ls, s.k, s.c, s.g, s.n)
+
+
+def _exchange_legs(leg_force: Any) -> Any:
+    """Return the law of the neighboring legs, which differs only if the legs alternate."""
+    return leg_force.exchange() if hasattr(leg_force, "exchange") else leg_force
+
+
+def evaluate_leg_force(
+    s: Symbols, L: Elementwise, dL: Elementwise, leg_number: int = 1
+) -> Elementwise:
+    """Return the force of a user's law along a leg, N; positive pushes the hub off the foot."""
+    leg_force = s.leg_force if leg_number % 2 else _exchange_legs(s.leg_force)
+    return leg_force(L, dL, _collect_law_parameters(s))
+
+
+def evaluate_stopper_preload(s: Symbols, leg_numbers: np.ndarray) -> Elementwise:
+    """Return the force of a user's law along legs at rest on their stoppers, N."""
+    odd_force, even_force = (evaluate_leg_force(s, s.L0, 0.0 * s.L0, i) for i in (1, 2))
+    if _exchange_legs(s.leg_force) is s.leg_force:
+        return odd_force
+    return jnp.where(leg_numbers % 2 == 1, odd_force, even_force)
+
+
+def evaluate_hub_torque(s: Symbols, dtheta: Elementwise) -> Elementwise:
+    """Return the torque on the hub by a user's law, N m; positive drives the wheel forward."""
+    return s.hub_torque(dtheta, _collect_law_parameters(s))
+
+
+def compute_motor_work(s: Symbols, angle: Elementwise) -> Elementwise:
+    """Return the work of a constant torque on the hub that turns by `angle`, J.
+
+    The work is zero for a torque that varies with the rate, which counts as a damper.
+    """
+    return s.hub_torque.torque * angle if isinstance(s.hub_torque, ConstantTorque) else 0.0 * angle
+
+
+_POTENTIAL_NODES, _POTENTIAL_WEIGHTS = np.polynomial.legendre.leggauss(16)
+"""Gauss's rule for the potential of a law, which is exact to round-off for smooth forces."""
+
+
+def compute_leg_potential(s: Symbols, L: Elementwise, leg_number: int = 1) -> Elementwise:
+    """Return the elastic energy of a leg with a user's law, J.
+
+    If the law has no method `potential(L, params)`, the energy is the work that compresses the leg
+    slowly from its locked length: the integral of the force at rest.
+    """
+    leg_force = s.leg_force if leg_number % 2 else _exchange_legs(s.leg_force)
+    if hasattr(leg_force, "potential"):
+        return leg_force.potential(L, _collect_law_parameters(s))
+    half_compression = 0.5 * (s.L0 - L)
+    zero_rate = 0.0 * L
+    energy = zero_rate
+    for node, weight in zip(_POTENTIAL_NODES.tolist(), _POTENTIAL_WEIGHTS.tolist(), strict=True):
+        length = L + half_compression * (1.0 + node)
+        energy = energy + weight * evaluate_leg_force(s, length, zero_rate, leg_number)
+    return half_compression * energy
+
+
+def convert_leg_force(leg_force: Any) -> Any:
+    """Return a user's law of the legs as a module whose leaves are arrays, or None for the paper's.
+
+    Raise a `TypeError` or a `ValueError` if the law is no elementwise function of (L, dL, params),
+    or if a field has no value in its domain.
+    """
+    return _convert_law(leg_force, "leg_force", "force along a leg", "f(L, dL, params)", "N")
+
+
+def convert_hub_torque(hub_torque: Any) -> Any:
+    """Return a torque on the hub as a law of the hub, or None if there is none.
+
+    Raise a `TypeError` or a `ValueError` as `convert_leg_force`.
+    """
+    if hub_torque is not None and not callable(hub_torque):
+        hub_torque = ConstantTorque(hub_torque)
+    return _convert_law(hub_torque, "hub_torque", "torque on the hub", "f(dtheta, params)", "N m")
+
+
+def _convert_law(law: Any, law_name: str, meaning: str, signature: str, unit: str) -> Any:
+    if law is None:
+        return None
+    if not callable(law) or isinstance(law, type):
+        raise TypeError(
+            f"{law_name} is {format_value(law)}, but it is the {meaning}: give a "
+            f"function {signature} that returns {unit}, or an object of a module with such a "
+            "__call__."
+        )
+    law = _make_law_module(law)
+    law_parameters = list(list_parameters(law, law_name[:3]))
+    remedy_text = "give a number, or declare the field with eqx.field(static=True)"
+    values = [check_reals(x.name, x.value, remedy_text) for x in law_parameters]
+    values = [x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float) for x in values]
+    for law_parameter, value in zip(law_parameters, values, strict=True):
+        if value.ndim == 0 and not isinstance(value, jax.core.Tracer):
+            law_parameter.domain.require_value_in_domain(law_parameter.name, float(value))
+        if value.ndim > 1:
+            raise ValueError(
+                f"{law_parameter.name} has shape {value.shape}, but a field of a law is one "
+                "number, or one for each element of a batch: give each number its own field."
+            )
+    structure: Any = jax.tree.structure(law)
+    if structure.num_leaves != len(values):
+        raise TypeError(
+            f"the fields of {type(law).__name__} contain {structure.num_leaves} values in "
+            f"{len(values)} fields, but each field of a law is one number: give each number "
+            "its own field."
+        )
+    _check_result(
+        jax.tree.unflatten(structure, [jnp.ones(())] * len(values)), law_name, signature.count(",")
+    )
+    return jax.tree.unflatten(structure, values)
+
+
+def _check_result(law: Any, law_name: str, n_arguments: int) -> None:
+    """Raise an error unless a law is an elementwise function that JAX can trace.
+
+    - `n_arguments`: number of arguments before the parameters.
+    """
+    for shape in ((), (3,)):
+        lengths = jax.ShapeDtypeStruct(shape, jnp.result_type(float))
+        evaluate = lambda L: jnp.asarray(
+            law(*[L] * n_arguments, LawParameters._make([*[L] * 8, 8]))
+        )
+        try:
+            result: Any = jax.eval_shape(evaluate, lengths)
+        except jax.errors.ConcretizationTypeError as error:
+            raise TypeError(
+                f"{law_name} decides by the value of a length, a rate or a parameter, which is not "
+                "known when JAX compiles it: write jnp.where(condition, force, other_force)."
+            ) from error
+        if result.shape != shape or not jnp.issubdtype(result.dtype, jnp.floating):
+            raise ValueError(
+                f"{law_name} returns {result.dtype.name} of shape {result.shape} for arguments of "
+                f"shape {shape}, but it acts element by element: return one real number for each."
+            )
