@@ -5,9 +5,11 @@ mistake is reported in one sentence on standard error, with exit code 2.
 """
 
 import gc
-import importlib
+import importlib.util
+import keyword
 import os
 import signal
+import sys
 import tempfile
 import webbrowser
 from dataclasses import replace
@@ -144,8 +146,11 @@ def configure_root_command(
 
       [cyan]vrw continue configs/branch_damping.toml[/cyan]   a branch of gaits with special points
 
-    [bold]Files[/bold]   init: configs. gait: none. reproduce: figures and tables. scan: scan.zarr
-    (open it with vrw_jax.open_scan or xarray.open_zarr), pictures, PNG and SVG, and figures.json.
+      [cyan]vrw new my_walker[/cyan]                     a skeleton of your own walker
+
+    [bold]Files[/bold]   init: configs. new: two Python files. gait: none. reproduce: figures and
+    tables. scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr), pictures, PNG and
+    SVG, and figures.json.
     tune: path.zarr, a picture, summary.md, and wheel.toml, a config of vrw gait.
     continue: branch.zarr, borders.csv, a picture and summary.md.
 
@@ -267,6 +272,46 @@ def run_init_command(
         printing.print_written_paths(missing_config_paths)
         if not missing_config_paths:
             stdout_console.print(f"{folder} has them all: nothing to write.", highlight=False)
+
+
+SKELETON_NAME = "my_walker"
+"""Name of the walker in the folder `new` of the example configs."""
+
+
+@app.command("new")
+def run_new_command(
+    name: Annotated[str, typer.Argument(help="Name of the walker, as my_walker.")],
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the two files.")] = Path("."),
+) -> None:
+    """Write the skeleton of a walker of your own, NAME.py, with its test, test_NAME.py.
+
+    The skeleton is a hopping leg that passes its test: replace its physics by your own. Existing
+    files are never overwritten.
+    """
+    with report_command_errors():
+        if not name.isidentifier() or keyword.iskeyword(name):
+            raise ValueError(
+                f"the name is {name!r}, but it is the name of a Python file that others import: "
+                "give letters, digits and underscores, as my_walker."
+            )
+        if name in sys.stdlib_module_names or importlib.util.find_spec(name) is not None:
+            raise ValueError(f"{name} is the name of an installed module: give another name.")
+        folder = check_path("--out", folder, "give a folder")
+        paths = {
+            folder / f"{name}.py": "my_walker.py",
+            folder / f"test_{name}.py": "test_my_walker.py",
+        }
+        for path in paths:
+            if path.exists():
+                raise ValueError(f"{path} is there already: give another name or --out FOLDER.")
+        _require_writable_folder(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, skeleton_file in paths.items():
+            text = (find_example_config_folder() / "new" / skeleton_file).read_text(
+                encoding="utf-8"
+            )
+            path.write_text(text.replace(SKELETON_NAME, name), encoding="utf-8")
+        printing.print_written_paths(list(paths))
 
 
 def find_example_config_folder() -> Path:
