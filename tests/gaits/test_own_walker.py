@@ -14,56 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from support.walkers import SIMPLEST_WALKER
+from support.walkers import BALL_PARAMS, BALL_SYSTEM, GRAVITY, SIMPLEST_WALKER, JuggledBall
 
 import vrw_jax as vrw
-from vrw_jax.hybrid import Guard, HybridSystem, Mode
-
-GRAVITY = 9.81
-PARAMS = {"ball": {"restitution": 0.5}, "kick": 1.0}
-
-
-@vrw.measure("height", unit="m", meaning="height of the flight")
-def flight_height(step, params):
-    return GRAVITY / 8.0 * step.duration**2
-
-
-class JuggledBall(vrw.AbstractWalker):
-    coordinates = {"velocity": "m/s"}  # noqa: RUF012
-    measures = (flight_height,)
-
-    def advance(self, params, x, options):
-        v = params["ball"]["restitution"] * x + params["kick"]
-        return vrw.AdvanceResult(v, 2.0 * v / GRAVITY, jnp.where(v[0] > 0.0, 0, 3))
-
-    def starts(self, params):
-        return jnp.array([1.0])
-
-
-def bounce(y, p):
-    return jnp.stack([0.0 * y[0], -p["ball"]["restitution"] * y[1] + p["kick"]])
-
-
-BALL_SYSTEM = HybridSystem(
-    modes={
-        "flight": Mode(
-            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
-            {"bounce": Guard(lambda y, p: y[0], bounce)},
-        )
-    },
-    section="bounce",
-    state={"height": "m", "velocity": "m/s"},
-    coordinates={"velocity": "m/s"},
-    project=lambda y, p: y[1:],
-    embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
-    starts=lambda p: jnp.array([1.0]),
-    measures=(flight_height,),
-)
 
 
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_a_gait_has_the_closed_form_of_velocity_multiplier_and_period(walker):
-    gait = vrw.limit_cycle(PARAMS, model=walker)
+    gait = vrw.limit_cycle(BALL_PARAMS, model=walker)
     np.testing.assert_allclose(gait.section_state, [2.0], rtol=1e-12)
     np.testing.assert_allclose(np.asarray(gait.multipliers), [0.5], rtol=1e-9)
     # A flight lasts one solver step of a parabola; in the system it starts at the velocity before.
@@ -72,7 +30,7 @@ def test_a_gait_has_the_closed_form_of_velocity_multiplier_and_period(walker):
 
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_an_element_of_a_batch_without_a_gait_has_a_code_and_the_others_their_gait(walker):
-    params = PARAMS | {"kick": np.array([1.0, np.nan, 2.0])}
+    params = BALL_PARAMS | {"kick": np.array([1.0, np.nan, 2.0])}
     gaits = vrw.limit_cycles(params, model=walker)
     assert gaits.outcome.tolist() == [0, vrw.Outcome.BAD_INPUT, 0]
     np.testing.assert_allclose(gaits.section_state[:, 0], [2.0, 0.0, 4.0], rtol=1e-12)
@@ -91,13 +49,13 @@ def test_a_batch_has_the_gaits_of_single_searches():
 def test_the_first_start_that_leads_to_a_gait_is_taken():
     starts = lambda p: jnp.array([[-3.0], [1.0]])  # the ball that moves down never flies
     walker = dataclasses.replace(BALL_SYSTEM, starts=starts)
-    assert vrw.limit_cycle(PARAMS, model=walker).converged
+    assert vrw.limit_cycle(BALL_PARAMS, model=walker).converged
 
 
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_sensitivities_are_the_derivatives_of_the_closed_form(walker):
     """v = k / (1 - e), T = 2 v / g and h = v^2 / 2 g."""
-    table = vrw.sensitivities(PARAMS, model=walker)
+    table = vrw.sensitivities(BALL_PARAMS, model=walker)
     assert table.measure.values.tolist() == ["period", "velocity", "height"]
     assert table.parameter.values.tolist() == ["ball.restitution", "kick"]
     assert table.measure_unit.values.tolist() == ["s", "m/s", "m"]
@@ -109,29 +67,29 @@ def test_sensitivities_are_the_derivatives_of_the_closed_form(walker):
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_a_walk_takes_a_parameter_for_each_step_and_a_batch_walks_as_one(walker):
     kicks = np.array([1.0, 0.5, 0.0])
-    walk = vrw.walk(PARAMS | {"kick": kicks}, [2.0], 3, model=walker)
+    walk = vrw.walk(BALL_PARAMS | {"kick": kicks}, [2.0], 3, model=walker)
     np.testing.assert_allclose(walk.steps.section_state[:, 0], [2.0, 1.5, 0.75], rtol=1e-12)
     assert int(walk.n_stepped) == 3
-    batch = vrw.step_batch(PARAMS | {"kick": kicks}, np.array([2.0]), 3, model=walker)
+    batch = vrw.step_batch(BALL_PARAMS | {"kick": kicks}, np.array([2.0]), 3, model=walker)
     expected = 0.125 * 2.0 + kicks * 1.75
     np.testing.assert_allclose(batch.section_state[:, 0], expected, rtol=1e-12)
     assert batch.n_stepped.tolist() == [3, 3, 3]
 
 
 def test_a_simulation_shows_the_flights_of_a_ball():
-    walk = vrw.simulate(PARAMS, [2.0], 2, model=BALL_SYSTEM, n_samples=3)
+    walk = vrw.simulate(BALL_PARAMS, [2.0], 2, model=BALL_SYSTEM, n_samples=3)
     half = 2.0 / GRAVITY
     np.testing.assert_allclose(walk.time, half * np.array([0, 1, 2, 2, 3, 4]), rtol=1e-12)
     top = 2.0 / GRAVITY
     np.testing.assert_allclose(walk.height, [0, top, 0, 0, top, 0], atol=1e-12)
     assert walk.velocity.attrs["units"] == "m/s"
     with pytest.raises(TypeError, match=r"vrw\.walk"):
-        vrw.simulate(PARAMS, [2.0], 2, model=JuggledBall())
+        vrw.simulate(BALL_PARAMS, [2.0], 2, model=JuggledBall())
 
 
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_every_start_is_in_the_basin_of_a_stable_gait(walker):
-    basin = vrw.basin(PARAMS, {"velocity": [0.5, 1.0, 5.0]}, model=walker)
+    basin = vrw.basin(BALL_PARAMS, {"velocity": [0.5, 1.0, 5.0]}, model=walker)
     assert basin.attractor.values.tolist() == [0, 0, 0]
     np.testing.assert_allclose(basin.orbit_state.values[0, 0], [2.0], atol=1e-6)
 
@@ -141,7 +99,7 @@ def test_a_scan_has_the_closed_form_and_its_derivatives_and_knows_the_code(tmp_p
     design = vrw.grid({"kick": [0.5, 1.0, -1.0], "ball.restitution": [0.5, 0.6]})
     names = ["period", "d period / d ball.restitution"]
     scan = lambda walker: vrw.scan(
-        design, names, base=PARAMS, model=walker, store=tmp_path / "scan", chunk=2
+        design, names, base=BALL_PARAMS, model=walker, store=tmp_path / "scan", chunk=2
     )
     result = scan(JuggledBall())
     kick, e = np.meshgrid([0.5, 1.0], [0.5, 0.6], indexing="ij")
@@ -164,7 +122,9 @@ def test_a_scan_has_the_closed_form_and_its_derivatives_and_knows_the_code(tmp_p
 
 def test_a_sample_of_a_scan_does_not_depend_on_others():
     kicks = np.linspace(0.5, 1.0, 70)
-    scan = lambda kicks: vrw.scan(vrw.samples(kick=kicks), base=PARAMS, model=BALL_SYSTEM).period
+    scan = lambda kicks: (
+        vrw.scan(vrw.samples(kick=kicks), base=BALL_PARAMS, model=BALL_SYSTEM).period
+    )
     np.testing.assert_array_equal(scan(kicks)[65:], scan(kicks[65:]))
 
 
@@ -172,7 +132,7 @@ def test_tuning_ends_at_the_limit_of_a_measure_with_its_multiplier():
     """T = sqrt(8 h / g), so that at a height of 0.5 m the price is dT/dh = T / 2 h."""
     bounds = {"kick": (0.5, 2.0), "ball.restitution": (0.2, 0.8)}
     tuned = vrw.tune(
-        PARAMS, "period", [*bounds], bounds, {"height": (None, 0.5)}, model=JuggledBall()
+        BALL_PARAMS, "period", [*bounds], bounds, {"height": (None, 0.5)}, model=JuggledBall()
     )
     period = np.sqrt(8.0 * 0.5 / GRAVITY)
     assert tuned.converged
@@ -184,39 +144,42 @@ def test_tuning_ends_at_the_limit_of_a_measure_with_its_multiplier():
     assert "kick" in str(tuned)
 
 
+KICKS = BALL_PARAMS | {"kick": np.ones(2)}
 CALLS = {
-    "walker.step": lambda: BALL_SYSTEM.step(PARAMS, [2.0]),
-    "step_batch": lambda: BALL_SYSTEM.step_batch(PARAMS, [[2.0]]),
-    "simulate": lambda: BALL_SYSTEM.simulate(PARAMS, [0.0, 2.0], events=1),
-    "simulate_batch": lambda: BALL_SYSTEM.simulate_batch(PARAMS, [[0.0, 2.0]], events=1),
-    "vrw.step": lambda: vrw.step(PARAMS, [2.0], model=BALL_SYSTEM),
-    "vrw.walk": lambda: vrw.walk(PARAMS, [2.0], 3, model=BALL_SYSTEM),
-    "vrw.step_batch": lambda: vrw.step_batch(PARAMS, np.array([[2.0]]), model=BALL_SYSTEM),
-    "vrw.simulate": lambda: vrw.simulate(PARAMS, None, 2, model=BALL_SYSTEM, n_samples=3),
-    "vrw.basin": lambda: vrw.basin(PARAMS, {"velocity": [0.5, 5.0]}, model=BALL_SYSTEM),
-    "walker.return_map(params)": lambda: BALL_SYSTEM.return_map(PARAMS)(jnp.array([2.0])),
+    "walker.step": lambda: BALL_SYSTEM.step(BALL_PARAMS, [2.0]),
+    "step_batch": lambda: BALL_SYSTEM.step_batch(BALL_PARAMS, [[2.0]]),
+    "simulate": lambda: BALL_SYSTEM.simulate(BALL_PARAMS, [0.0, 2.0], events=1),
+    "simulate_batch": lambda: BALL_SYSTEM.simulate_batch(BALL_PARAMS, [[0.0, 2.0]], events=1),
+    "vrw.step": lambda: vrw.step(BALL_PARAMS, [2.0], model=BALL_SYSTEM),
+    "vrw.walk": lambda: vrw.walk(BALL_PARAMS, [2.0], 3, model=BALL_SYSTEM),
+    "vrw.step_batch": lambda: vrw.step_batch(BALL_PARAMS, np.array([[2.0]]), model=BALL_SYSTEM),
+    "vrw.simulate": lambda: vrw.simulate(BALL_PARAMS, None, 2, model=BALL_SYSTEM, n_samples=3),
+    "vrw.basin": lambda: vrw.basin(BALL_PARAMS, {"velocity": [0.5, 5.0]}, model=BALL_SYSTEM),
+    "walker.return_map(params)": lambda: BALL_SYSTEM.return_map(BALL_PARAMS)(jnp.array([2.0])),
     "vrw.solve_fixed_point": lambda: vrw.solve_fixed_point(
-        BALL_SYSTEM.return_map(PARAMS), jnp.array([1.0])
+        BALL_SYSTEM.return_map(BALL_PARAMS), jnp.array([1.0])
     ),
     "vrw.continue_map": lambda: vrw.continue_map(
-        lambda _, x, kick: BALL_SYSTEM.return_map(PARAMS | {"kick": kick})(x),
+        lambda _, x, kick: BALL_SYSTEM.return_map(BALL_PARAMS | {"kick": kick})(x),
         jnp.array([2.0]),
         1.0,
         (0.9, 1.1),
     ),
-    "vrw.limit_cycle": lambda: vrw.limit_cycle(PARAMS, model=BALL_SYSTEM),
-    "vrw.limit_cycles": lambda: vrw.limit_cycles(PARAMS | {"kick": np.ones(1)}, model=BALL_SYSTEM),
-    "vrw.sensitivities": lambda: vrw.sensitivities(PARAMS, model=BALL_SYSTEM),
+    "vrw.limit_cycle": lambda: vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM),
+    "vrw.limit_cycles": lambda: vrw.limit_cycles(
+        BALL_PARAMS | {"kick": np.ones(1)}, model=BALL_SYSTEM
+    ),
+    "vrw.sensitivities": lambda: vrw.sensitivities(BALL_PARAMS, model=BALL_SYSTEM),
     "vrw.continue_branch": lambda: vrw.continue_branch(
-        PARAMS,
+        BALL_PARAMS,
         "kick",
         (0.9, 1.1),
         model=BALL_SYSTEM,
-        cycle=vrw.limit_cycle(PARAMS, model=BALL_SYSTEM),
+        cycle=vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM),
     ),
-    "vrw.scan": lambda: vrw.scan(vrw.samples(kick=[1.0]), base=PARAMS, model=BALL_SYSTEM),
+    "vrw.scan": lambda: vrw.scan(vrw.samples(kick=[1.0]), base=BALL_PARAMS, model=BALL_SYSTEM),
     "vrw.tune": lambda: vrw.tune(
-        PARAMS, "period", ["kick"], {"kick": (0.9, 1.1)}, model=BALL_SYSTEM
+        BALL_PARAMS, "period", ["kick"], {"kick": (0.9, 1.1)}, model=BALL_SYSTEM
     ),
 }
 FOR_WHEELS_ONLY = ("vrw.first_passage", "vrw.smallest_disturbance", "vrw.gait_sensitivity")
@@ -244,10 +207,13 @@ def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels
     [
         (lambda: vrw.limit_cycle({"slope": 0.009}, model=SIMPLEST_WALKER), "starts="),
         (lambda: vrw.sensitivities({"slope": 0.009}, model=SIMPLEST_WALKER), "starts="),
-        (lambda: vrw.limit_cycles(PARAMS, model=JuggledBall()), "one common length"),
+        (lambda: vrw.limit_cycles(BALL_PARAMS, model=JuggledBall()), "one common length"),
         (lambda: vrw.limit_cycle({"kick": np.ones(1)}, model=JuggledBall()), "limit_cycles"),
-        (lambda: vrw.walk(PARAMS | {"kick": np.ones(2)}, [2.0], 3, model=JuggledBall()), "shape"),
-        (lambda: vrw.basin(PARAMS, {"speed": 1.0}, model=JuggledBall()), "velocity"),
+        (
+            lambda: vrw.walk(KICKS, [2.0], 3, model=JuggledBall()),
+            "shape",
+        ),
+        (lambda: vrw.basin(BALL_PARAMS, {"speed": 1.0}, model=JuggledBall()), "velocity"),
         (lambda: vrw.first_passage(vrw.WheelParams(), 0.01, model=JuggledBall()), "of yours"),
     ],
 )

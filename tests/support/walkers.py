@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 
+import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, HybridSystem, Mode
 
 
@@ -41,3 +42,45 @@ SIMPLEST_WALKER = HybridSystem(
     embed=lambda x, p: jnp.stack([x[0], x[1], 2.0 * x[0], (1.0 - jnp.cos(2.0 * x[0])) * x[1]]),
 )
 """Simplest walking model of Garcia, Chatterjee, Ruina and Coleman (1998)."""
+
+GRAVITY = 9.81
+BALL_PARAMS = {"ball": {"restitution": 0.5}, "kick": 1.0}
+
+
+@vrw.measure("height", unit="m", meaning="height of the flight")
+def flight_height(step, params):
+    return GRAVITY / 8.0 * step.duration**2
+
+
+class JuggledBall(vrw.AbstractWalker):
+    coordinates = {"velocity": "m/s"}  # noqa: RUF012
+    measures = (flight_height,)
+
+    def advance(self, params, x, options):
+        v = params["ball"]["restitution"] * x + params["kick"]
+        return vrw.AdvanceResult(v, 2.0 * v / GRAVITY, jnp.where(v[0] > 0.0, 0, 3))
+
+    def starts(self, params):
+        return jnp.array([1.0])
+
+
+def bounce(y, p):
+    return jnp.stack([0.0 * y[0], -p["ball"]["restitution"] * y[1] + p["kick"]])
+
+
+BALL_SYSTEM = HybridSystem(
+    modes={
+        "flight": Mode(
+            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
+            {"bounce": Guard(lambda y, p: y[0], bounce)},
+        )
+    },
+    section="bounce",
+    state={"height": "m", "velocity": "m/s"},
+    coordinates={"velocity": "m/s"},
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
+    starts=lambda p: jnp.array([1.0]),
+    measures=(flight_height,),
+)
+"""Ball that a racket kicks: v' = e v + k, so that a gait has v = k / (1 - e)."""

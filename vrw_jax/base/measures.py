@@ -81,6 +81,22 @@ class Measure:
         return f"{float(np.asarray(measured_value)):.6g} {self.display_unit}".strip()
 
 
+def find_own_measures(measures: Any) -> dict[str, Measure]:
+    """Return the measures of the user among names and measures, by name."""
+    given = () if measures is None or isinstance(measures, str) else measures
+    given = (given,) if isinstance(given, Measure) else given
+    return {measure.name: measure for measure in given if isinstance(measure, Measure)}
+
+
+def name_measures(measures: Any) -> Any:
+    """Return names and measures with the name of each measure of the user in its place."""
+    if isinstance(measures, Measure):
+        return (measures.name,)
+    if isinstance(measures, list | tuple):
+        return [getattr(measure, "name", measure) for measure in measures]
+    return measures
+
+
 def measure(
     name: str,
     *,
@@ -90,19 +106,23 @@ def measure(
     phase: str = "",
     reduction: str = "",
 ) -> Callable[[Callable[..., Any]], Measure]:
-    """Declare a function as a measure of the gaits of your own walker.
+    """Declare a function as a measure of gaits, of the paper's wheel or of your own walker.
 
     A measure without a phase is a function of a step and of the parameters. A measure of a phase is
-    a function of the state and of the parameters, whose integral or mean over the phase is computed
-    with the motion, to the same accuracy. Give it to the walker, as `measures=(cost,)`. Its name
-    then works in sensitivities, scans and tuning, and it has derivatives.
+    a function of the motion at one instant and of the parameters, whose integral or mean over the
+    phase is as accurate as the motion and has derivatives. For the wheel, the instant has `motion`,
+    `acceleration`, `fore_force` and `rear_force`, and the phases are "DLS", "SLS-I" and "SLS-II".
+    For a `HybridSystem`, the instant is the state, and the phases are the modes.
+
+    Give the measure to `vrw.scan`, `vrw.tune`, `vrw.sensitivities` or `cycle.measure`, or to your
+    own walker as `measures=(cost,)`. Its value for several steps is the mean over the steps.
 
     Args:
         name: name of the measure.
         unit: SI unit, "1" for a pure number.
         meaning: what is measured, for printed results and datasets.
         symbol: symbol in figures; by default the name.
-        phase: name of the mode over which the function is integrated.
+        phase: name of the phase or mode over which the function is integrated.
         reduction: "integral" or "mean" over the phase.
 
     Returns:

@@ -188,6 +188,10 @@ class HybridSystem(AbstractWalker):
                 if guard.target_mode is not None:
                     require_known_name(guard.target_mode, tuple(self.modes), "mode")
         require_known_name(self.section, tuple(self.guard_names), "guard")
+        for measure in self.measures:
+            check_type("a measure", measure, Measure, "decorate its function with vrw.measure")
+            if measure.phase:
+                require_known_name(measure.phase, tuple(self.modes), "mode")
         if len(self._start_modes) > 1:
             raise ValueError(
                 f"{self.section!r} leads to the modes {sorted(self._start_modes)}, but each step "
@@ -201,6 +205,20 @@ class HybridSystem(AbstractWalker):
     def __repr__(self) -> str:
         modes = ", ".join(f"{name}: {'/'.join(mode.guards)}" for name, mode in self.modes.items())
         return f"HybridSystem({modes}; section {self.section!r})"
+
+    def measure_step(
+        self, params: Any, x: Array, step: HybridStep, options: StepOptions
+    ) -> dict[str, Array]:
+        of_modes = tuple(measure for measure in self.measures if measure.phase)
+        values = {m.name: jnp.asarray(m(step, params)) for m in self.measures if not m.phase}
+        if not of_modes:
+            return values
+        end = compile_step(_append_integrals(self, of_modes))(params, x, options)
+        for measure, integral in zip(of_modes, end.section_state[len(self.state) :], strict=True):
+            duration = end.mode_durations[self._find_mode(measure.phase)]
+            divisor = jnp.where(duration > 0.0, duration, 1.0)
+            values[measure.name] = integral / divisor if measure.reduction == "mean" else integral
+        return values
 
     @property
     def guard_names(self) -> tuple[str, ...]:
@@ -414,6 +432,48 @@ class HybridSystem(AbstractWalker):
                 f"{function_name} gives {getattr(result, 'shape', type(result).__name__)}, but the "
                 f"coordinates of the state are {self.state}: give an array of shape {shape}."
             )
+
+
+@functools.lru_cache
+def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> HybridSystem:
+    """Return the system whose state also contains the integrals of measures over their modes.
+
+    The solver steps then control the errors of the integrals as those of the state.
+    """
+    n = len(system.state)
+
+    def append_rates(mode_name: str, field: Any) -> Callable:
+        def evaluate(y: Array, params: Any) -> Array:
+            rates = [
+                measure(y[:n], params) if measure.phase == mode_name else 0.0 * y[0]
+                for measure in measures
+            ]
+            return jnp.concatenate([field(y[:n], params), jnp.stack(rates)])
+
+        return evaluate
+
+    def extend_guard(guard: Guard) -> Guard:
+        return Guard(
+            lambda y, params: guard.evaluate(y[:n], params),
+            lambda y, params: jnp.concatenate([guard.reset(y[:n], params), y[n:]]),
+            guard.target_mode,
+        )
+
+    return HybridSystem(
+        modes={
+            name: Mode(
+                append_rates(name, mode.field),
+                {guard_name: extend_guard(guard) for guard_name, guard in mode.guards.items()},
+            )
+            for name, mode in system.modes.items()
+        },
+        section=system.section,
+        state=(*system.state, *(measure.name for measure in measures)),
+        embed=lambda x, params: jnp.concatenate(
+            [system.embed(x, params), jnp.zeros(len(measures)) + 0.0 * x[0]]
+        ),
+        max_events=system.max_events,
+    )
 
 
 @functools.lru_cache

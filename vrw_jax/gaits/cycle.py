@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.base.checks import check_choice
+from vrw_jax.base.measures import Measure, name_measures
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     AbstractPrintable,
@@ -263,29 +264,38 @@ class AbstractCycle(AbstractPrintable):
 
     @announce_wait("the measure of a gait", "20 s")
     @with_default_jax_settings
-    def measure(self, measure_name: str) -> Array:
+    def measure(self, measure_name: str | Measure) -> Array:
         """Return the measure that `CYCLE_MEASURE_FUNCTIONS` computes for this name.
+
+        A measure of your own, see `vrw.measure`, is a mean over the gait steps of the cycle.
 
         Durations are sums over the gait steps of the cycle, and indicators are minima over the gait
         steps. Batch axes come first.
         """
+        if isinstance(measure_name, Measure):
+            return self._zero_without_gait(self._evaluate_own_measure(measure_name))
         return CYCLE_MEASURE_FUNCTIONS[
             check_choice("the measure", measure_name, tuple(CYCLE_MEASURE_FUNCTIONS))
         ](self)
 
     @announce_wait("measures of a gait", "20 s")
-    def measures(self, measure_names: Iterable[str]) -> dict[str, Array]:
+    def measures(self, measure_names: Iterable[str | Measure]) -> dict[str, Array]:
         """Return the requested measures by name. Only these measures are traced."""
         measure_names = tuple(measure_names)
         force_peaks = (
             {} if FORCE_PEAK_MEASURES.keys().isdisjoint(measure_names) else self.force_peaks
         )
         return {
-            measure_name: force_peaks[measure_name]
-            if measure_name in force_peaks
-            else self.measure(measure_name)
-            for measure_name in measure_names
+            name: force_peaks[name] if name in force_peaks else self.measure(measure)
+            for measure, name in zip(measure_names, name_measures(measure_names), strict=True)
         }
+
+    def _evaluate_own_measure(self, measure: Measure) -> Array:
+        """Return the value of a measure of the user, which is undefined without a gait."""
+        raise ValueError(
+            f"{measure.name} is a measure of your own, but it is known for gaits of the paper's "
+            "model and of your own walkers only: take model=vrw.ViscoelasticWheel()."
+        )
 
     @property
     def force_peaks(self) -> dict[str, Array]:

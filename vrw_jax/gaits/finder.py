@@ -224,14 +224,14 @@ class AbstractGaitFinder(eqx.Module):
         return cycle_guess
 
     def measure_gait(
-        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
+        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[Any, ...]
     ) -> "GaitMeasures":
         """Return measures of the gait near `cycle_guess`, and their derivatives.
 
         `measure_names` is a selection of `differentiable_measures`. Derivatives of stability
         measures are second derivatives of the motion.
         """
-        if set(measure_names) <= set(self.cycle_measures):
+        if all(isinstance(x, Measure) or x in self.cycle_measures for x in measure_names):
             return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
         start_state = (
             self.make_initial_guess(parameter_values)
@@ -268,14 +268,14 @@ class AbstractGaitFinder(eqx.Module):
         return type(self).read_measure
 
     @classmethod
-    def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:
+    def read_measure(cls, measure_name: Any, cycle: AbstractCycle, step: AbstractStep) -> Array:
         """Return the measure of a gait with the given name.
 
         Margins of locked legs have one value per leg.
         """
         return (
             cycle.measure(measure_name)
-            if measure_name in cls.cycle_measures
+            if isinstance(measure_name, Measure) or measure_name in cls.cycle_measures
             else step.measures()[measure_name]
         )
 
@@ -296,7 +296,7 @@ def compute_cycle_measures(
     gait_finder: AbstractGaitFinder,
     parameter_values: ParameterValues,
     cycle_guess: Any,
-    measure_names: tuple[str, ...],
+    measure_names: tuple[Any, ...],
 ) -> GaitMeasures:
     """Return measures that depend only on the cycle, and their derivatives."""
 
@@ -370,7 +370,7 @@ class MeasureReader:
     """Function that maps a cycle and a step to the measures with the names `measure_names`."""
 
     read_measure: GaitMeasureReader
-    measure_names: tuple[str, ...]
+    measure_names: tuple[Any, ...]
 
     def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> dict[str, Array]:
         # One search locates all force peaks.
@@ -378,7 +378,7 @@ class MeasureReader:
             name for name in self.measure_names if name in FORCE_PEAK_MEASURES
         )
         return {
-            measure_name: force_peaks[measure_name]
+            getattr(measure_name, "name", measure_name): force_peaks[measure_name]
             if measure_name in force_peaks
             else self.read_measure(measure_name, cycle, step)
             for measure_name in self.measure_names
@@ -386,7 +386,7 @@ class MeasureReader:
 
 
 def compute_gait_measures(
-    gait: Gait, read_measure: Callable, measure_names: tuple[str, ...]
+    gait: Gait, read_measure: Callable, measure_names: tuple[Any, ...]
 ) -> GaitMeasures:
     """Return measures of a gait and their derivatives, computed from the gait's stored
     derivatives.
@@ -395,7 +395,7 @@ def compute_gait_measures(
         MeasureReader(read_measure, measure_names), gait
     )
     stack_measures = lambda parameter_values: jnp.stack(
-        [parameter_values[measure_name] for measure_name in measure_names], -1
+        [parameter_values[getattr(name, "name", name)] for name in measure_names], -1
     )
     return GaitMeasures(
         stack_measures(measure_values), stack_measures(measure_tangents).T, gait.cycle.outcome

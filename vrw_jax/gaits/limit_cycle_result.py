@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.base.checks import require_known_name
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import LabelAndText, format_numbers
@@ -27,7 +29,7 @@ from vrw_jax.gaits.collocation_search import (
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import attach_monodromy_derivatives, solve_cycle_with_derivatives
 from vrw_jax.gaits.force_peaks import evaluate_force_peaks, locate_force_extrema
-from vrw_jax.gaits.gauss import N_GAUSS_NODES, transfer_accelerations
+from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.gaits.slope_response import (
@@ -44,7 +46,7 @@ from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import Motion
 from vrw_jax.wheel.params import WheelParams, stack_parameters
-from vrw_jax.wheel.phases import make_paper_phases
+from vrw_jax.wheel.phases import PAPER_PHASES, PhaseInstant, make_paper_phases
 
 
 class LimitCycle(AbstractCycle):
@@ -184,6 +186,12 @@ class LimitCycle(AbstractCycle):
             self.map_over_batch_axes(compute_sensitivity_norm)(self.slope_response)
         )
 
+    def _evaluate_own_measure(self, measure: Measure) -> Array:
+        evaluate = functools.partial(_evaluate_own_measure, measure, self.system, self.model)
+        return self.map_over_batch_axes(evaluate)(
+            self.parameters, self.collocation_state.solution, self.section_state
+        )
+
     def _locate_force_peaks(self) -> dict[str, Array]:
         locate, evaluate = (
             self.map_over_batch_axes(functools.partial(function, self.system))
@@ -232,6 +240,49 @@ class LimitCycle(AbstractCycle):
             ("durations of DLS, SLS-I, SLS-II", f"{format_numbers(self.durations)} s"),
             ("indicators λ_I4, λ2⁺, λ4⁺", indicator_text),
         ]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _evaluate_own_measure(
+    measure: Measure,
+    system: CollocationSystem,
+    model: ViscoelasticWheel,
+    parameters: Array,
+    solution: CollocationSolution,
+    section_state: Array,
+) -> Array:
+    """Return a measure of the user, as the mean over the gait steps.
+
+    The Gauss nodes of a phase integrate a function of its motion as accurately as the collocation
+    integrates the motion: both have order 8.
+    """
+    params = system.make_wheel(parameters)
+    if not measure.phase:
+        if system.period_n > 1:
+            raise ValueError(
+                f"{measure.name} is a function of a step, but the cycle has {system.period_n}: "
+                "give it a phase, or compute the steps by vrw.walk."
+            )
+        return jnp.asarray(measure(step(params, section_state, model=model), params))
+    phase_names = [phase.phase_name for phase in PAPER_PHASES]
+    require_known_name(measure.phase, phase_names, "phase")
+    index = phase_names.index(measure.phase)
+    mesh = system.phase_meshes[index]
+    weights = jnp.ravel(mesh.interval_length_fractions[:, None] * END_WEIGHTS)
+    values = []
+    for durations, points in zip(
+        solution.durations, system.evaluate_phase_points(parameters, solution), strict=True
+    ):
+        phase = make_paper_phases(
+            params.symbols(), points[0].phase_start_point.held_constants[0], stop_at_lift_off=False
+        )[index]
+        evaluate = lambda q, v, phase=phase: jnp.asarray(
+            measure(PhaseInstant(phase, phase.compute_motion(q, v)), params)
+        )
+        nodes = points[index].node_points
+        mean = weights @ jax.vmap(evaluate)(nodes.q, nodes.v)
+        values.append(mean if measure.reduction == "mean" else durations[index] * mean)
+    return sum(values[1:], start=values[0]) / len(values)
 
 
 _attach_monodromy_compiled = jax.jit(attach_monodromy_derivatives, static_argnums=0)

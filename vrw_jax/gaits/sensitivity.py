@@ -9,6 +9,7 @@ import numpy as np
 
 from vrw_jax.base.checks import check_names, format_name_suggestion, require_untraced_arguments
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure, find_own_measures, name_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
@@ -26,7 +27,7 @@ from vrw_jax.models.stepping import ModelLike
 def sensitivities(
     params: Any,
     *,
-    measures: Sequence[str] | None = None,
+    measures: Sequence[str | Measure] | None = None,
     guess: Any = None,
     model: ModelLike | None = None,
     options: CycleOptions | StepOptions | None = None,
@@ -42,7 +43,8 @@ def sensitivities(
 
     Args:
         params: the wheel, or the parameters of a walker of yours.
-        measures: names of measures; by default all measures of the model's gait.
+        measures: names of measures, or measures of your own, see `vrw.measure`; by default all
+            measures of the model's gait.
         guess: as in `limit_cycle`.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: as in `limit_cycle`.
@@ -64,9 +66,14 @@ def sensitivities(
         model = resolve_model(params, model)  # type: ignore[arg-type]
     gait_finder = resolve_finder(params, model, options, guess=guess)
     measure_names = (
-        gait_finder.default_measures if measures is None else check_names("measures", measures)
+        gait_finder.default_measures
+        if measures is None
+        else check_names("measures", name_measures(measures))
     )
-    unknown_names = sorted(set(measure_names) - set(gait_finder.differentiable_measures))
+    own_measures = find_own_measures(measures) if gait_finder.model.is_wheel else {}
+    unknown_names = sorted(
+        set(measure_names) - set(gait_finder.differentiable_measures) - own_measures.keys()
+    )
     if unknown_names or not measure_names:
         raise ValueError(
             f"measures holds {', '.join(unknown_names) or 'nothing'}"
@@ -75,7 +82,9 @@ def sensitivities(
             f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )
     parameter_values = gait_finder.model.collect_parameter_values(params)
-    gait_measures = gait_finder.measure_gait(parameter_values, guess, measure_names)
+    gait_measures = gait_finder.measure_gait(
+        parameter_values, guess, tuple(own_measures.get(name, name) for name in measure_names)
+    )
     if int(gait_measures.outcome) != Outcome.STEPPED:
         failure_outcome = Outcome(int(gait_measures.outcome))
         raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
@@ -87,6 +96,7 @@ def sensitivities(
         )
     table_axes = ("measure", "parameter")
     parameter_names = gait_finder.model.parameter_names
+    unit_of = lambda name: (own_measures.get(name) or gait_finder.get_measure(name)).unit
     return xr.Dataset(
         {
             "value": ("measure", measure_values),
@@ -102,7 +112,7 @@ def sensitivities(
             ),
             "measure_unit": (
                 "measure",
-                [gait_finder.get_measure(name).unit for name in measure_names],
+                [unit_of(name) for name in measure_names],
             ),
             "parameter_unit": (
                 "parameter",

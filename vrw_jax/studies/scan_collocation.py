@@ -21,6 +21,7 @@ from jaxtyping import Array
 
 from vrw_jax import lanes
 from vrw_jax.base import batch_sizes
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_search import CollocationState
@@ -64,6 +65,7 @@ class EvaluationRequest(NamedTuple):
     error_tolerance: float | None
     # standard deviation of random slopes, rad; None for a scan without measures of such walks
     slope_standard_deviation: float | None = None
+    own_measures: tuple[Measure, ...] = ()  # measures of the user, whose names may be requested
 
     @property
     def requested_derivatives(self) -> tuple[MeasureDerivative, ...]:
@@ -104,6 +106,8 @@ class CollocationScanEngine:
         self._n_threads = n_threads or lanes.count_available_cores()
         self._evaluation_request = evaluation_request
         requested_derivatives = evaluation_request.requested_derivatives
+        own_measures = {measure.name: measure for measure in evaluation_request.own_measures}
+        find_measure = lambda name: own_measures.get(name, name)
         differentiation_parameters = list(
             dict.fromkeys(derivative.parameter_name for derivative in requested_derivatives)
         )
@@ -137,7 +141,7 @@ class CollocationScanEngine:
                     starts_only_from_guess=bool(search_start),
                 )
                 return limit_cycle.measures(
-                    derivative.measure_name for derivative in requested_derivatives
+                    find_measure(derivative.measure_name) for derivative in requested_derivatives
                 ), limit_cycle
 
             mesh_finder = dataclasses.replace(gait_finder, cycle_options=cycle_options)
@@ -147,9 +151,9 @@ class CollocationScanEngine:
                 parameter_values[differentiated_parameter_indices]
             )
             cycle_measure_names = [
-                measure_name
+                find_measure(measure_name)
                 for measure_name in measure_names
-                if measure_name in DIFFERENTIABLE_MEASURES
+                if measure_name in DIFFERENTIABLE_MEASURES or measure_name in own_measures
             ]
             measures = limit_cycle.measures([*cycle_measure_names, "spectral_radius"]) | {
                 derivative.variable_name: measure_jacobian[derivative.measure_name][

@@ -18,6 +18,7 @@ from typing import Any
 
 from vrw_jax.base.checks import check_callable, check_path
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait, report_progress
@@ -61,7 +62,7 @@ class ScanProgress:
 @announce_wait("batches of gaits and gait steps", "15 s")
 def scan(
     design: AbstractSampleDesign,
-    measures: Iterable[str] | None = None,
+    measures: Iterable[str | Measure] | Measure | None = None,
     *,
     base: Any = None,
     model: ModelLike | None = None,
@@ -96,7 +97,8 @@ def scan(
 
     Args:
         design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
-        measures: names of the measures; by default DLS fraction, speed and similar measures.
+        measures: names of the measures, or measures of your own, see `vrw.measure`; by default DLS
+            fraction, speed and similar measures.
         base: wheel with the parameters that are not swept; by default that of Table 1 of the
             paper. For a walker of yours, its parameters.
         model: model of the wheel; "auto" for the simplest valid model for each sample.

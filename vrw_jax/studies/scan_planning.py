@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import platform
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from vrw_jax import lanes
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_names, check_positive, check_type
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure, find_own_measures, name_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.walker import check_parameters, is_own_walker
 from vrw_jax.gaits.finder_selection import make_finder
@@ -151,6 +152,10 @@ class ScanPlan:
         }
         if request.error_tolerance is not None:
             scan_settings["tol"] = request.error_tolerance
+        if request.own_measures:
+            scan_settings["own_measures"] = {
+                x.name: _identify_code(x) for x in request.own_measures
+            }
         if request.slope_standard_deviation is not None:
             scan_settings["slope_sd"] = request.slope_standard_deviation
         return scan_settings
@@ -181,7 +186,7 @@ class ScanPlan:
 
 def plan_scan(
     design: AbstractSampleDesign,
-    measures: Iterable[str] | None = None,
+    measures: Iterable[str | Measure] | Measure | None = None,
     *,
     base: Any = None,
     model: Any = None,
@@ -266,8 +271,21 @@ def plan_scan(
         measure_catalog = MeasureCatalog(
             names, ("outcome", "spectral_radius"), names, model.parameter_names, names, 64
         )
+    own_measures = find_own_measures(measures) if model.is_wheel else {}
+    if own_measures:
+        if not gait_finder.supports_cold_start or tol is not None:
+            raise ValueError(
+                f"{', '.join(own_measures)} is a measure of your own, but it is known for gaits of "
+                "the paper's model only: take model=vrw.ViscoelasticWheel(), and no tol."
+            )
+        measure_catalog = measure_catalog._replace(
+            requestable_measures=(*measure_catalog.requestable_measures, *own_measures),
+            differentiable_measures=(*measure_catalog.differentiable_measures, *own_measures),
+        )
     requested_measures = (
-        measure_catalog.default_measures if measures is None else check_names("measures", measures)
+        measure_catalog.default_measures
+        if measures is None
+        else check_names("measures", name_measures(measures))
     )
     measure_names = check_measure_names(requested_measures, measure_catalog)
     variable_names = []
@@ -278,9 +296,12 @@ def plan_scan(
     variable_names += measure_catalog.always_included_variables
     cycle_options = getattr(gait_finder, "cycle_options", cycle_options or CycleOptions())
     evaluation_request = EvaluationRequest(
-        measure_names, base, model, options, cycle_options, tol, slope_sd
+        measure_names, base, model, options, cycle_options, tol, slope_sd,
+        tuple(own_measures.values()),
+    )  # fmt: skip
+    result_layout = _make_result_layout(
+        design, variable_names, base, gait_finder, own_measures, dtype, chunk
     )
-    result_layout = _make_result_layout(design, variable_names, base, gait_finder, dtype, chunk)
     return ScanPlan(
         design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
     )
@@ -346,6 +367,8 @@ def describe_settings_difference(
         return ""
     if setting_name == "design.digest":
         return "the values of the swept parameters differ"
+    if setting_name.startswith("own_measures."):
+        return f"the code of {setting_name.removeprefix('own_measures.')} differs"
     if setting_name == "model.walker" or setting_name.removeprefix("model.") in LAW_NAMES:
         return f"the code of {setting_name.removeprefix('model.')} differs"
     if setting_name == "code":
@@ -358,6 +381,7 @@ def _make_result_layout(
     variable_names: Iterable[str],
     base_wheel: Any,
     gait_finder: Any,
+    own_measures: Mapping[str, Measure],
     dtype: np.dtype,
     chunk_size: int,
 ) -> ResultLayout:
@@ -369,15 +393,18 @@ def _make_result_layout(
     locked_leg_coordinate = make_locked_leg_coordinate(getattr(base_wheel, "n_legs", 2))
     domains = model.parameter_domains
 
-    def describe_variable(variable_name: str) -> dict[str, object]:
+    def describe_variable(variable_name: str) -> dict[str, Any]:
         derivative = parse_derivative(variable_name)
-        if model.is_wheel or variable_name in ("outcome", "spectral_radius"):
+        measure_name = variable_name if derivative is None else derivative.measure_name
+        is_known = model.is_wheel or variable_name in ("outcome", "spectral_radius")
+        if is_known and measure_name not in own_measures:
             return get_variable_attributes(variable_name)
+        measure: Any = own_measures.get(measure_name) or gait_finder.get_measure(measure_name)
         if derivative is None:
-            return gait_finder.get_measure(variable_name).variable_attributes
+            return measure.variable_attributes
         parameter_name = derivative.parameter_name
         return derivative.describe_variable(
-            gait_finder.get_measure(derivative.measure_name),
+            measure,
             describe_parameter(parameter_name, domains[parameter_name]),
         )
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import operator
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -29,6 +30,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
@@ -93,7 +95,7 @@ from vrw_jax.wheel.params import (
 ParameterBounds = Mapping[str, tuple[float, float]]
 """Lower and upper bound of each free parameter, by the parameter's name."""
 
-ObjectiveSpecification = str | Mapping[str, float] | Callable[..., Array] | WheelObjective
+ObjectiveSpecification = str | Measure | Mapping[str, float] | Callable[..., Array] | WheelObjective
 
 
 N_STEPS_OF_WALK = 10
@@ -146,9 +148,10 @@ def tune(
 
     Args:
         params: the start, one wheel, or the parameters of a walker of yours.
-        objective: quantity to maximize: name of a measure, weights of measures by name, or a
-            function of a LimitCycle. A function of two arguments also gets the cycle's StepResult.
-            A `WheelObjective` is a function of the wheel that is not compiled.
+        objective: quantity to maximize: name of a measure, a measure of your own (`vrw.measure`),
+            weights of measures by name, or a function of a LimitCycle. A function of two arguments
+            also gets the cycle's StepResult. A `WheelObjective` is a function of the wheel that is
+            not compiled.
         free: names of the parameters that may change.
         bounds: lower and upper bound of each free parameter.
         constraints: lower bounds of measures by name, or pairs of lower and upper bounds, of which
@@ -695,6 +698,10 @@ def _parse_objective_function(
     """
     if isinstance(objective, WheelObjective):
         return zero_objective, objective.label
+    if isinstance(objective, Measure) and gait_finder.model.is_wheel:
+        # For a walker of the user, which has the measure, its name suffices.
+        return CycleObjective(operator.methodcaller("measure", objective)), objective.name
+    objective = objective.name if isinstance(objective, Measure) else objective
     if callable(objective):
         if gait_finder.model.is_wheel and not gait_finder.supports_cold_start:
             raise TypeError(
