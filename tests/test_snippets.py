@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import vrw_jax as vrw
+from experiments.gallery.compare import PAGES as PAGES_OF_WALKERS
 
 ROOT = Path(__file__).parent.parent
 ELSEWHERE_MARKER = "<!-- runs elsewhere"
@@ -26,6 +27,7 @@ SLOW_PAGES = {
     "docs/explanation/batches.md", "docs/explanation/branches.md",
     "docs/explanation/contact_gaits.md", "docs/explanation/contact_model.md",
     "docs/explanation/numerics.md", "docs/explanation/tolerances.md",
+    *(f"docs/gallery/{page}.md" for page in PAGES_OF_WALKERS),
     "docs/howto/add_a_measure.md", "docs/howto/basins.md", "docs/howto/cluster.md",
     "docs/howto/export.md",
     "docs/howto/numpyro.md", "docs/howto/own_constraint.md", "docs/howto/robustness.md",
