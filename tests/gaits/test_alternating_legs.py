@@ -109,5 +109,9 @@ def test_force_peaks_and_stoppers_see_both_legs(cycle):
 def test_what_two_legs_cannot_do_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="a gait repeats after an even number of steps"):
         vrw.limit_cycle(PARAMS, model=make_wheel())
+    with pytest.raises(ValueError, match=r"the legs alternate, but vrw.basin compares"):
+        vrw.basin(
+            PARAMS, {"theta_post_impact": -0.7, "dtheta_post_impact": 1.1}, model=make_wheel()
+        )
     with pytest.raises(ValueError, match="n_legs is 7, but legs alternate only if"):
         vrw.step(vrw.WheelParams(n_legs=7), vrw.paper_start(), model=make_wheel())

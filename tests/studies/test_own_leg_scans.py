@@ -80,3 +80,32 @@ def test_tuning_moves_a_parameter_of_the_law_to_its_bound():
     assert abs(tuned.value - cycle.dls_fraction) < 1e-10
     assert "leg.c2 70 N s^2/m^2" in str(tuned)
     assert tuned.params.laws is None
+
+
+@pytest.mark.slow
+def test_studies_of_robustness_with_the_papers_law_as_a_law_are_those_of_the_paper():
+    starts = {
+        "theta_post_impact": np.linspace(-0.75, -0.6, 3),
+        "dtheta_post_impact": np.linspace(0.9, 1.6, 3),
+    }
+    box = {name: (values[0], values[-1]) for name, values in starts.items()}
+    studies = [
+        lambda model: vrw.first_passage(PARAMS, 0.03, model=model, n_walkers=256).mean_steps,
+        lambda model: vrw.basin(PARAMS, starts, model=model).outcome.values,
+        lambda model: vrw.gait_sensitivity(PARAMS, ["period"], model=model).norm,
+        lambda model: vrw.smallest_disturbance(PARAMS, model=model).size,
+        lambda model: vrw.basin_share(PARAMS, box, model=model, n_starts=64).share,
+    ]
+    for study in studies:  # A law evaluates the force in another order of operations.
+        expected, value = study(vrw.ViscoelasticWheel()), study(make_wheel(PaperLeg()))
+        np.testing.assert_allclose(value, expected, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_law_changes_lives_basins_and_disturbances():
+    light, heavy = make_wheel(QuadraticDamper(0.0)), make_wheel(QuadraticDamper(200.0))
+    for study in (
+        lambda model: vrw.first_passage(PARAMS, 0.03, model=model, n_walkers=256).mean_steps,
+        lambda model: vrw.gait_sensitivity(PARAMS, ["period"], model=model).norm[0],
+    ):
+        assert abs(study(light) - study(heavy)) > 1e-3 * study(light)

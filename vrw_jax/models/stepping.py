@@ -126,6 +126,15 @@ def require_compliant_model(model: Any, computation_text: str, command_name: str
         )
 
 
+def require_equal_legs(model: AbstractWheel, command_name: str) -> None:
+    """Raise a `ValueError` if the legs of a model alternate from step to step."""
+    if model.leg_period > 1:
+        raise ValueError(
+            f"the legs alternate, but {command_name} compares walks of equal steps: give one law "
+            "for all legs, or follow walks by vrw.walk."
+        )
+
+
 _make_default_model = functools.cache(ViscoelasticWheel)
 
 

@@ -33,6 +33,7 @@ from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
     convert_step_options,
+    require_equal_legs,
     require_single_wheel,
 )
 from vrw_jax.wheel import transitions
@@ -99,9 +100,9 @@ def basin(
     own_walker: Any = model if is_own_walker(model) else None
     if own_walker is None:
         require_single_wheel(params, "compute one basin after the other")
-        model = wheel_model = convert_model_argument(
-            model
-        ).fallback_model  # It is valid for any start.
+        # The model is valid for any start.
+        model = wheel_model = convert_model_argument(model).fallback_model
+        require_equal_legs(wheel_model, "vrw.basin")
     else:
         params = check_parameters(params)
     options = convert_step_options(options)
