@@ -32,7 +32,8 @@ SLOW_EXAMPLES = {
     "continue_special_point", "SpecialPointCurve",
     "measure_to_tolerance", "MeasureResult", "multifidelity_mean", "MultifidelityMean",
     "gait_sensitivity", "GaitSensitivity", "measure_gait_sensitivity",
-    "smallest_disturbance", "tune", "TuneResult", "ReturnMapCycle",
+    "smallest_disturbance", "phase_response", "PhaseResponse", "tune", "TuneResult",
+    "ReturnMapCycle",
     "WheelObjective", "measure_basins", "FirstPassage", "SmallestDisturbance",
 }  # fmt: skip
 """Names whose examples compile for a minute, or compute for seconds what other tests cover."""

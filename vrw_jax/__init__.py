@@ -52,6 +52,7 @@ from vrw_jax.studies.first_passage import FirstPassage, first_passage
 from vrw_jax.studies.gait_sensitivity import GaitSensitivity, gait_sensitivity
 from vrw_jax.studies.measure_result import MeasureResult
 from vrw_jax.studies.multifidelity import MultifidelityMean, multifidelity_mean
+from vrw_jax.studies.phase_response import PhaseResponse, phase_response
 from vrw_jax.studies.scan_design import grid, saltelli, samples, sobol, uniform
 from vrw_jax.studies.scan_execution import scan
 from vrw_jax.studies.scan_store import open_scan
@@ -92,6 +93,7 @@ __all__ = (
     "MultifidelityMean",
     "Outcome",
     "ParameterSet",
+    "PhaseResponse",
     "RequiredFriction",
     "ReturnMapCycle",
     "RigidWheel",
@@ -135,6 +137,7 @@ __all__ = (
     "paper_start",
     "parameter",
     "parameter_sets",
+    "phase_response",
     "plot",
     "return_map",
     "saltelli",

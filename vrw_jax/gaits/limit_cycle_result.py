@@ -270,18 +270,18 @@ def _evaluate_own_measure(
     mesh = system.phase_meshes[index]
     weights = jnp.ravel(mesh.interval_length_fractions[:, None] * END_WEIGHTS)
     values = []
-    for durations, points in zip(
-        solution.durations, system.evaluate_phase_points(parameters, solution), strict=True
-    ):
+    for k, points in enumerate(system.evaluate_phase_points(parameters, solution)):
+        params = system.make_wheel(parameters, k)
         phase = make_paper_phases(
             params.symbols(), points[0].phase_start_point.held_constants[0], stop_at_lift_off=False
         )[index]
-        evaluate = lambda q, v, phase=phase: jnp.asarray(
+        evaluate = lambda q, v, phase=phase, params=params: jnp.asarray(
             measure(PhaseInstant(phase, phase.compute_motion(q, v)), params)
         )
         nodes = points[index].node_points
         mean = weights @ jax.vmap(evaluate)(nodes.q, nodes.v)
-        values.append(mean if measure.reduction == "mean" else durations[index] * mean)
+        duration = solution.durations[k, index]
+        values.append(mean if measure.reduction == "mean" else duration * mean)
     return sum(values[1:], start=values[0]) / len(values)
 
 

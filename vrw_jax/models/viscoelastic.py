@@ -256,23 +256,32 @@ class ViscoelasticWheel(AbstractWheel):
         options: StepOptions,
     ) -> AdvanceResult:
         params = self.attach_laws(params)
-        if can_use_batch_kernel(options):
-            finish_lane_steps = functools.partial(
-                _finish_lane_steps, self.stop_at_lift_off, phase_index
+
+        def finish_by_diffrax(
+            params: WheelParams, foot_distance: Array, phase_state: Array, options: StepOptions
+        ) -> AdvanceResult:
+            return finish_gait_step(
+                _make_diffrax_phase_runner(options, records_margins=False),
+                params,
+                phase_index,
+                foot_distance,
+                tuple(phase_state),
+                options,
+                self.stop_at_lift_off,
+                _select_engine(options),
             )
-            return lanes.jit_batch(finish_lane_steps)(
-                params, jnp.asarray(foot_distance), phase_state, options
-            )
-        return finish_gait_step(
-            _make_diffrax_phase_runner(options, records_margins=False),
-            params,
-            phase_index,
-            foot_distance,
-            tuple(phase_state),
-            options,
-            self.stop_at_lift_off,
-            "diffrax",
+
+        inputs = params, jnp.asarray(foot_distance), phase_state, options
+        if not can_use_batch_kernel(options):
+            return finish_by_diffrax(*inputs)
+        finish_lane_steps = functools.partial(
+            _finish_lane_steps, self.stop_at_lift_off, phase_index
         )
+        return lanes.differentiate(
+            lanes.jit_batch(finish_lane_steps),
+            finish_by_diffrax,
+            functools.partial(_make_column_function, finish_lane_steps),
+        )(*inputs)
 
 
 def _compute_step(
@@ -364,7 +373,7 @@ def _compile_lane_steps(stop_at_lift_off: bool, friction: float) -> Any:
 def _make_column_function(
     take_lane_steps: Callable, structure: Any, argnums: tuple[int, ...]
 ) -> Callable:
-    """Return a function of the leaves of (params, x, options) that computes Jacobian columns.
+    """Return a function of the leaves of (params, ..., options) that computes Jacobian columns.
 
     Its results are those of `compute_jacobian_columns`, with the tolerances for derivatives.
     """
@@ -375,13 +384,13 @@ def _make_column_function(
         )
 
     def compute_columns(*leaves: Array) -> tuple:
-        params, x, options = jax.tree.unflatten(structure, leaves)
+        *inputs, options = jax.tree.unflatten(structure, leaves)
         n_columns = sum(math.prod(jnp.shape(leaves[i])) for i in argnums)
         compute_compiled_columns = lanes.jit_batch(
             compute_lane_columns, N_STEP_INPUTS + (n_columns > N_STEP_INPUTS)
         )
         return compute_compiled_columns(
-            *jax.tree.leaves((params, x, options.with_derivative_tolerances()))
+            *jax.tree.leaves((*inputs, options.with_derivative_tolerances()))
         )
 
     return compute_columns

@@ -1,0 +1,119 @@
+"""Pushes within a step: their response, against walks and simulations that are pushed."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.walkers import SIMPLEST_WALKER
+
+import vrw_jax as vrw
+from vrw_jax.hybrid import Guard, HybridSystem, Mode
+
+TIGHT = vrw.StepOptions.tight()
+N_STEPS = 40  # after which the pushed walkers are on their gaits up to round-off
+
+
+@pytest.fixture(scope="module")
+def wheel_response():
+    return vrw.phase_response(vrw.WheelParams(), n_samples=3)
+
+
+def finish_and_walk(params, phase_index, foot_distance, state):
+    """Return the time of each landing after a state within a step."""
+    model = vrw.ViscoelasticWheel()
+    rest = model.finish_step(params, phase_index, foot_distance, jnp.asarray(state), TIGHT)
+    walk = vrw.walk(params, rest.section_state, N_STEPS, options=TIGHT)
+    durations = np.sum(np.asarray(walk.steps.durations), -1)
+    first = float(np.sum(np.asarray(rest.durations)))
+    return first + np.concatenate([[0.0], np.cumsum(durations)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instant", [1, 3, 4, 7])  # in double support, at a take-off, in SLS-I, -II
+def test_a_pushed_wheel_lands_as_much_earlier_as_its_response_says(wheel_response, instant):
+    """By central differences of walks: their error is the square of the push."""
+    params, push = vrw.WheelParams(), 1e-4
+    gait = vrw.limit_cycle(params, options=vrw.CycleOptions.tight())
+    distance = vrw.step(params, gait.section_state, options=TIGHT).step_length
+    phase_index = int(wheel_response.phase_indices[instant])
+    for coordinate in (3, 4):  # dtheta, and the rate of Leg 1
+        times = []
+        for sign in (1.0, -1.0):
+            state = wheel_response.states[instant].copy()
+            state[coordinate] += sign * push
+            times.append(finish_and_walk(params, phase_index, distance, state))
+        delays = (times[0] - times[1]) / (2.0 * push)
+        assert abs(delays[-1] - wheel_response.delay[instant, coordinate]) < 2e-6
+        expected = wheel_response.measures["period"][:, instant, coordinate]
+        np.testing.assert_allclose(np.diff(delays)[:3], expected, atol=2e-6)
+    # In double support the feet stay, so that the angular velocity determines the rates of legs.
+    assert (wheel_response.delay[instant, 4] == 0.0) == (phase_index == 0)
+
+
+def test_a_push_along_the_flow_is_a_shift_in_time_on_both_sides_of_an_impact():
+    """A rimless wheel whose speed follows from its energy, pushed at all instants of a step."""
+    alpha = np.pi / 8
+    wheel = HybridSystem(
+        modes={
+            "stance": Mode(
+                lambda y, p: jnp.stack([y[1], 9.81 * jnp.sin(y[0])]),
+                {
+                    "touchdown": Guard(
+                        lambda y, p: p["slope"] + alpha - y[0],
+                        lambda y, p: jnp.stack([p["slope"] - alpha, y[1] * np.cos(2 * alpha)]),
+                    )
+                },
+            )
+        },
+        section="touchdown",
+        state=("angle", "rate"),
+        project=lambda y, p: y[1:],
+        embed=lambda x, p: jnp.stack([p["slope"] - alpha, x[0]]),
+    )
+    params = {"slope": 0.2}
+    gait = vrw.limit_cycle(params, model=wheel, guess=[1.5], options=TIGHT)
+    response = vrw.phase_response(params, model=wheel, cycle=gait, n_samples=5)
+    angle, rate = response.states.T
+    flow = np.stack([rate, 9.81 * np.sin(angle)], 1)
+    np.testing.assert_allclose(np.sum(response.delay * flow, 1), -1.0, atol=1e-9)
+    # A push that keeps the energy moves the wheel along its orbit, without another effect.
+    np.testing.assert_allclose(
+        np.einsum("kidn,id->kin", response.section_states, flow), 0.0, atol=1e-9
+    )
+    assert (response.phase_advance[:, 1] > 0.0).all()
+
+
+@pytest.mark.slow
+def test_a_pushed_simplest_walker_strikes_as_much_earlier_as_its_response_says():
+    params, push = {"slope": 0.009}, 1e-6
+    gait = vrw.limit_cycle(params, model=SIMPLEST_WALKER, guess=[0.2, -0.2], options=TIGHT)
+    response = vrw.phase_response(params, model=SIMPLEST_WALKER, cycle=gait, n_samples=4)
+    instant, n_strikes = 1, 60
+    unpushed = SIMPLEST_WALKER.simulate(
+        params, response.states[instant], events=n_strikes, options=TIGHT
+    )
+    for coordinate in range(4):
+        times = []
+        for sign in (1.0, -1.0):
+            state = response.states[instant].copy()
+            state[coordinate] += sign * push
+            pushed = SIMPLEST_WALKER.simulate(params, state, events=n_strikes, options=TIGHT)
+            times.append(np.asarray(pushed.times))
+        assert pushed.n_events == unpushed.n_events == n_strikes
+        delays = (times[0] - times[1]) / (2.0 * push)
+        assert abs(delays[-1] - response.delay[instant, coordinate]) < 1e-5
+        periods = np.diff(delays)[:3]
+        np.testing.assert_allclose(
+            periods, response.measures["period"][:, instant, coordinate], atol=1e-5
+        )
+    flow = SIMPLEST_WALKER.modes["swing"].field(jnp.asarray(response.states[instant]), params)
+    # A push along the flow is a shift in time.
+    assert response.delay[instant] @ np.asarray(flow) == pytest.approx(-1.0, abs=1e-8)
+
+
+@pytest.mark.slow
+def test_an_unstable_gait_is_refused():
+    unstable = vrw.limit_cycle(
+        {"slope": 0.009}, model=SIMPLEST_WALKER, guess=[0.1939, -0.2039], options=TIGHT
+    )
+    with pytest.raises(ValueError, match="the gait is unstable"):
+        vrw.phase_response({"slope": 0.009}, model=SIMPLEST_WALKER, cycle=unstable)
