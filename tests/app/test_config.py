@@ -112,6 +112,15 @@ def test_a_config_takes_a_law_of_the_legs_from_a_python_file(tmp_path, monkeypat
     assert float(stiff_config.make_model().leg_force.k) == 600.0
 
 
+def test_a_config_drives_the_hub_by_a_torque_and_sweeps_it() -> None:
+    text = '[wheel]\nslope = 0.0\n[model]\nhub_torque = 47.23\n[grid]\n"hub.torque" = [45, 47]\n'
+    config = parse_config(text)
+    assert float(config.make_model().hub_torque.torque) == 47.23
+    assert config.design.swept_parameters == ("hub.torque",)
+    with pytest.raises(ValueError, match="has the unknown key 'hub_torque'"):
+        parse_config('[model]\nname = "unilateral"\nhub_torque = 1.0\n')
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
