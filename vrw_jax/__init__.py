@@ -52,6 +52,7 @@ from vrw_jax.studies.first_passage import FirstPassage, first_passage
 from vrw_jax.studies.gait_sensitivity import GaitSensitivity, gait_sensitivity
 from vrw_jax.studies.measure_result import MeasureResult
 from vrw_jax.studies.multifidelity import MultifidelityMean, multifidelity_mean
+from vrw_jax.studies.optimum_curve import ActiveSetChange, OptimumCurve
 from vrw_jax.studies.phase_response import PhaseResponse, phase_response
 from vrw_jax.studies.scan_design import grid, saltelli, samples, sobol, uniform
 from vrw_jax.studies.scan_execution import scan
@@ -71,6 +72,7 @@ __all__ = (
     "MEASURES",
     "AbstractWalker",
     "AbstractWheel",
+    "ActiveSetChange",
     "AdvanceResult",
     "AlternatingLegs",
     "ArclengthOptions",
@@ -91,6 +93,7 @@ __all__ = (
     "MeasureResult",
     "ModelChoice",
     "MultifidelityMean",
+    "OptimumCurve",
     "Outcome",
     "ParameterSet",
     "PhaseResponse",

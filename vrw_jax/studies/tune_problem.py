@@ -24,6 +24,7 @@ from vrw_jax.base.checks import (
     check_positive,
     check_range,
     check_real,
+    check_reals,
     check_type,
     format_value,
     require_known_name,
@@ -63,6 +64,7 @@ from vrw_jax.models.stepping import (
     require_compliant_model,
     require_single_wheel,
 )
+from vrw_jax.studies.optimum_curve import follow_optimum
 from vrw_jax.studies.tune_exploration import ExplorationResult, explore_starts
 from vrw_jax.studies.tune_maximization import (
     EvaluatedTrial,
@@ -127,7 +129,8 @@ def tune(
     max_evaluations: int = 200,
     n_starts: int = 1,
     seed: int = 0,
-) -> TuneResult:
+    along: tuple[str, Any] | None = None,
+) -> Any:
     """Return the wheel near `params` whose gait maximizes an objective under constraints.
 
     The default constraints are all margins that gaits of the model can satisfy (`default_margins`).
@@ -163,9 +166,12 @@ def tune(
         max_evaluations: largest number of evaluated gaits.
         n_starts: number of starts; the maximization continues from the best.
         seed: seed of the random starts.
+        along: name and values of another parameter, along which the optimum is followed, such as
+            ("slope", np.linspace(0.30, 0.05, 26)).
 
     Returns:
-        A `TuneResult`, whose `status` is CONVERGED at an optimum.
+        A `TuneResult`, whose `status` is CONVERGED at an optimum. With `along`, an `OptimumCurve`,
+        with the optimum at each value, and the values at which the active limits change.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.
@@ -205,6 +211,11 @@ def tune(
         if exploration_result is None
         else exploration_result.normalized_parameters[exploration_result.best_start_index]
     )
+    if along is not None:
+        return follow_optimum(
+            tune_problem, *_check_along(tune_problem, along), start_trial, tolerance,
+            max_evaluations,
+        )  # fmt: skip
     compilation_end_seconds = time.perf_counter()
     maximization_result = maximize_objective(
         tune_problem.evaluate_trial,
@@ -215,6 +226,25 @@ def tune(
     return tune_problem.make_tune_result(
         maximization_result, start_seconds, compilation_end_seconds, exploration_result
     )
+
+
+def _check_along(problem: TuneProblem, along: Any) -> tuple[str, list[float]]:
+    """Return the name and the values of the parameter along which an optimum is followed."""
+    check_type("along", along, tuple, 'write along=("slope", (0.30, 0.25, 0.20))')
+    name, values = along
+    check_parameter_name(name, problem.gait_finder.model.parameter_names, "parameter")
+    if name in problem.free_parameters:
+        raise ValueError(
+            f"along is {name!r}, which is free, but the optimum is followed along a parameter that "
+            "is not: take it out of free."
+        )
+    numbers = check_reals("the values in along", values)
+    if numbers.ndim != 1 or numbers.size < 2:
+        raise ValueError(
+            f"the values in along have shape {numbers.shape}, but a curve needs a row of at least "
+            "two: write np.linspace(0.30, 0.05, 26)."
+        )
+    return name, np.asarray(numbers).tolist()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,55 @@
+"""Curves of optima: each point is the optimum of a search of its own, also beside changes."""
+
+import numpy as np
+import pytest
+
+import vrw_jax as vrw
+
+FREE, BOUNDS = ("damping", "stiffness"), {"damping": (20.0, 300.0), "stiffness": (250.0, 1200.0)}
+
+
+def follow(*slopes):
+    wheel = vrw.WheelParams(slope=slopes[0])
+    return vrw.tune(wheel, "spectral_margin", FREE, BOUNDS, along=("slope", slopes))
+
+
+@pytest.fixture(scope="module")
+def curve():
+    return follow(0.30, 0.25, 0.23)
+
+
+@pytest.mark.slow
+def test_each_point_of_a_curve_is_the_optimum_of_a_search_of_its_own(curve):
+    assert curve.dataset.slope.values[[0, -1]].tolist() == [0.30, 0.23]
+    for point in (0, -1):
+        start = {name: float(curve.dataset[name][point]) for name in FREE}
+        start["damping"] -= 5.0
+        wheel = vrw.WheelParams(slope=float(curve.dataset.slope[point]), **start)
+        single = vrw.tune(wheel, "spectral_margin", FREE, BOUNDS)
+        assert single.converged
+        assert abs(single.value - float(curve.dataset.objective[point])) < 1e-6
+        for name in FREE:
+            assert abs(float(getattr(single.params, name)) - curve.dataset[name][point]) < 0.02
+
+
+@pytest.mark.slow
+def test_the_active_limits_change_where_the_damping_reaches_and_leaves_its_bound(curve):
+    """On both sides of a change, searches of their own have the limits that the curve reports."""
+    assert len(curve.changes) > 1
+    assert all("damping at its upper bound" in repr(change) for change in curve.changes)
+    first, last = curve.changes[0], curve.changes[-1]
+    for slope, names in ((first.value + 1e-3, first.before), (last.value - 1e-3, last.after)):
+        point = np.argmin(np.abs(curve.dataset.slope.values - slope))
+        start = {name: float(curve.dataset[name][point]) for name in FREE}
+        single = vrw.tune(vrw.WheelParams(slope=slope, **start), "spectral_margin", FREE, BOUNDS)
+        assert {limit.name for limit in single.active} == set(names)
+
+
+def test_arguments_of_a_curve_are_refused_in_one_sentence():
+    for along, message in (
+        (("damping", (150.0, 160.0)), "which is free"),
+        (("slope", (0.3,)), "at least two"),
+        (("incline", (0.3, 0.2)), "no parameter"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vrw.tune(vrw.WheelParams(), "dls_fraction", FREE, BOUNDS, along=along)
