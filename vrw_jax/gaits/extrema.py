@@ -11,7 +11,7 @@ accurate as the cycle.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -301,7 +301,7 @@ def locate_extrema(
         starts = jnp.concatenate([jnp.zeros(1), rate_times, phase_duration[None]])
         inverse_slopes = jnp.pad(jnp.where(is_rate_extremum, 1.0 / slopes, 0.0), 1)
 
-        def locate_next(carry: tuple, seeks_extrema: Array) -> tuple[tuple, tuple]:
+        def locate_next(carry: Any, seeks_extrema: Any) -> tuple[Any, tuple]:
             """Locate the extrema of R, or of F between those of R in `carry`."""
             times, rates, has_extremum = carry
             bisected_times = _bisect_zeros(

@@ -127,14 +127,13 @@ def evaluate_force_peaks(
             evaluate_extrema(*forces, extrema)
             for forces, extrema in zip(step_forces, step_extrema, strict=True)
         ]
-        fore_force, total_force = (
-            jax.tree.map(lambda x, index=index: x[min(index, len(x) - 1)], (step_extrema, values))
-            for index in range(2)
+        fore_peaks, total_force_peaks = (
+            _summarize_force_extrema(step_extrema, values, durations, force_index)
+            for force_index in range(2)
         )
-        total_force_peaks = _summarize_force_extrema(*total_force, durations)
         peaks_by_step.append(
             {
-                **_summarize_force_extrema(*fore_force, durations),
+                **fore_peaks,
                 "n_total_force_peaks": total_force_peaks["n_force_peaks"],
                 "peak_total_force": total_force_peaks["peak_force"],
                 "smooth_peak_total_force": total_force_peaks["smooth_peak_force"],
@@ -158,11 +157,17 @@ def _summarize_force_extrema(
     extrema_of_phases: list[LocatedExtrema],
     values_of_phases: list[ExtremumValues],
     phase_durations: Array,
+    force_index: int,
 ) -> dict[str, Scalar]:
-    """Return the measures of one force over a gait step, from the force's extrema in each phase.
+    """Return the measures of one force over a gait step, from the extrema in each phase.
 
     The measures are those of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name.
+
+    - `force_index`: 0 for the force on the fore foot, 1 for the total force.
     """
+    extrema_of_phases, values_of_phases = jax.tree.map(
+        lambda x: x[min(force_index, len(x) - 1)], (extrema_of_phases, values_of_phases)
+    )
     start_times = jnp.cumsum(phase_durations) - phase_durations
     extrema, values = (
         jax.tree.map(lambda *by_phase: jnp.concatenate(by_phase), *phases)
@@ -171,8 +176,8 @@ def _summarize_force_extrema(
                 extrema._replace(
                     times=extrema.times + start_time,
                     rate_times=extrema.rate_times + start_time,
-                    node_accelerations=(),
-                    inverse_jacobian=(),
+                    node_accelerations=jnp.zeros(0),
+                    inverse_jacobian=jnp.zeros(0),
                 )
                 for extrema, start_time in zip(extrema_of_phases, start_times, strict=True)
             ],
