@@ -41,6 +41,11 @@ class AdvanceResult(eqx.Module):
     engine: str = eqx.field(static=True, default="")
 
     @property
+    def is_complete(self) -> Any:
+        """Return whether the step ended at the next touchdown."""
+        return self.outcome == Outcome.STEPPED
+
+    @property
     def duration(self) -> Array:
         """Return the duration of the step, s."""
         return jnp.sum(self.durations, 0)

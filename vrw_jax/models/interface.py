@@ -16,6 +16,7 @@ from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.models.capabilities import ModelCapabilities
+from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_results import SectionState
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import (
@@ -128,6 +129,14 @@ class AbstractWheel(AbstractWalker, eqx.Module):
     def parameter_names(self) -> tuple[str, ...]:
         """Return the names of `parameter_domains`."""
         return (*PARAMETER_NAMES, *self.own_parameter_domains)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Return the SI units of all measures and parameters, by name."""
+        domains = self.parameter_domains
+        return {name: measure.unit for name, measure in MEASURES.items()} | {
+            name: domain.unit or "1" for name, domain in domains.items()
+        }
 
     def attach_laws(self, params: WheelParams) -> WheelParams:
         """Return the parameters with the laws of this model, unless they have laws already."""

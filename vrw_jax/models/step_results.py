@@ -394,3 +394,8 @@ class Trajectory(eqx.Module):
     section_state: AnySectionState
     durations: Float[Array, "3 ..."]  # s
     outcome: Int[Array, "..."]  # an Outcome
+
+    @property
+    def is_complete(self) -> Any:
+        """Return whether the step ended at the next touchdown."""
+        return self.outcome == Outcome.STEPPED

@@ -215,10 +215,12 @@ class ViscoelasticWheel(AbstractWheel):
     ) -> Trajectory:
         params = self.attach_laws(params)
         if can_use_batch_kernel(options):
-            sample_lane_steps = functools.partial(
-                _sample_lane_steps, self.stop_at_lift_off, n_samples
-            )
-            return lanes.jit_batch(sample_lane_steps)(params, x, options)
+            return _compile_sampling(self.stop_at_lift_off, n_samples)(params, x, options)
+        return self._sample_by_diffrax(params, x, options, n_samples)
+
+    def _sample_by_diffrax(
+        self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
+    ) -> Trajectory:
         phase_sequence = self._run_phases(params, x, options, records_margins=False)
         phase_samples = []
         for phase, phase_start, phase_end in zip(
@@ -334,6 +336,20 @@ def _compile_step(model: ViscoelasticWheel, engine: str, records_margins: bool) 
         lanes.jit_batch(take_lane_steps),
         take_tight_step,
         functools.partial(_make_column_function, take_lane_steps),
+    )
+
+
+@functools.cache
+def _compile_sampling(stop_at_lift_off: bool, n_samples: int) -> Callable:
+    """Return a compiled function of (params, x, options) that samples a step, with derivatives."""
+    sample_lane_steps = functools.partial(_sample_lane_steps, stop_at_lift_off, n_samples)
+    model = ViscoelasticWheel(stop_at_lift_off=stop_at_lift_off)
+    return lanes.differentiate(
+        lanes.jit_batch(sample_lane_steps),
+        lambda params, x, options: model._sample_by_diffrax(
+            params, x, options.with_derivative_tolerances(), n_samples
+        ),
+        functools.partial(_make_column_function, sample_lane_steps),
     )
 
 
