@@ -75,6 +75,8 @@ SLOW_FUNCTIONS = {
     "tune",
     "basin",
     "map_special_points",
+    "fit",
+    "compare_laws",
 }
 """Those that compile for minutes where nothing is kept."""
 
@@ -87,6 +89,8 @@ def test_friction_margins_use_the_friction_of_the_model(name):
     rows = [float(FRICTION[name](vrw.ViscoelasticWheel(friction=mu))) for mu in (1.0, 20.0)]
     np.testing.assert_allclose(rows[1] - rows[0], 19.0, rtol=1e-9)
 
+
+ONE_GAIT = {"period": [0.7], "period_error": [1.0], "speed": [1.0], "speed_error": [1.0]}
 
 OUTCOMES = {
     "step": lambda m: vrw.step(LIFT_OFF_WHEEL, LIFT_OFF_START, model=m).outcome,
@@ -220,6 +224,10 @@ GAITS = {
             max_evaluations=1,
         )
     ),
+    "fit": lambda m: vrw.fit(ONE_GAIT, PULLED_WHEEL, ["stiffness"], model=m, n_starts=1).converged,
+    "compare_laws": lambda m: vrw.compare_laws(
+        ONE_GAIT, PULLED_WHEEL, ["stiffness"], model=m, n_folds=0, n_starts=1
+    ).converged.sel(law="linear"),
 }
 """By function: whether it tells of that gait."""
 
@@ -241,7 +249,7 @@ def test_every_function_with_a_model_argument_is_tested_with_both_options():
     # These report no margin of friction, or only how it varies.
     measured = {"step_batch", "walk", "simulate", "return_map", "gait_sensitivity"}
     measured |= {"first_passage", "basin_share", "smallest_disturbance", "measure_basins"}
-    measured |= {"measure_gait_sensitivity"}
+    measured |= {"measure_gait_sensitivity", "fit", "compare_laws"}
     assert taking - measured == set(FRICTION)
 
 

@@ -49,6 +49,8 @@ from vrw_jax.studies.basin_share import BasinShare, basin_share
 from vrw_jax.studies.basins import basin
 from vrw_jax.studies.branch_robustness import measure_basins, measure_gait_sensitivity
 from vrw_jax.studies.first_passage import FirstPassage, first_passage
+from vrw_jax.studies.fit import compare_laws, fit
+from vrw_jax.studies.fit_result import FitResult
 from vrw_jax.studies.gait_sensitivity import GaitSensitivity, gait_sensitivity
 from vrw_jax.studies.measure_result import MeasureResult
 from vrw_jax.studies.multifidelity import MultifidelityMean, multifidelity_mean
@@ -82,6 +84,7 @@ __all__ = (
     "DoubleSupportIndicators",
     "EnergyLoss",
     "FirstPassage",
+    "FitResult",
     "FixedPointResult",
     "GaitSensitivity",
     "HybridGait",
@@ -118,6 +121,7 @@ __all__ = (
     "basin",
     "basin_share",
     "choose_model",
+    "compare_laws",
     "continue_branch",
     "continue_branches",
     "continue_map",
@@ -125,6 +129,7 @@ __all__ = (
     "default_margins",
     "explore",
     "first_passage",
+    "fit",
     "force_peaks",
     "gait_sensitivity",
     "grid",

@@ -2,6 +2,7 @@
 
 from vrw_jax.app import figure_style as style
 from vrw_jax.app._branch_figures import basin_figure, branch_figure
+from vrw_jax.app._fit_figures import fit_figure
 from vrw_jax.app._scan_figures import map_figure, scan_figures
 from vrw_jax.app._tuning_figures import tornado_figure, tuning_figure
 from vrw_jax.app._walk_figures import (
@@ -28,6 +29,7 @@ __all__ = (
     "basin_figure",
     "branch_figure",
     "figure_style",
+    "fit_figure",
     "foot_height",
     "gait_panels",
     "ground_forces",

@@ -1,4 +1,4 @@
-"""Studies of many gaits: tuning, scans, basins, robustness, tolerances."""
+"""Studies of many gaits: tuning, scans, basins, robustness, tolerances, fits."""
 
 from vrw_jax.studies.scan_execution import ScanProgress, run_scan
 from vrw_jax.studies.scan_planning import ScanPlan, plan_scan

@@ -1,0 +1,536 @@
+"""Fit of a walker's parameters to measurements, and comparison of leg laws by their fits."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vrw_jax.base.checks import (
+    check_choice,
+    check_int,
+    check_names,
+    check_numpy_reals,
+    check_range,
+    check_real,
+    check_type,
+    require_known_name,
+    require_untraced_arguments,
+)
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import list_parameters
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.gaits.finder_selection import resolve_finder
+from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
+from vrw_jax.studies import fit_data, fit_problem
+from vrw_jax.studies.fit_laws import make_leg_laws
+from vrw_jax.studies.fit_problem import FitProblem, FitTarget, solve_fits
+from vrw_jax.studies.fit_result import FitResult, make_result, summarize
+
+N_STARTS = 8
+"""Default number of starts. The first start is the given walker."""
+START_RANGE_FACTOR = 2.0
+"""Factor by which starts differ from the given walker, where no bounds are given."""
+N_FOLDS = 5
+
+
+@announce_wait("predictions with derivatives, and their fit", "30 s")
+def fit(
+    data: Any,
+    params: Any,
+    free: Sequence[str] = ("damping", "stiffness"),
+    *,
+    model: Any = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    start: Any = None,
+    extra: Mapping[str, float] | None = None,
+    observe: Callable[[Any, dict[str, Any]], Mapping[str, Any]] | None = None,
+    covariance: Any = None,
+    window: float | None = None,
+    n_starts: int = N_STARTS,
+    options: StepOptions | None = None,
+) -> FitResult:
+    """Estimate parameters of a walker from measurements, with their uncertainty.
+
+    The kind of the data follows from their columns:
+
+    - **gaits**: each row is a steady gait, and its columns are measures such as "period";
+    - **steps**, with a column "step": each row is a step of a walk that need not be periodic. The
+      columns are durations, states at touchdown, or "touchdown_time" and "takeoff_time";
+    - **series**, with a column "time": variables of `vrw.simulate`, such as forces and angles.
+
+    Each measured column has a column of its standard errors, as "period_error". Units are those of
+    xarray's attribute `units`, or in the heading, as "period [ms]"; SI units otherwise. Columns
+    with names of parameters, as "slope", describe each row. A column "walk" distinguishes walks. A
+    dimension "dataset" is a batch of data sets, which are fitted in one call.
+
+    The Levenberg-Marquardt method of optimistix minimizes the sum of squared residuals, with exact
+    derivatives of gaits, steps and events. Standard errors follow from the derivatives and from the
+    errors of the data. Wheels without a gait are rejected during the search.
+
+    Args:
+        data: an xarray Dataset, a pandas DataFrame, a dictionary of columns or a CSV file.
+        params: the walker at which the search starts, with the known parameters.
+        free: names of the unknown parameters, which all rows share; "slope_offset" is added to the
+            slopes of all rows, and "time_offset" to all times.
+        model: the model, or a `HybridSystem`; the paper's, `ViscoelasticWheel()`, by default.
+        bounds: lower and upper bound of unknowns by name; by default the domain of the parameter.
+        priors: mean and standard deviation of unknowns by name.
+        start: section state at the start of a walk, one for each walk, or "gait" for the steady
+            gait. By default it is unknown and estimated too. For a `HybridSystem`, it is required.
+        extra: first values of further unknowns that `observe` uses, by name.
+        observe: function of the predicted columns and of `extra`, as dictionaries. It returns what
+            the sensors report.
+        covariance: covariance of the columns of a row, instead of standard errors.
+        window: duration over which each sample of a series is a mean, s; by default the sampling
+            interval, and 0 for instantaneous values.
+        n_starts: number of starts of the search, of which the best fit is returned.
+        options: numerical options of the steps.
+
+    Returns:
+        A `FitResult`, which prints a summary.
+
+    Raises:
+        TypeError, ValueError: if an argument or a number is invalid; the message names the remedy.
+
+    Examples:
+        >>> data = {"period": [0.70], "period_error": [0.002], "speed": [0.92]}
+        >>> data |= {"speed_error": [0.01], "slope": [0.30]}
+        >>> result = vrw.fit(data, vrw.WheelParams(damping=150.0), free=["damping"])
+        >>> print(result.names, result.dof, bool(result.converged))
+        ('damping',) 1 True
+    """
+    require_untraced_arguments("vrw.fit", "use result.log_likelihood", params)
+    problem, targets, starts, table, units, walker = make_fit_problem(
+        data, params, free, model=model, bounds=bounds, priors=priors, start=start, extra=extra,
+        observe=observe, covariance=covariance, window=window, n_starts=n_starts, options=options,
+    )  # fmt: skip
+    if not table.is_batch:
+        targets = FitTarget(*(np.repeat(x, len(starts), 0) for x in targets))
+        return make_result(problem, targets, starts, table, units, params, walker, is_batch=False)
+    mean_targets = targets._replace(values=targets.values.mean(0, keepdims=True))
+    mean_targets = FitTarget(*(np.repeat(x, len(starts), 0) for x in mean_targets))
+    mean_fit = make_result(
+        problem, mean_targets, starts, table, units, params, walker, is_batch=False
+    )
+    starts = np.tile(mean_fit.values, (len(table.values), 1))
+    return make_result(problem, targets, starts, table, units, params, walker, is_batch=True)
+
+
+def make_fit_problem(
+    data: Any,
+    params: Any,
+    free: Sequence[str],
+    *,
+    model: Any,
+    bounds: Any,
+    priors: Any,
+    start: Any,
+    extra: Any,
+    observe: Any,
+    covariance: Any,
+    window: Any,
+    n_starts: int,
+    options: StepOptions | None,
+) -> tuple[FitProblem, FitTarget, np.ndarray, fit_data.FitData, tuple[str, ...], Any]:
+    """Check all arguments of `fit`, and return the problem, its targets and its starts."""
+    free = check_names("free", free, '"damping", "stiffness"')
+    bounds, priors, extra = dict(bounds or {}), dict(priors or {}), dict(extra or {})
+    options = StepOptions() if options is None else options
+    check_type("options", options, StepOptions, "give vrw.StepOptions()")
+    n_starts = check_int("n_starts", n_starts)
+    system = model if isinstance(model, HybridSystem) else None
+    finder: Any = None
+    time_unit: Any = None
+    if system is None:
+        model = resolve_model(params, model)
+        finder = resolve_finder(params, model, None)
+        model = finder.model
+        base_values = np.asarray(model.collect_parameter_values(params), float)
+        structure: Any = params.n_legs
+        units, domains = model.units, model.parameter_domains
+        time_unit = math.sqrt(float(params.locked_length) / float(params.gravity))
+    else:
+        leaves, structure = jax.tree.flatten(params)
+        base_values = np.array([check_real("a parameter", x) for x in leaves])
+        units, domains = {"period": "s"}, {}
+    parameter_names = fit_problem.list_parameter_names(system or model, structure)
+    table = fit_data.read_data(data, covariance, units, parameter_names)
+    fit_data.check_plausible(table, units, time_unit)
+    if table.kind == "gaits" and system is not None:
+        raise ValueError(
+            "data have no column 'step', but gaits of a HybridSystem are fitted as steps: add the "
+            "column, and give start=."
+        )
+    if table.kind == "series" and (system is not None or model.reports_contacts):
+        raise ValueError(
+            "data have a column 'time', but time series are those of the paper's phases: give "
+            "vrw.ViscoelasticWheel(), or fit the steps."
+        )
+    walks = np.unique(table.labels.get("walk", np.zeros(1)))
+    row_walks = np.searchsorted(walks, table.labels.get("walk", np.zeros(table.values.shape[1])))
+    starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
+    if starts_from_gait and (system is not None or not finder.supports_cold_start):
+        raise ValueError(
+            "start is 'gait', but the gaits of this walker are found from a start only: give a "
+            "section state."
+        )
+    first_states: Any = None
+    row_steps: Any = None
+    n_steps = 1
+    start_names: list[str] = []
+    if table.kind != "gaits":
+        cycle: Any = limit_cycle(params, model=model) if system is None else None
+        first_states = _make_starts(table, params, model, system, cycle, start, walks)
+        entries = fit_problem.list_start_names(system, first_states.shape[1])
+        if start is None:
+            # The landing on both feet of the paper's wheel leaves two of the three entries.
+            n_entries = 2 if system is None and not model.reports_contacts else len(entries)
+            start_names = fit_problem.make_start_names(len(walks), entries[:n_entries])
+        if table.kind == "steps":
+            row_steps = table.labels["step"].astype(int)
+            row_steps = row_steps - min(row_steps)
+            n_steps = int(row_steps.max()) + 1
+        elif not starts_from_gait:
+            period = float(cycle.period) if bool(cycle.found) else 2.0 * time_unit
+            n_steps = math.ceil(float(table.labels["time"].max()) / (0.7 * period)) + 1
+    elif finder is not None and not finder.supports_cold_start:
+        guess = start if start is not None else limit_cycle(params, model=model).section_state
+        first_states = np.asarray(guess, float)[None]
+    offset_names = [f"{name}{fit_problem.OFFSET_SUFFIX}" for name in parameter_names]
+    if table.kind == "series":
+        offset_names.append(fit_problem.TIME_OFFSET)
+    for name in free:
+        require_known_name(name, (*parameter_names, *offset_names), "parameter of the walker")
+        if name in table.conditions:
+            raise ValueError(
+                f"{name} is free and a column of data, but a column describes what is known: free "
+                f"{name}_offset, or remove one of them."
+            )
+    unknown_names = (*free, *extra, *start_names)
+    if not unknown_names or len(set(unknown_names)) < len(unknown_names):
+        raise ValueError(f"the unknowns are {unknown_names}, but each is named once: change free.")
+    for name in (*bounds, *priors):
+        require_known_name(name, unknown_names, "unknown")
+    _require_measures(table, finder, system, observe, units)
+    known_values = dict(zip(parameter_names, base_values, strict=True)) | extra
+    for name in start_names:
+        entry = fit_problem.parse_start_name(name, len(walks), entries)
+        known_values[name] = first_states[entry]
+    first = np.array([float(known_values.get(name, 0.0)) for name in unknown_names])
+    lower, upper = _collect_bounds(unknown_names, bounds, domains, first)
+    prior_means, prior_weights = np.zeros(len(first)), np.zeros(len(first))
+    for name, prior in priors.items():
+        mean, width = (check_real(f"the prior of {name}", x) for x in prior)
+        if width <= 0.0:
+            raise ValueError(
+                f"the prior of {name} has the standard deviation {width:g}, but it is positive: "
+                "give (mean, standard deviation)."
+            )
+        index = unknown_names.index(name)
+        prior_means[index], prior_weights[index] = mean, 1.0 / width
+    n_numbers = table.values[0].size + len(priors)
+    if n_numbers < len(first):
+        raise ValueError(
+            f"data contain {n_numbers} numbers for {len(first)} unknowns ("
+            f"{', '.join(unknown_names)}), which cannot be estimated from fewer: measure more, or "
+            "give start= or fewer free parameters."
+        )
+    widths = [priors[x][1] if x in priors else _guess_scale(x, domains) for x in unknown_names]
+    scale = np.where(first == 0.0, widths, np.abs(first))
+    times = table.labels.get("time")
+    if times is not None and window is None:
+        window = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
+    problem = FitProblem(
+        walker=None if system is not None else model,
+        finder=finder,
+        base_values=tuple(map(jnp.asarray, base_values)),
+        conditions=_arrange_conditions(table, row_walks, row_steps, n_steps, len(walks)),
+        row_walks=jnp.asarray(row_walks),
+        row_steps=None if row_steps is None else jnp.asarray(row_steps),
+        times=None if times is None else jnp.asarray(times),
+        window=None if times is None else jnp.asarray(check_real("window", window)),
+        starts=None if first_states is None else jnp.asarray(first_states),
+        whitener=jnp.asarray(table.whitener),
+        lower=lower,
+        upper=upper,
+        scale=scale,
+        options=options,
+        names=table.names,
+        unknown_names=unknown_names,
+        extra_names=tuple(extra),
+        kind=table.kind,
+        system=system,
+        params_structure=structure,
+        n_steps=n_steps,
+        starts_from_gait=starts_from_gait,
+        observe=observe,
+    )
+    targets = FitTarget(
+        table.values,
+        np.ones((1, table.values.shape[1])),
+        prior_means[None],
+        prior_weights[None],
+    )
+    starts = _make_search_starts(first, lower, upper, bounds, unknown_names, free, n_starts)
+    unknown_units = tuple(
+        domains[name.removesuffix("_offset")].unit
+        if name.removesuffix("_offset") in domains
+        else "s"
+        if name == fit_problem.TIME_OFFSET
+        else units.get(name.removeprefix(fit_problem.START_PREFIX).partition("[")[0], "1")
+        for name in unknown_names
+    )
+    return problem, targets, starts, table, unknown_units, system or model
+
+
+def _make_starts(
+    table: fit_data.FitData,
+    params: Any,
+    model: Any,
+    system: HybridSystem | None,
+    cycle: Any,
+    start: Any,
+    walks: np.ndarray,
+) -> np.ndarray:
+    """Return the section state at the start of each walk, or a first guess of it."""
+    if start is not None and not isinstance(start, str):
+        states = np.atleast_2d(check_numpy_reals("start", start))
+        if states.shape[0] not in (1, len(walks)):
+            raise ValueError(
+                f"start has shape {states.shape}, but there are {len(walks)} walks: give one "
+                "section state, or one for each walk."
+            )
+    elif system is not None:
+        raise ValueError(
+            "start is None, but a HybridSystem has no start of its own: give section coordinates."
+        )
+    else:
+        found = bool(cycle.found)
+        states = np.asarray(cycle.section_state if found else model.compute_default_start(params))[
+            None
+        ]
+    if system is None:
+        states = np.stack(
+            [np.asarray(model.complete_section_state(params, jnp.asarray(x))) for x in states]
+        )
+    return np.broadcast_to(states, (len(walks), states.shape[1])).astype(float)
+
+
+def _require_measures(
+    table: fit_data.FitData, finder: Any, system: Any, observe: Any, units: Mapping[str, str]
+) -> None:
+    """Raise a `ValueError` if a measured column is not a quantity that the walker predicts."""
+    if observe is not None:
+        return
+    if table.kind == "gaits":
+        known = finder.cycle_measures
+    elif table.kind == "series":
+        known = fit_problem.SERIES_NAMES
+    elif system is not None:
+        known = ("period", "touchdown_time", *(f"duration_{mode}" for mode in system.modes))
+        known += tuple(f"section_{i}" for i in range(len(system.state)))
+    else:
+        durations = (
+            fit_problem.CONTACT_DURATION_NAMES
+            if finder.model.reports_contacts
+            else fit_problem.PHASE_DURATION_NAMES
+        )
+        known = (*durations, *fit_problem.START_NAMES, "period", "dls_fraction", "step_length")
+        known += ("touchdown_time", "takeoff_time")
+    for name in table.names:
+        require_known_name(name, known, f"measure of {table.kind}")
+
+
+def _collect_bounds(
+    names: Sequence[str], bounds: Mapping[str, Any], domains: Mapping[str, Any], first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    for i, name in enumerate(names):
+        if name in bounds:
+            lower[i], upper[i] = check_range(f"the range of {name}", bounds[name])
+            if not lower[i] <= first[i] <= upper[i]:
+                raise ValueError(
+                    f"the start has {name} {first[i]:g}, outside its bounds ({lower[i]:g}, "
+                    f"{upper[i]:g}): widen the bounds, or start inside them."
+                )
+        elif name in domains:
+            lower[i] = domains[name].lower_bound
+            upper[i] = domains[name].upper_bound
+    large = 1e30  # beyond it, a bound is that of floating-point numbers
+    return np.where(lower < -large, -np.inf, lower), np.where(upper > large, np.inf, upper)
+
+
+def _guess_scale(name: str, domains: Mapping[str, Any]) -> float:
+    """Return the typical size of an unknown whose first value is zero."""
+    if name.endswith(fit_problem.OFFSET_SUFFIX):
+        return 0.01  # s or rad
+    return 10.0 if name in domains and domains[name].unit != "1" else 1.0
+
+
+def _arrange_conditions(
+    table: fit_data.FitData, row_walks: Any, row_steps: Any, n_steps: int, n_walks: int
+) -> dict[str, Any]:
+    """Return the conditions of each row of gaits, or of each walk and its steps."""
+    conditions = {name: np.asarray(x, float) for name, x in table.conditions.items()}
+    if table.kind == "gaits":
+        return {name: jnp.asarray(x) for name, x in conditions.items()}
+    arranged = {}
+    for name, column in conditions.items():
+        by_walk = [column[row_walks == walk] for walk in range(n_walks)]
+        is_constant = all(np.ptp(x) == 0.0 for x in by_walk)
+        if name == fit_problem.HEIGHT_NAME or (not is_constant and name == "slope"):
+            if table.kind != "steps":
+                raise ValueError(
+                    f"{name} varies in a time series, which needs even ground: fit the steps."
+                )
+            # The ground goes on with the last value where a walk has fewer steps.
+            values = np.tile([[x[-1]] for x in by_walk], (1, n_steps))
+            values[row_walks, row_steps] = column
+            if name == fit_problem.HEIGHT_NAME:
+                values = np.concatenate([np.zeros((n_walks, 1)), values], 1)
+            arranged[name] = jnp.asarray(values)
+        elif is_constant:
+            arranged[name] = jnp.asarray([x[0] for x in by_walk])
+        else:
+            raise ValueError(
+                f"{name} varies within a walk, but only slopes and heights may: give one value "
+                "for each walk."
+            )
+    return arranged
+
+
+def _make_search_starts(
+    first: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    bounds: Mapping[str, Any],
+    names: Sequence[str],
+    free: Sequence[str],
+    n_starts: int,
+) -> np.ndarray:
+    """Return the first values of all searches: the given walker, and random ones around it."""
+    shares = np.random.default_rng(0).random((n_starts, len(first)))
+    starts = np.tile(first, (n_starts, 1))
+    for i, name in enumerate(names):
+        if name in bounds:
+            starts[1:, i] = lower[i] + shares[1:, i] * (upper[i] - lower[i])
+        elif name in free and first[i] != 0.0:
+            starts[1:, i] = first[i] * START_RANGE_FACTOR ** (2.0 * shares[1:, i] - 1.0)
+    return np.clip(starts, lower, upper)
+
+
+@announce_wait("predictions with derivatives, and their fit for each law", "60 s")
+def compare_laws(
+    data: Any,
+    params: Any,
+    free: Sequence[str] = ("damping", "stiffness"),
+    *,
+    laws: Mapping[str, Any] | None = None,
+    model: Any = None,
+    n_folds: int = N_FOLDS,
+    **fit_options: Any,
+) -> xr.Dataset:
+    """Fit several laws of the legs to the same data, and compare them.
+
+    Akaike's criterion is chi2 plus twice the number of unknowns; the law with the smallest value
+    predicts new data best. A prediction error is that of rows that were left out of the fit, in
+    standard errors; it is 1 for a perfect law.
+
+    Args:
+        data: as in `fit`.
+        params: the wheel at which each search starts.
+        free: names of the unknown parameters of all laws.
+        laws: further laws by name, as for `ViscoelasticWheel(leg_force=...)`. All parameters of a
+            law are unknown. Always compared are "linear", the paper's law, "quadratic damper" and
+            "progressive spring", which add one parameter each.
+        model: the model whose law is replaced; `ViscoelasticWheel()` by default.
+        n_folds: number of parts into which the rows are divided for the prediction; 0 for none.
+        fit_options: further arguments of `fit`.
+
+    Returns:
+        A dataset over `law` with `chi2`, `n_unknowns`, `aic`, `aic_difference`, `p_value`,
+        `prediction_error` and `converged`. Its attribute `best` is the law with the smallest
+        criterion, and `fits` contains each `FitResult` by name.
+
+    Raises:
+        TypeError, ValueError: as for `fit`.
+
+    Examples:
+        >>> slopes = np.linspace(0.28, 0.32, 5)
+        >>> cycles = vrw.limit_cycles(vrw.WheelParams(damping=150.0, slope=slopes))
+        >>> data = {"slope": slopes, "period": cycles.period, "period_error": [1e-3]}
+        >>> data |= {"dls_fraction": cycles.dls_fraction, "dls_fraction_error": [1e-3]}
+        >>> table = vrw.compare_laws(data, vrw.WheelParams(damping=160.0), n_folds=0)
+        >>> table.attrs["best"]
+        'linear'
+    """
+    laws = make_leg_laws(params) | dict(laws or {})
+    n_folds = check_int("n_folds", n_folds, 0)
+    base_model: Any = resolve_finder(params, model, None).model
+    if not hasattr(base_model, "leg_force"):
+        raise TypeError(
+            f"model is a {type(base_model).__name__}, which has no law of its own for the legs: "
+            "give vrw.ViscoelasticWheel()."
+        )
+    fits, prediction_errors = {}, []
+    for name, law in laws.items():
+        law_model = dataclasses.replace(base_model, leg_force=law)
+        law_names = [x.name for x in list_parameters(law_model.leg_force, "leg")]
+        fits[name] = fit(data, params, (*free, *law_names), model=law_model, **fit_options)
+        prediction_errors.append(_predict_left_out(fits[name], n_folds))
+    columns: dict[str, Any] = {
+        "chi2": [x.chi2 for x in fits.values()],
+        "n_unknowns": [len(x.names) for x in fits.values()],
+        "p_value": [x.p_value for x in fits.values()],
+        "prediction_error": prediction_errors,
+        "converged": [x.converged for x in fits.values()],
+    }
+    has_batch = np.ndim(columns["chi2"]) > 1
+    dims = ("law", *(fit_data.DATASET_DIMENSION,) * has_batch)
+    aic = np.asarray(columns["chi2"]) + 2.0 * np.expand_dims(
+        np.asarray(columns["n_unknowns"]), 1 if has_batch else ()
+    )
+    columns |= {"aic": aic, "aic_difference": aic - aic.min(0)}
+    names = list(laws)
+    table = xr.Dataset(
+        {
+            name: (dims if np.ndim(x) == len(dims) else dims[:1], np.asarray(x))
+            for name, x in columns.items()
+        },
+        {"law": names},
+    )
+    table.attrs["best"] = np.array(names)[aic.argmin(0)] if has_batch else names[int(aic.argmin())]
+    table.attrs["fits"] = fits
+    return table
+
+
+def _predict_left_out(result: FitResult, n_folds: int) -> Any:
+    """Return the root mean square of the residuals of rows that were left out of the fit.
+
+    The rows are divided into parts, of which each is left out in turn.
+    """
+    n_rows = result.data.values.shape[1]
+    is_batch = result.values.ndim > 1
+    shape = (len(result.values),) if is_batch else ()
+    if not n_folds:
+        return np.full(shape, np.nan)[()]
+    n_folds = min(n_folds, n_rows)
+    squares = np.zeros(shape)
+    for fold in range(n_folds):
+        is_left_out = np.arange(n_rows) % n_folds == fold
+        targets = result.target if is_batch else FitTarget(*(x[None] for x in result.target))
+        kept = targets._replace(row_weights=np.where(is_left_out, 0.0, 1.0)[None])
+        solution = solve_fits(result.problem, kept, np.atleast_2d(result.values))
+        left_out = targets._replace(row_weights=np.where(is_left_out, 1.0, 0.0)[None])
+        whitened = summarize(result.problem, left_out, solution).whitened
+        squares = squares + (whitened**2).sum((-2, -1)).reshape(shape)
+    return np.sqrt(squares / result.data.values[0].size)[()]
