@@ -77,6 +77,7 @@ SLOW_FUNCTIONS = {
     "map_special_points",
     "fit",
     "compare_laws",
+    "phase_response",
 }
 """Those that compile for minutes where nothing is kept."""
 
@@ -224,6 +225,9 @@ GAITS = {
             max_evaluations=1,
         )
     ),
+    "phase_response": lambda m: is_successful(
+        lambda: vrw.phase_response(PULLED_WHEEL, model=m, n_samples=2)
+    ),
     "fit": lambda m: vrw.fit(ONE_GAIT, PULLED_WHEEL, ["stiffness"], model=m, n_starts=1).converged,
     "compare_laws": lambda m: vrw.compare_laws(
         ONE_GAIT, PULLED_WHEEL, ["stiffness"], model=m, n_folds=0, n_starts=1
@@ -249,7 +253,7 @@ def test_every_function_with_a_model_argument_is_tested_with_both_options():
     # These report no margin of friction, or only how it varies.
     measured = {"step_batch", "walk", "simulate", "return_map", "gait_sensitivity"}
     measured |= {"first_passage", "basin_share", "smallest_disturbance", "measure_basins"}
-    measured |= {"measure_gait_sensitivity", "fit", "compare_laws"}
+    measured |= {"measure_gait_sensitivity", "fit", "compare_laws", "phase_response"}
     assert taking - measured == set(FRICTION)
 
 

@@ -240,3 +240,25 @@ def test_the_sequence_of_events_changes_where_a_second_leg_touches():
     assert change.kind == "order_of_events_changes"
     assert abs(change.value - 0.5) < 1e-9
     assert branch.values[[0, -1]].tolist() == [0.2, 0.8]
+
+
+class JuggledBall(vrw.AbstractWalker):
+    """A ball that a paddle hits with the same kick each time, in closed form."""
+
+    def advance(self, params, x, options):
+        v = params["restitution"] * x + params["kick"]
+        return vrw.AdvanceResult(v, 2.0 * v / 9.81)
+
+
+def test_a_branch_of_a_walker_in_closed_form_has_its_states_and_periods():
+    params, ball = {"restitution": 0.5, "kick": 1.0}, JuggledBall()
+    gait = vrw.limit_cycle(params, model=ball, guess=[1.0])
+    branch = vrw.continue_branch(params, "kick", (0.5, 2.0), model=ball, cycle=gait).dataset
+    velocities = branch.kick.values / (1.0 - 0.5)
+    # Newton's method ends at 1e-10 of the state.
+    np.testing.assert_allclose(branch.x.values[:, 0], velocities, rtol=1e-9)
+    np.testing.assert_allclose(branch.period, 2.0 * velocities / 9.81, rtol=1e-9)
+    with pytest.raises(ValueError, match="JuggledBall does not define"):
+        vrw.continue_branch(
+            params, "kick", (0.5, 2.0), model=ball, cycle=gait, margins={"m": lambda y, p: y[0]}
+        )

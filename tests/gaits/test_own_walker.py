@@ -177,6 +177,20 @@ CALLS = {
         model=BALL_SYSTEM,
         cycle=vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM),
     ),
+    "vrw.phase_response": lambda: vrw.phase_response(
+        BALL_PARAMS,
+        model=BALL_SYSTEM,
+        cycle=vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM),
+        n_samples=2,
+        n_steps=1,
+    ),
+    "vrw.fit": lambda: vrw.fit(
+        {"step": [0], "period": [0.4], "period_error": [0.1]},
+        BALL_PARAMS,
+        ["kick"],
+        model=BALL_SYSTEM,
+        start=[2.0],
+    ),
     "vrw.scan": lambda: vrw.scan(vrw.samples(kick=[1.0]), base=BALL_PARAMS, model=BALL_SYSTEM),
     "vrw.tune": lambda: vrw.tune(
         BALL_PARAMS, "period", ["kick"], {"kick": (0.9, 1.1)}, model=BALL_SYSTEM

@@ -153,8 +153,11 @@ def test_float32_works_if_requested():
         (lambda: vrw.WheelParams(c=100), "c is called damping: write damping"),
         (lambda: vrw.WheelParams(Ls=1.02), "Ls is called natural_length"),
         (lambda: vrw.WheelParams(n=8), "n is called n_legs"),
-        (lambda: vrw.grid(c=[100.0, 150.0]), "c is called damping"),
-        (lambda: vrw.sobol({"mu": (0.5, 0.8)}, n=4), "mu is called friction"),
+        (lambda: vrw.scan(vrw.grid(c=[100.0, 150.0])), "c is called damping"),
+        (
+            lambda: vrw.scan(vrw.sobol({"mu": (0.5, 0.8)}, n=4), model=vrw.UnilateralWheel()),
+            "mu is called friction",
+        ),
         (lambda: vrw.continue_branch(vrw.WheelParams(), "k", (400.0, 600.0)), "k is called stiff"),
         (
             lambda: vrw.tune(vrw.WheelParams(), "speed", ("c",), {"c": (150.0, 200.0)}),

@@ -178,7 +178,7 @@ def test_forces_that_grow_together_are_not_identifiable(small_fit):
 
 
 def test_a_prior_counts_as_a_measurement(small_fit):
-    """The reference is the sum of two informations, to first order in the small shift."""
+    """The reference is the sum of the information of both, to first order in the small shift."""
     error = small_fit.error("damping")
     prior = {"damping": (small_fit["damping"], error)}
     result = vrw.fit(SMALL_GAIT, SMALL_WHEEL, priors=prior)

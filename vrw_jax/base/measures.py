@@ -83,8 +83,8 @@ class Measure:
 
 def find_own_measures(measures: Any) -> dict[str, Measure]:
     """Return the measures of the user among names and measures, by name."""
-    given = () if measures is None or isinstance(measures, str) else measures
-    given = (given,) if isinstance(given, Measure) else given
+    given = (measures,) if isinstance(measures, Measure) else measures
+    given = given if isinstance(given, list | tuple) else ()
     return {measure.name: measure for measure in given if isinstance(measure, Measure)}
 
 

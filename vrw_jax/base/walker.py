@@ -47,8 +47,8 @@ class AdvanceResult(eqx.Module):
 
     @property
     def duration(self) -> Array:
-        """Return the duration of the step, s."""
-        return jnp.sum(self.durations, 0)
+        """Return the duration of the step, s, or those of a batch on the first axis."""
+        return jnp.sum(jnp.asarray(self.durations), -1)
 
 
 class AbstractWalker(abc.ABC):
@@ -111,11 +111,16 @@ class AbstractWalker(abc.ABC):
 
         The arguments are shapes, and `name` is "x" for section coordinates.
         """
-        end = jax.eval_shape(self.advance, params, x, StepOptions()).section_state
-        if end.shape != x.shape:
+        end = jax.eval_shape(self.advance, params, x, StepOptions())
+        if end.section_state.shape != x.shape:
             raise ValueError(
-                f"advance returns section coordinates of shape {end.shape} for {name} of shape "
-                f"{x.shape}: both must be the same."
+                f"advance returns section coordinates of shape {end.section_state.shape} for "
+                f"{name} of shape {x.shape}: both must be the same."
+            )
+        if len(end.durations.shape) != 1:
+            raise ValueError(
+                f"advance returns durations of shape {end.durations.shape}, but they have one "
+                "entry for each phase of the step: give a vector."
             )
 
 
