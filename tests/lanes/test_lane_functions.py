@@ -265,3 +265,25 @@ def test_indices_out_of_range_and_powers_of_special_values_agree_with_jax():
     )
     powers = lanes.jit(lambda x, y: jnp.power(x, y)).batch(bases, exponents)
     np.testing.assert_allclose(powers, jnp.power(bases, exponents), rtol=1e-15)  # one rounding
+
+
+def test_inverse_functions_agree_with_those_of_numpy_to_round_off():
+    large = np.array([0.0, 1e-300, 1e-9, 0.3, 0.9, 1.0, 1.7, 40.0, 1e200, np.inf])
+    small = np.concatenate([-large[large <= 1.0], large[large <= 1.0], [0.99999999, np.nan]])
+    y, x = map(
+        np.ravel, np.meshgrid(np.concatenate([-large[1:], large]), [-np.inf, -2.0, 0.0, 3.0])
+    )
+    cases = [(jnp.arctan2, (y, x)), (jnp.arctan, (y,)), (jnp.arcsinh, (y,))]
+    cases += [(f, (small,)) for f in (jnp.arcsin, jnp.arccos, jnp.arctanh)]
+    cases += [(jnp.arccosh, (1.0 + large,))]
+    for function, arguments in cases:
+        values = lanes.jit(lambda *x, f=function: f(*x)).batch(*arguments)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected = getattr(np, function.__name__)(*arguments)
+        # a few rounding errors; arctan2 of (-0, x) is not among the cases
+        np.testing.assert_allclose(values, expected, rtol=2e-15, atol=1e-300, err_msg=str(function))
+    np.testing.assert_allclose(
+        jax.vmap(jax.grad(lanes.jit(jnp.arctan)))(np.array([0.3, -2.0])),
+        1.0 / (1.0 + np.array([0.09, 4.0])),
+        rtol=1e-15,
+    )

@@ -1,6 +1,7 @@
 """Primitives without a rule of their own, written for one lane in terms of others."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -141,6 +142,63 @@ def _sinh(x: jax.Array, **_: Any) -> jax.Array:
     return jnp.where(x < 0.0, -magnitude, magnitude)
 
 
+def _atan2(y: jax.Array, x: jax.Array, **_: Any) -> jax.Array:
+    """Return the angle of a vector: that of a polynomial with an error of 1e-5 (Abramowitz and
+    Stegun 4.4.49), corrected by the sine of its difference to the angle.
+    """
+    is_below = y < 0.0
+    is_infinite = jnp.isinf(x) | jnp.isinf(y)
+    shrink = lambda z: jnp.where(jnp.isinf(z), jnp.where(z < 0.0, -1.0, 1.0), 0.0)
+    y, x = (jnp.where(is_infinite, shrink(z), z) for z in (y, x))
+    largest = jnp.maximum(jnp.abs(x), jnp.abs(y))
+    scale = jnp.where(largest == 0.0, 1.0, largest)
+    y, x = y / scale, x / scale
+    ratio = jnp.minimum(jnp.abs(x), jnp.abs(y))
+    square = ratio * ratio
+    angle = ratio * (
+        0.9998660
+        + square * (-0.3302995 + square * (0.1801410 + square * (-0.0851330 + square * 0.0208351)))
+    )
+    angle = jnp.where(jnp.abs(y) > jnp.abs(x), 0.5 * jnp.pi - angle, angle)
+    angle = jnp.where(x < 0.0, jnp.pi - angle, angle)
+    angle = jnp.where(is_below, -angle, angle)
+    radius = jnp.sqrt(x * x + y * y)
+    sine = (y * jnp.cos(angle) - x * jnp.sin(angle)) / jnp.where(radius == 0.0, 1.0, radius)
+    return angle + (sine + sine * sine * sine / 6.0)
+
+
+def _asin(x: jax.Array, **_: Any) -> jax.Array:
+    return _atan2(x, jnp.sqrt((1.0 - x) * (1.0 + x)))
+
+
+def _acos(x: jax.Array, **_: Any) -> jax.Array:
+    return _atan2(jnp.sqrt((1.0 - x) * (1.0 + x)), x)
+
+
+def _asinh(x: jax.Array, **_: Any) -> jax.Array:
+    size = jnp.abs(x)
+    is_large = size > 1e8  # 1 + size**2 is size**2 to round-off
+    part = jnp.where(is_large, 0.0, size)
+    magnitude = _log1p(part + part * part / (1.0 + jnp.sqrt(1.0 + part * part)))
+    magnitude = jnp.where(is_large, jnp.log(size) + math.log(2.0), magnitude)
+    return jnp.where(x < 0.0, -magnitude, magnitude)
+
+
+def _acosh(x: jax.Array, **_: Any) -> jax.Array:
+    is_large = x > 1e8
+    part = jnp.where(is_large, 1.0, x)
+    magnitude = _log1p((part - 1.0) + jnp.sqrt((part - 1.0) * (part + 1.0)))
+    return jnp.where(is_large, jnp.log(x) + math.log(2.0), magnitude)
+
+
+def _atanh(x: jax.Array, **_: Any) -> jax.Array:
+    size = jnp.abs(x)
+    part = jnp.where(size == 1.0, 0.0, size)
+    magnitude = 0.5 * _log1p(2.0 * part / (1.0 - part))
+    magnitude = jnp.where(size == 1.0, jnp.inf, magnitude)
+    return jnp.where(x < 0.0, -magnitude, magnitude)
+
+
 def _pow(x: jax.Array, y: jax.Array, **_: Any) -> jax.Array:
     if not jnp.issubdtype(y.dtype, jnp.floating):
         y = y.astype(x.dtype)
@@ -161,8 +219,15 @@ def _cbrt(x: jax.Array, **_: Any) -> jax.Array:
 
 
 DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
+    "acos": _acos,
+    "acosh": _acosh,
     "argmax": functools.partial(_find_extremum, lax.gt),
     "argmin": functools.partial(_find_extremum, lax.lt),
+    "asin": _asin,
+    "asinh": _asinh,
+    "atan": lambda x, **_: _atan2(x, jnp.ones_like(x)),
+    "atan2": _atan2,
+    "atanh": _atanh,
     "cbrt": _cbrt,
     "ceil": lambda x: -jnp.floor(-x),
     "clamp": lambda lower, x, upper: jnp.minimum(jnp.maximum(x, lower), upper),
