@@ -33,7 +33,7 @@ SLOW_EXAMPLES = {
     "measure_to_tolerance", "MeasureResult", "multifidelity_mean", "MultifidelityMean",
     "gait_sensitivity", "GaitSensitivity", "measure_gait_sensitivity",
     "smallest_disturbance", "phase_response", "PhaseResponse", "tune", "TuneResult",
-    "ReturnMapCycle", "compare_laws",
+    "ReturnMapCycle", "compare_laws", "OptimumCurve",
     "WheelObjective", "measure_basins", "FirstPassage", "SmallestDisturbance",
 }  # fmt: skip
 """Names whose examples compile for a minute, or compute for seconds what other tests cover."""
