@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 
-from vrw_jax.base.checks import check_real
+from vrw_jax.base.checks import check_real, require_known_name
 
 
 class ParameterDomain(NamedTuple):
@@ -135,3 +135,17 @@ def list_tree_parameters(params: Any) -> list[ModuleParameter]:
         domain = domain._replace(symbol=domain.symbol or names[-1])
         parameters.append(ModuleParameter(".".join(names), value, domain, 1.0))
     return parameters
+
+
+def find_tree_parameter(params: Any, name: str) -> int:
+    """Return the index of a parameter among the leaves of a tree, or raise an error."""
+    names = tuple(parameter.name for parameter in list_tree_parameters(params))
+    require_known_name(name, names, "parameter")
+    return names.index(name)
+
+
+def replace_tree_parameter(params: Any, name: str, value: Any) -> Any:
+    """Return a tree of parameters with another value of the parameter with a name."""
+    leaves, structure = jax.tree.flatten(params)
+    leaves[find_tree_parameter(params, name)] = value
+    return jax.tree.unflatten(structure, leaves)

@@ -15,9 +15,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base.checks import check_callable, check_int, check_type, require_known_name
+from vrw_jax.base.checks import check_callable, check_int, check_type
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.walker import AbstractWalker, make_return_map, step_batch_of_walker
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Branch, SpecialPoint
@@ -54,7 +55,7 @@ class HybridGaitFinder:
 
     def find(self, section_state: np.ndarray, p: float) -> HybridGait:
         """Return the gait near a section state at the value p of the parameter."""
-        params = replace_parameter(self.params, self.name, p)
+        params = replace_tree_parameter(self.params, self.name, p)
         return find_hybrid_gait(self.walker, params, section_state, self.period_n, self.options)
 
 
@@ -88,7 +89,7 @@ class HybridContinuation(AbstractMapContinuation):
 
     def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
         finder, states = self.gait_finder, self.state_units * points.z
-        params = replace_parameter(wheels, finder.name, points.p)
+        params = replace_tree_parameter(wheels, finder.name, points.p)
         quantities = {"x": states, "period": np.zeros(len(states))}
         codes, outcome = [], np.full(len(states), int(Outcome.STEPPED))
         minima = np.full((len(states), len(self.margins)), np.inf)
@@ -197,12 +198,13 @@ def continue_hybrid_branch(
     for margin_name, margin in margins.items():
         check_callable(f"margin {margin_name!r}", margin, "of state and parameters")
     n_periods = SWITCHED_KINDS.get(switch_at.kind, 1) if isinstance(switch_at, SpecialPoint) else 1
-    start_value = float(find_parameter(params, name))
+    start_value = float(jax.tree.leaves(params)[find_tree_parameter(params, name)])
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
     finder = HybridGaitFinder(walker, params, name, n_periods * period_n, step_options)
 
     def map_section_state(params: Any, x: Array, value: Array) -> Array:
-        take_step = make_return_map(walker, replace_parameter(params, name, value), step_options)
+        step_params = replace_tree_parameter(params, name, value)
+        take_step = make_return_map(walker, step_params, step_options)
         for _ in range(period_n):
             x = take_step(x)
         return x
@@ -212,20 +214,3 @@ def continue_hybrid_branch(
         map_section_state, gait.section_state, start_value, bounds, params, name, None, options,
         switch_at,
     )  # fmt: skip
-
-
-def find_parameter(params: Any, name: str) -> Any:
-    """Return the entry of a tree of parameters with a name such as `stiffness` or `leg.damping`."""
-    first, _, rest = name.partition(".")
-    if isinstance(params, Mapping):
-        require_known_name(first, tuple(params), "parameter")
-        entry = params[first]
-    else:
-        require_known_name(first, tuple(getattr(params, "__annotations__", {})), "parameter")
-        entry = getattr(params, first)
-    return find_parameter(entry, rest) if rest else entry
-
-
-def replace_parameter(params: Any, name: str, value: Any) -> Any:
-    """Return the tree of parameters with another value of the entry with a name."""
-    return eqx.tree_at(lambda tree: find_parameter(tree, name), params, value)

@@ -114,10 +114,8 @@ def fit(
         observe=observe, covariance=covariance, window=window, n_starts=n_starts, options=options,
     )  # fmt: skip
     if not table.is_batch:
-        targets = FitTarget(*(np.repeat(x, len(starts), 0) for x in targets))
         return make_result(problem, targets, starts, table, units, params, walker, is_batch=False)
     mean_targets = targets._replace(values=targets.values.mean(0, keepdims=True))
-    mean_targets = FitTarget(*(np.repeat(x, len(starts), 0) for x in mean_targets))
     mean_fit = make_result(
         problem, mean_targets, starts, table, units, params, walker, is_batch=False
     )

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import list_tree_parameters
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.lanes.batching import map_in_batches
 
@@ -361,10 +362,7 @@ def list_parameter_names(walker: Any, params_structure: Any) -> tuple[str, ...]:
     if not isinstance(walker, HybridSystem):
         return walker.parameter_names
     tree = jax.tree.unflatten(params_structure, [0.0] * params_structure.num_leaves)
-    return tuple(
-        jax.tree_util.keystr(path, simple=True, separator=".")
-        for path, _ in jax.tree_util.tree_leaves_with_path(tree)
-    )
+    return tuple(parameter.name for parameter in list_tree_parameters(tree))
 
 
 def list_start_names(system: HybridSystem | None, size: int) -> tuple[str, ...]:
@@ -545,7 +543,11 @@ def _fit_batch(problem: FitProblem, targets: FitTarget, starts: Array) -> FitSol
             throw=False,
         )
         x = problem.transform(solution.value)
-        predict = lambda x: (problem.predict(x).values, problem.predict(x))
+
+        def predict(x: Array) -> tuple[Array, Prediction]:
+            prediction = problem.predict(x)
+            return prediction.values, prediction
+
         jacobian, prediction = jax.jacfwd(predict, has_aux=True)(x)
         has_ended = solution.stats["num_steps"] < MAX_ITERATIONS
         return FitSolution(x, prediction.values, jacobian, prediction.is_valid, has_ended)
