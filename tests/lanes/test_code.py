@@ -105,9 +105,21 @@ def test_another_batch_is_neither_traced_nor_compiled_again_without_a_store(proc
         for n in (5, 8, 11):
             x = jnp.arange(n) + 1.0
             np.testing.assert_array_equal(jax.jit(call)(x), 2.0 * x)
-        assert process.n_traces == 1
+        assert len(set(process.names)) == 1
         jax.jit(call)(jnp.ones(1))
-        assert process.n_traces == 2  # a lone lane has code of its own
+        assert len(set(process.names)) == 2  # a lone lane has code of its own
+        assert process.n_traces == 1
+
+
+def test_a_function_that_is_mapped_compiles_no_code_for_one_lane(process):
+    double = lanes.jit_batch(lambda x: 2.0 * x)
+    np.testing.assert_array_equal(jax.vmap(jax.jit(double))(X), 2.0 * X)
+    assert (len(process.names), process.n_traces) == (1, 1)
+    process.reset_registry()
+    np.testing.assert_array_equal(jax.jit(jax.vmap(double))(X), 2.0 * X)
+    assert process.n_traces == 1  # the trace of one lane was saved without code
+    assert jax.jit(double)(X[1]) == 2.0
+    assert len(set(process.names)) == 2
 
 
 def test_code_is_loaded_by_its_name(process):

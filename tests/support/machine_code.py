@@ -1,6 +1,7 @@
 """Replace the registry of machine code by one that can be emptied, as in a new process."""
 
 import contextlib
+from collections import OrderedDict
 
 import jax
 from jax.experimental.compilation_cache import compilation_cache
@@ -51,6 +52,7 @@ class CodeRegistrySpy:
     def reset_registry(self):
         for name in ("_machine_code_by_name", "_lane_program_by_index_name"):
             self._monkeypatch.setattr(code, name, {})
+        self._monkeypatch.setattr(code, "_recent_traces", OrderedDict())
         self._monkeypatch.setattr(program, "_lane_kernels", {})
         registered = PersistentRegistry()
         for module in (ffi, program):

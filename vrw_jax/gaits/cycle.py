@@ -187,7 +187,7 @@ class AbstractCycle(AbstractPrintable):
         return format_each_batch_element(describe_element, flat_indices, failed_checks)
 
     @property
-    @announce_wait("the search for the last gait on the way from Table 1", "a minute")
+    @announce_wait("the search for the last gait on the way from Table 1", "30 s")
     def why(self) -> Any:
         """Return the sentence of `ending`, which contains the reason if no gait was found.
 

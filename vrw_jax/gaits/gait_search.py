@@ -103,7 +103,7 @@ def limit_cycle(
 
 
 @with_default_jax_settings
-@announce_wait("the search for a gait", "10 s, or 50 s if it finds no gait")
+@announce_wait("the search for a gait", "10 s, or 30 s if it finds no gait")
 def limit_cycle(
     params: Any,
     *,
@@ -188,7 +188,7 @@ def limit_cycle(
 
 
 @with_default_jax_settings
-@announce_wait("the search for gaits", "10 s, or 50 s if it finds no gait")
+@announce_wait("the search for gaits", "10 s, or 30 s if it finds no gait")
 def limit_cycles(
     params: Any,
     *,

@@ -8,14 +8,17 @@ by the same name as before the edit.
 """
 
 import contextlib
+import functools
 import gc
 import hashlib
 import json
 import pickle
 import warnings
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
+from dataclasses import dataclass, field
 from threading import RLock
 from typing import Any, NamedTuple
 
@@ -44,11 +47,25 @@ class MachineCode(NamedTuple):
     object_code_future: Future[bytes]
 
 
-class LaneProgram(NamedTuple):
-    """Machine code of a function, and the tree structure of the function's results."""
+@dataclass(unsafe_hash=True)
+class LaneProgram:
+    """Results of a function over lanes, and its machine code, which is compiled when it is needed.
 
-    machine_code: MachineCode
-    result_structure: Any
+    A program that JAX traces without its batch, and then maps over the batch, needs no code.
+    """
+
+    name: str  # Programs with equal names are equal.
+    result_shapes_and_dtypes: ResultShapesAndDtypes = field(compare=False)
+    result_structure: Any = field(compare=False)
+    compile_code: Callable[[], MachineCode] = field(compare=False)
+
+    @functools.cached_property
+    def machine_code(self) -> MachineCode:
+        """Machine code of the function. It raises an error of a function that has none."""
+        with _jax_tracing_lock, _pause_garbage_collection():
+            machine_code = self.compile_code()
+        self.compile_code = lambda: machine_code  # releases the trace
+        return machine_code
 
 
 def get_lane_program(
@@ -69,81 +86,142 @@ def get_lane_program(
     - `lanes_per_group`: number of lanes that the code computes at a time.
     """
     if function_key is None:
-        return _compile_lane_program(
-            lane_function, argument_shapes, None, lanes_per_group, max_unrolled_entries
+        return _trace_lane_program(
+            lane_function, argument_shapes, None, None, lanes_per_group, max_unrolled_entries
         )
-    index_key = (
+    trace_key = (
         function_key,
         [(x.shape, x.dtype.name, bool(getattr(x, "weak_type", False))) for x in argument_shapes],
-        lanes_per_group,
         max_unrolled_entries,
         disk_cache.describe_trace_environment(),
         describe_compiler_settings(),
     )
-    index_name = f"lanes_index_{hashlib.sha256(repr(index_key).encode()).hexdigest()}"
+    trace_name, index_digest = (
+        hashlib.sha256(repr(key).encode()).hexdigest()
+        for key in (trace_key, (trace_key, lanes_per_group))
+    )
+    index_name = f"lanes_index_{index_digest}"
     if index_name not in _lane_program_by_index_name:
-        _lane_program_by_index_name[index_name] = _load_lane_program(
-            index_name
-        ) or _compile_lane_program(
-            lane_function, argument_shapes, index_name, lanes_per_group, max_unrolled_entries
+        trace_program = functools.partial(
+            _trace_lane_program,
+            lane_function,
+            argument_shapes,
+            trace_name,
+            index_name,
+            lanes_per_group,
+            max_unrolled_entries,
+        )
+        _lane_program_by_index_name[index_name] = (
+            _load_lane_program(index_name, trace_program) or trace_program()
         )
     return _lane_program_by_index_name[index_name]
 
 
-def _load_lane_program(index_name: str) -> LaneProgram | None:
-    """Return the program that an index record names, or None."""
-    encoded_name, _, pickled_skeleton = (disk_cache.load_cache_record(index_name) or b"").partition(
-        b"\n"
-    )
+def _load_lane_program(
+    index_name: str, trace_program: Callable[[], LaneProgram]
+) -> LaneProgram | None:
+    """Return the program that an index record describes, or None.
+
+    - `trace_program`: function that traces the program, if it has been traced but never compiled.
+    """
+    encoded_name, _, content = (disk_cache.load_cache_record(index_name) or b"").partition(b"\n")
+    encoded_result_types, _, pickled_skeleton = content.partition(b"\n")
     if not pickled_skeleton:
         return None
     try:
-        skeleton = pickle.loads(pickled_skeleton)
-        machine_code = load_machine_code(encoded_name.decode("ascii"))
+        structure = jax.tree.structure(pickle.loads(pickled_skeleton))
+        result_types = _parse_result_shapes_and_dtypes(encoded_result_types)
+        machine_code = load_machine_code(encoded_name.decode("ascii")) if encoded_name else None
     except Exception:  # Damaged bytes may raise any exception.
         disk_cache.warn_of_unusable_cache_record(f"{index_name} is no index of code")
         return None
-    return machine_code and LaneProgram(machine_code, jax.tree.structure(skeleton))
+    if encoded_name and machine_code is None:
+        return None
+    return LaneProgram(
+        index_name, result_types, structure, lambda: machine_code or trace_program().machine_code
+    )
 
 
 @with_default_jax_settings  # The trace has calls also where the caller has disabled `jax.jit`.
-def _compile_lane_program(
+def _trace_lane_program(
     lane_function: Callable,
     argument_shapes: Any,
+    trace_name: str | None,
     index_name: str | None,
     lanes_per_group: int,
     max_unrolled_entries: int,
 ) -> LaneProgram:
-    """Trace a function, and compile it in the background unless its LLVM text is known."""
+    """Return a program that is compiled in the background when its code is needed.
+
+    The trace is that of the last program named `trace_name` for another number of lanes, if any.
+    """
     with _jax_tracing_lock, _pause_garbage_collection():
-        closed_jaxpr, result_structure = trace_for_machine_code(lane_function, *argument_shapes)
-        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, max_unrolled_entries)
+        trace = _recent_traces.get(trace_name) or trace_for_machine_code(
+            lane_function, *argument_shapes
+        )
+    if trace_name is not None:
+        _recent_traces[trace_name] = trace
+        if len(_recent_traces) > MAX_RECENT_TRACES:
+            _recent_traces.popitem(last=False)
+    closed_jaxpr, result_structure = trace
     encoded_result_types = json.dumps(
         [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
     )
+
+    def save_index(code_name: str = "") -> None:
+        """Save the name of the code, which is empty before it is compiled."""
+        skeleton = jax.tree.unflatten(result_structure, range(result_structure.num_leaves))
+        # A class inside a function cannot be pickled.
+        with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
+            record = f"{code_name}\n{encoded_result_types}\n".encode() + pickle.dumps(skeleton)
+            disk_cache.save_cache_record(str(index_name), record)
+
+    compile_code = lambda: _compile_trace(
+        closed_jaxpr,
+        encoded_result_types,
+        save_index if index_name else None,
+        lanes_per_group,
+        max_unrolled_entries,
+    )
+    if index_name:
+        save_index()
+    else:
+        machine_code = compile_code()
+        index_name, compile_code = machine_code.ffi_target_name, lambda: machine_code
+    return LaneProgram(
+        index_name,
+        _parse_result_shapes_and_dtypes(encoded_result_types),
+        result_structure,
+        compile_code,
+    )
+
+
+def _compile_trace(
+    closed_jaxpr: ClosedJaxpr,
+    encoded_result_types: str,
+    save_index: Callable[[str], None] | None,
+    lanes_per_group: int,
+    max_unrolled_entries: int,
+) -> MachineCode:
+    """Compile a trace in the background, unless its LLVM text is known.
+
+    - `save_index`: function that saves the name of the code; None if nothing is saved.
+    """
+    llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, max_unrolled_entries)
     digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
     code_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
-    is_saved = index_name is not None
-
-    def save_index() -> None:
-        skeleton = jax.tree.unflatten(result_structure, range(result_structure.num_leaves))
-        with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
-            if index_name is not None:  # A class inside a function cannot be pickled.
-                disk_cache.save_cache_record(
-                    index_name, code_name.encode() + b"\n" + pickle.dumps(skeleton)
-                )
 
     def compile_and_save_code() -> bytes:
         object_code = compile_llvm_for_processor(llvm_text)
-        if is_saved:
+        if save_index:
             encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
             disk_cache.save_cache_record(code_name, encoded_machine_code)
-            save_index()
+            save_index(code_name)
         return object_code
 
     # Another trace may have given the same LLVM text.
     machine_code = (
-        load_machine_code(code_name) if is_saved else _machine_code_by_name.get(code_name)
+        load_machine_code(code_name) if save_index else _machine_code_by_name.get(code_name)
     )
     if machine_code is None:
         machine_code = _machine_code_by_name[code_name] = MachineCode(
@@ -151,9 +229,9 @@ def _compile_lane_program(
             _parse_result_shapes_and_dtypes(encoded_result_types),
             _llvm_compiler_pool.submit(compile_and_save_code),
         )
-    else:
-        save_index()
-    return LaneProgram(machine_code, result_structure)
+    elif save_index:
+        save_index(code_name)
+    return machine_code
 
 
 def load_machine_code(code_name: str) -> MachineCode | None:
@@ -190,6 +268,9 @@ _machine_code_by_name: dict[str, MachineCode] = {}
 """Machine code of this process by its name. Programs with the same LLVM text share the code."""
 _lane_program_by_index_name: dict[str, LaneProgram] = {}
 """Programs of this process by the name of their index record."""
+MAX_RECENT_TRACES = 4
+"""Largest number of traces in memory. A trace of one lane is soon compiled for a batch as well."""
+_recent_traces: OrderedDict[str | None, tuple[ClosedJaxpr, Any]] = OrderedDict()
 
 
 @contextlib.contextmanager

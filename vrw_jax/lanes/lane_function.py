@@ -82,9 +82,19 @@ class CompiledBatchFunction:
         if is_machine_code_available() and self._has_machine_code():
             leaves, structure = jax.tree.flatten(argument_trees)
             leaves = [x if hasattr(x, "dtype") else jnp.asarray(x) for x in leaves]
+
+            def replace_code(compilation_error: Exception) -> Callable:
+                self._use_xla_after(compilation_error)
+                return lambda *leaves: jax.tree.leaves(
+                    self._call_by_xla(*jax.tree.unflatten(structure, leaves))
+                )
+
             get_program = functools.partial(self._get_program, structure)
             with contextlib.suppress(_NoMachineCodeError):
-                return call_machine_code(get_program, leaves)
+                return call_machine_code(get_program, leaves, replace_code)
+        return self._call_by_xla(*argument_trees)
+
+    def _call_by_xla(self, *argument_trees: Any) -> Any:
         blockwise_function = apply_function_in_blocks(self._function, self._xla_block_size)
         return wrap_with_saved_trace(blockwise_function, self._find_key)(*argument_trees)
 
@@ -134,6 +144,8 @@ class CompiledBatchFunction:
                 lanes_per_group,
                 self._max_unrolled_entries,
             )
+            if lanes_per_group > 1:  # JAX may still map the call for one lane over a batch.
+                lane_program.machine_code  # noqa: B018, starts the compilation
         except Exception as compilation_error:
             self._use_xla_after(compilation_error)
             raise _NoMachineCodeError from compilation_error

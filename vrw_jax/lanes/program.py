@@ -23,6 +23,7 @@ from vrw_jax.lanes.code_cache import (
 from vrw_jax.lanes.ffi_primitive import (
     LOADED_CODE_BY_FFI_TARGET,
     MACHINE_CODE_PRIMITIVE,
+    LaneCall,
     register_machine_code,
 )
 from vrw_jax.lanes.kernel import LANE_KERNEL_NAME, write_llvm_kernel
@@ -76,7 +77,7 @@ def _can_xla_call_machine_code() -> bool:
         lanes_per_group,
         MAX_UNROLLED_ENTRIES,
     )
-    increment = lambda x: call_machine_code(get_program, [x])
+    increment = lambda x: call_machine_code(get_program, [x], _raise_error)
     with jax.ensure_compile_time_eval():
         try:
             test_program_results = jax.jit(increment)(jnp.arange(3.0))
@@ -87,6 +88,10 @@ def _can_xla_call_machine_code() -> bool:
             fallback.disable_machine_code("XLA calls it in another way")
             return False
     return True
+
+
+def _raise_error(compilation_error: Exception) -> Any:
+    raise compilation_error
 
 
 def make_argument_shapes(argument_types: ArgumentTypes) -> list[jax.ShapeDtypeStruct]:
@@ -103,13 +108,19 @@ def count_lanes_per_256_bits(argument_leaves: Sequence[Any]) -> int:
     return LANES_PER_256_BITS[max(sizes) if sizes else jnp.zeros(()).dtype.itemsize]
 
 
-def call_machine_code(get_program: GetProgram, argument_leaves: Sequence[Any]) -> Any:
+def call_machine_code(
+    get_program: GetProgram,
+    argument_leaves: Sequence[Any],
+    replace_code: Callable[[Exception], Callable],
+) -> Any:
     """Return the results of a function, computed by machine code that a JAX program calls.
 
     The last axis of the arguments is the lane axis. The first array must have lanes; scalars are
     the same for all lanes. A single lane has separate code, which computes no
     other lanes and gives the same bits. The call has no derivatives, works on CPUs only, and uses
     one core.
+
+    - `replace_code`: function of an error of the compilation, see `LaneCall`.
     """
     n_lanes = argument_leaves[0].shape[-1]
     for argument_shape in map(jnp.shape, argument_leaves):
@@ -136,10 +147,12 @@ def call_machine_code(get_program: GetProgram, argument_leaves: Sequence[Any]) -
         argument_leaves = [pad_with_last_lane(x) if jnp.ndim(x) else x for x in argument_leaves]
     padded_result_shapes = tuple(
         jax.ShapeDtypeStruct((*shape_without_lanes, n_lanes + n_padding_lanes), result_dtype)
-        for shape_without_lanes, result_dtype in lane_program.machine_code.result_shapes_and_dtypes
+        for shape_without_lanes, result_dtype in lane_program.result_shapes_and_dtypes
     )
     padded_results = MACHINE_CODE_PRIMITIVE.bind(
-        *argument_leaves, machine_code=lane_program.machine_code, result_shapes=padded_result_shapes
+        *argument_leaves,
+        lane_call=LaneCall(lane_program, replace_code),
+        result_shapes=padded_result_shapes,
     )
     return jax.tree.unflatten(
         lane_program.result_structure, [x[..., :n_lanes] for x in padded_results]

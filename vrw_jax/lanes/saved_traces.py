@@ -172,7 +172,9 @@ def _find_ffi_target_names(jaxpr: Any) -> set[str]:
     ffi_target_names: set[str] = set()
     for jaxpr_equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
         if jaxpr_equation.primitive is MACHINE_CODE_PRIMITIVE:
-            ffi_target_names.add(jaxpr_equation.params["machine_code"].ffi_target_name)
+            with contextlib.suppress(NotImplementedError):  # XLA computes the function.
+                lane_program = jaxpr_equation.params["lane_call"].lane_program
+                ffi_target_names.add(lane_program.machine_code.ffi_target_name)
         for equation_parameter in jax.tree.leaves(list(jaxpr_equation.params.values())):
             if hasattr(getattr(equation_parameter, "jaxpr", equation_parameter), "eqns"):
                 ffi_target_names |= _find_ffi_target_names(equation_parameter)
