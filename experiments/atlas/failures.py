@@ -85,7 +85,7 @@ def anchor(title: str) -> str:
 
 
 def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
-    """Return a line for each method of a case, with its worst result and its cost."""
+    """Return a line for each method of a case, with its worst result."""
     lines, severities = [], list(VERDICT_LABELS)
     for method, rows_of_method in group_rows(rows, "method").items():
         size = lambda row: math.inf if row["error"] == "-" else float(row["error"])
@@ -95,9 +95,7 @@ def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
         lines.append(
             [
                 method.replace("ours", "vrw_jax"), VERDICT_LABELS[worst["verdict"]],
-                f"{good} of {len(rows_of_method)}", worst["quantity"],
-                worst["error"], says, worst["work"], worst["ms"],
-                f"{worst['options']}; {worst['version']}",
+                f"{good} of {len(rows_of_method)}", worst["quantity"], worst["error"], says,
             ]
         )  # fmt: skip
     return lines
@@ -133,8 +131,7 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
         link = f"[{case.title}]({PROBLEMS.name}#{anchor(case.title)})"
         results.append([link, *method_cells, f"{max(errors):.0e}" if errors else "-"])
         origins.append([link, case.breaks, case.reference, case.source])
-        header = ["method", "worst result", "correct", "worst quantity", "error", "report", "work",
-                  "ms", "options; version"]  # fmt: skip
+        header = ["method", "worst result", "correct", "worst quantity", "error", "report"]
         table = format_markdown(header, methods)
         measured = name in measured_names
         source = describe_run(f"experiments.atlas.failures --only {name}") if measured else None

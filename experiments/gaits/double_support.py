@@ -86,14 +86,11 @@ COMPARED_COLUMNS = {
     "speed": "speed, m/s",
     "energy_per_meter": "energy lost, J/m",
     "damper_share": "share of dampers in it",
-    "landing_share": "share of landing in it",
-    "stopper_share": "share of stopper in it",
     "peak_force": "peak force, weights",
     "landing_impulse": "landing impulse, N s",
     "spectral_radius": "spectral radius",
     "period_sensitivity": "period sensitivity, 1/rad",
     "friction_needed": "friction needed",
-    "friction_in_support": "friction of the fore foot after the landing",
 }
 """Labels of the compared columns of `double_support_gaits.csv`."""
 
@@ -597,33 +594,32 @@ def describe_bounds(bounds: np.ndarray) -> str:
 def summarize_comparisons(rows: Sequence[Row]) -> str:
     """Return a table in Markdown: medians of two thirds of the gaits, and rank correlations.
 
-    The thirds are those of the least and the largest DLS fraction.
+    The thirds are those of the least and the largest DLS fraction. The steepest slope has too few
+    gaits for medians.
     """
     lines = []
     for comparison, group in group_by_comparison(rows).items():
+        if comparison == f"slope {EQUAL_SLOPES[-1]:g} rad":
+            continue
         gaits = sorted(select_compliant(group), key=lambda row: float(row["dls_fraction"]))
         third = len(gaits) // 3
         rigid = {row["wheel"]: row for row in group if row["wheel"] in HAS_HELD_LANDING}
-        dls, damping = (read_column(gaits, name) for name in ("dls_fraction", "damping"))
+        dls = read_column(gaits, "dls_fraction")
         for name, label in {"dls_fraction": "DLS fraction", **COMPARED_COLUMNS}.items():
             if name == comparison.split()[0] or not gaits[0].get(name):
                 continue
             values = read_column(gaits, name)
-            if np.ptp(values) < 1e-4 * np.abs(values).max():
-                correlations = ["–", "–"]
-            else:
-                correlations = [
-                    f"{stats.spearmanr(column, values).statistic:+.2f}" for column in (dls, damping)
-                ]
+            is_constant = np.ptp(values) < 1e-4 * np.abs(values).max()
             lines.append([
                 comparison, label, len(gaits),
                 *(shorten_number(rigid[model][name]) if model in rigid else "no gait"
                   for model in HAS_HELD_LANDING),
                 f"{np.median(values[:third]):.3g}", f"{np.median(values[-third:]):.3g}",
-                "–" if name == "dls_fraction" else correlations[0], correlations[1],
+                "–" if is_constant or name == "dls_fraction"
+                else f"{stats.spearmanr(dls, values).statistic:+.2f}",
             ])  # fmt: skip
     header = ("at", "index", "gaits", *HAS_HELD_LANDING, "median, least DLS", "median, most DLS",
-              "rank correlation with DLS", "with damping")  # fmt: skip
+              "rank correlation with DLS")  # fmt: skip
     return format_markdown(header, lines)
 
 
@@ -657,19 +653,13 @@ def summarize_table(rows: Sequence[Row], columns: Sequence[str]) -> str:
 def make_blocks() -> dict[str, tuple[str, str]]:
     """Return the part that computes each block of the page, and its text from stored tables."""
     lives = [row | {"mean_steps": format_life(row)} for row in read_table(LIVES_TABLE)]
-    blocks = {
+    return {
         "double_support_gaits": ("gaits", summarize_comparisons(read_table(GAITS_TABLE))),
         "double_support_lives": ("lives", summarize_table(lives, LIFE_COLUMNS)),
         "double_support_contact": (
             "contact", summarize_table(read_table(CONTACT_TABLE), CONTACT_COLUMNS)
         ),
     }  # fmt: skip
-    for part, table in (("fronts", FRONTS_TABLE), ("indices", INDICES_TABLE)):
-        stored = read_table(table)
-        cells = [[shorten_number(cell) for cell in row.values()] for row in stored]
-        header = [name.replace("_", " ") for name in stored[0]]
-        blocks[table.stem] = (part, format_markdown(header, cells))
-    return blocks
 
 
 PANELS = (

@@ -42,7 +42,7 @@ from experiments.gaits.force_peak_figures import (
     draw_peak_map,
     format_log_axes,
 )
-from experiments.gaits.force_peak_stances import SPRING_MASS_TABLE, compute_stances
+from experiments.gaits.force_peak_stances import compute_stances
 from experiments.gaits.force_peak_wheels import (
     GAIT_OPTIONS,
     compute_bounce_periods,
@@ -230,12 +230,6 @@ def summarize_bisections() -> str:
     return format_markdown(header, lines)
 
 
-def summarize_spring_mass() -> str:
-    """Return a table in Markdown: the measures of the spring-mass walker."""
-    (row,) = read_table(SPRING_MASS_TABLE)
-    return format_markdown([name.replace("_", " ") for name in row], [list(row.values())])
-
-
 def describe_range(rows: list[Row], name: str) -> str:
     """Return least and largest value of a column as text; a dash if it is empty."""
     rows = [row for row in rows if row[name]]
@@ -308,7 +302,6 @@ def main() -> None:
         "force_peak_curve": ("borders", summarize_curve()),
         "force_peak_bisections": ("borders", summarize_bisections()),
         "force_peak_comparisons": ("comparisons", summarize_comparisons()),
-        "force_peak_spring_mass": ("stances", summarize_spring_mass()),
     }
     for block, (part, text) in blocks.items():
         replace_block(PAGE, block, text, run if part in computed_parts else None)

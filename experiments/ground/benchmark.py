@@ -113,8 +113,6 @@ def measure_jacobians() -> None:
             )
             print(rows[-1], flush=True)
     write_table(FIGURES / "ground_jacobians.csv", JACOBIAN_HEADER, rows)
-    command = "experiments.ground.benchmark --jacobians"
-    show_table("benchmarks/contact.md", FIGURES / "ground_jacobians.csv", command)
 
 
 def main() -> None:

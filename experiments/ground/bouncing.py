@@ -14,7 +14,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import FIGURES, show_table, write_table
+from experiments.shared.tables import FIGURES, write_table
 
 DAMPING, FRICTION = (1.0, 2.0, 4.0), (5.0, 8.0, 15.0, 100.0, 1e6, math.inf)
 STARTS = np.array(
@@ -54,9 +54,6 @@ def main() -> None:
     write_table(
         FIGURES / "bouncing.csv", header, [[f"{value:.5g}" for value in row] for row in rows]
     )
-    shown = "damping", "friction", "starts", "left", "period_s", "dls_fraction"
-    table = FIGURES / "bouncing.csv"
-    show_table("studies/beyond_the_border.md", table, "experiments.ground.bouncing", shown)
 
 
 if __name__ == "__main__":

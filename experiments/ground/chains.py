@@ -18,7 +18,6 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import (
     FIGURES,
-    show_table,
     write_table,
 )
 
@@ -72,7 +71,6 @@ def main() -> None:
             )
             print(rows[-1], flush=True)
     write_table(TABLE, HEADER, rows)
-    show_table("verification/contact.md", TABLE, "experiments.ground.chains")
 
 
 if __name__ == "__main__":

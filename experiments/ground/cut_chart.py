@@ -19,7 +19,6 @@ from experiments.shared.tables import (
     group_rows,
     read_column,
     read_table,
-    show_table,
     write_table,
 )
 from vrw_jax import plot as plots
@@ -72,7 +71,6 @@ def compute(wheels: int) -> None:
             rows.append([row[0], *(f"{x:.3g}" for x in row[1:])])
             print(rows[-1], flush=True)
     write_table(TABLE, HEADER, rows)
-    show_table("verification/contact.md", TABLE, "experiments.ground.cut_chart")
 
 
 def draw() -> None:

@@ -15,7 +15,6 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import (
     FIGURES,
-    show_table,
     write_table,
 )
 from experiments.shared.timing import measure_cpu_seconds
@@ -62,10 +61,6 @@ def main() -> None:
     each = [f"{name}_{stoppers}" for stoppers in rows_by_stoppers for name in COLUMN_NAMES]
     header = ("damping", "friction", *each, "period_change_percent")
     write_table(FIGURES / "one_sided_stoppers.csv", header, rows)
-    shown = "damping", "friction", "period_s_bilateral", "period_s_one-sided"
-    shown += "events_bilateral", "events_one-sided", "period_change_percent"
-    module, table = "experiments.ground.one_sided_stoppers", FIGURES / "one_sided_stoppers.csv"
-    show_table("verification/contact.md", table, module, shown)
 
 
 def walk_batch(damping, friction, states, n_steps: int, stoppers: str) -> vrw.StepBatchResult:

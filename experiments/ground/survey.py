@@ -17,7 +17,6 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import (
     FIGURES,
-    show_table,
     write_named_rows,
 )
 
@@ -88,8 +87,6 @@ def main() -> None:
                 rows.append(row)
                 print(row, flush=True)
     write_named_rows(FIGURES / "ground_survey.csv", rows)
-    command = f"experiments.ground.survey --wheels {arguments.wheels}"
-    show_table("verification/contact.md", FIGURES / "ground_survey.csv", command)
 
 
 if __name__ == "__main__":

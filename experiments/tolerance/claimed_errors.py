@@ -25,7 +25,6 @@ from experiments.shared.tables import (
     format_markdown,
     read_column,
     read_table,
-    show_table,
     write_table,
 )
 from experiments.shared.wheels import WIDE_BOX
@@ -257,7 +256,6 @@ def count_results() -> None:
             )
     header = "set", "tolerance", "answers", *KINDS, "steps", "outside", "worst", "gait unconfirmed"
     write_table(COUNT, header, table)
-    show_table("verification/tolerances.md", COUNT, "experiments.tolerance.claimed_errors")
     print(format_markdown(header, table))
 
 

@@ -21,7 +21,6 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import (
     FIGURES,
     format_markdown,
-    show_table,
     write_table,
 )
 from experiments.shared.wheels import PARAMETER_BOX
@@ -99,8 +98,6 @@ def measure_means() -> None:
         "CPU time, s", "wheels alone", "ms each", "ratio",
     )  # fmt: skip
     write_table(TABLE, header, rows)
-    columns = [name for name in header if name not in ("wheels alone", "ms each")]
-    show_table("verification/tolerances.md", TABLE, "experiments.tolerance.costs", columns)
     print(format_markdown(header, rows))
 
 
