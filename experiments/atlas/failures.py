@@ -90,12 +90,11 @@ def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
     for method, rows_of_method in group_rows(rows, "method").items():
         size = lambda row: math.inf if row["error"] == "-" else float(row["error"])
         worst = max(rows_of_method, key=lambda row: (severities.index(row["verdict"]), size(row)))
-        good = sum(row["verdict"] == "right" for row in rows_of_method)
         says = next((row["says"] for row in [worst, *rows_of_method] if row["says"]), "")
         lines.append(
             [
                 method.replace("ours", "vrw_jax"), VERDICT_LABELS[worst["verdict"]],
-                f"{good} of {len(rows_of_method)}", worst["quantity"], worst["error"], says,
+                worst["quantity"], worst["error"], says,
             ]
         )  # fmt: skip
     return lines
@@ -131,7 +130,7 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
         link = f"[{case.title}]({PROBLEMS.name}#{anchor(case.title)})"
         results.append([link, *method_cells, f"{max(errors):.0e}" if errors else "-"])
         origins.append([link, case.breaks, case.reference, case.source])
-        header = ["method", "worst result", "correct", "worst quantity", "error", "report"]
+        header = ["method", "worst result", "of", "error", "report"]
         table = format_markdown(header, methods)
         measured = name in measured_names
         source = describe_run(f"experiments.atlas.failures --only {name}") if measured else None

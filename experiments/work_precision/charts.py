@@ -243,10 +243,13 @@ def format_time(us: float) -> str:
 
 
 def table(rows: list[Row]) -> str:
-    """Return a table of recommended methods, of this library and of all."""
+    """Return a table of recommended methods, of this library and of all.
+
+    Errors with the same recommendation share a line.
+    """
     unit = unit_of(rows)
     ours = [row for row in rows if row["family"] not in (*SCALAR, "diffrax by hand")]
-    lines = []
+    lines: list[list[str]] = []
     for method_name, (group, is_for_one_wheel) in TABLE_METHODS.items():
         for target in TARGETS:
             cells = [method_name, f"1e{round(math.log10(target))}"]
@@ -257,7 +260,10 @@ def table(rows: list[Row]) -> str:
                     cells += ["none" if tried else "not measured", "–"]
                 else:
                     cells += [f"{label_of(row)}, {row['setting']}", format_time(time_of(row, unit))]
-            lines.append(cells)
+            if lines and [*lines[-1][:1], *lines[-1][2:]] == [method_name, *cells[2:]]:
+                lines[-1][1] = f"{lines[-1][1].split()[0]} to {cells[1]}"
+            else:
+                lines.append(cells)
     header = ("wanted", "p99 error", "ours", "per gait", "fastest of all", "per gait")
     return format_markdown(header, lines)
 
