@@ -121,6 +121,8 @@ WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     ),
     "half a derivative": ('[scan]\nmeasures = ["d speed / damping"]', "is no measure of a scan"),
     "chunk as text": ('[scan]\nchunk = "large"', "whole number"),
+    "a mesh as text": ('[scan]\nmesh_intervals = ["a", 8, 3]', 'mesh_intervals is "a"'),
+    "a mesh of two phases": ("[scan]\nmesh_intervals = [10, 8]", "three whole numbers"),
     "part of a sample": ("[scan]\nchunk = 2.5", "whole number"),
     "n_legs swept": ("[grid]\nn_legs = [6, 8]", "unknown key 'n_legs'"),
     "an axis of text": ('[grid]\ndamping = ["much"]', "must be a finite number"),

@@ -1,20 +1,29 @@
 """Configs: TOML files that define a wheel, samples and measures.
 
-An error in a file is reported in one sentence that states the given value, the allowed values and
-the remedy.
+pydantic checks the tables. An error in a file is reported in one sentence that states the given
+value, the allowed values and the remedy.
 """
 
-import contextlib
+import dataclasses
 import importlib.util
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from functools import partial
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+    WrapValidator,
+)
+from pydantic.dataclasses import dataclass
+from pydantic_core import PydanticCustomError
 
 from vrw_jax.base.checks import (
     check_path,
@@ -48,16 +57,8 @@ RANDOM_DESIGN_FUNCTIONS = {
 }
 DESIGN_TABLE_NAMES = ("grid", "samples", *RANDOM_DESIGN_FUNCTIONS)
 CONFIG_TABLE_NAMES = (
-    "wheel",
-    "model",
-    "options",
-    "gait",
-    "scan",
-    "tune",
-    "branch",
-    "figures",
-    *DESIGN_TABLE_NAMES,
-)
+    "wheel", "model", "options", "gait", "scan", "tune", "branch", "figures", *DESIGN_TABLE_NAMES,
+)  # fmt: skip
 PARAMETER_SET_KEY = "parameter_set"
 """Key of `[wheel]` that names a parameter set. Other keys of the table replace values of this
 set.
@@ -65,13 +66,102 @@ set.
 ConfigTable = Mapping[str, Any]
 """Table of a config, as read from TOML."""
 
-_GRID_AXIS_KEYS = ("from", "to", "count")
-
 MAX_CONFIG_INTEGER = 2**53
 """Largest integer in a config, chosen because floats represent all integers up to it."""
 
 MAX_CONFIG_LEGS = 1_000
 """Largest number of legs in a config, chosen because results have one value per leg and sample."""
+
+
+def _must_be(requirement: str) -> WrapValidator:
+    """Return a validator with the error that a value must be `requirement`."""
+
+    def check(value: Any, validate: Any) -> Any:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            if _find_explained_error(error):
+                raise
+            raise PydanticCustomError("requirement", "{text}", {"text": requirement}) from error
+
+    return WrapValidator(check)
+
+
+def _find_explained_error(error: ValidationError) -> Any:
+    """Return the first error with a requirement or a sentence, or None."""
+    return next((e for e in error.errors() if e["type"] in ("requirement", "value_error")), None)
+
+
+def _read(kind: Any, value: Any, name: str = "") -> Any:
+    """Return the value as an object of a type. Raise a ValueError with one sentence otherwise."""
+    try:
+        return TypeAdapter(kind).validate_python(value)
+    except ValidationError as error:
+        details = _find_explained_error(error)
+        if details["type"] == "value_error":
+            raise ValueError(str(details["ctx"]["error"])) from error
+        keys = [key for key in details["loc"] if isinstance(key, str)]
+        raise _make_value_error(
+            name or keys[-1], details["input"], details["ctx"]["text"]
+        ) from error
+
+
+def _limit(minimum: int, maximum: int = MAX_CONFIG_INTEGER) -> tuple[Any, ...]:
+    """Return validators of integers from `minimum` to `maximum`."""
+    return (
+        Strict(),
+        Field(ge=minimum),
+        _must_be(f"a whole number of at least {minimum}"),
+        Field(le=maximum),
+        _must_be(f"at most {maximum:,}"),
+    )
+
+
+Finite = Annotated[float, Strict(), Field(allow_inf_nan=False), _must_be("a finite number")]
+Positive = Annotated[Finite, Field(gt=0.0), _must_be("positive")]
+Whole = Annotated[int, *_limit(1)]
+Range = Annotated[tuple[Finite, Finite], _must_be("a range of two numbers: write [lower, upper]")]
+Values = Annotated[tuple[Finite, ...], _must_be("a list of numbers")]
+AxisValues = Annotated[
+    tuple[Finite, ...],
+    _must_be("a list of numbers or { from = ..., to = ..., count = ... }"),
+]
+Measures = Annotated[tuple[str, ...], _must_be('a list of names: write ["dls_fraction", "speed"]')]
+MeshIntervals = Annotated[
+    tuple[Whole, Whole, Whole],
+    _must_be("three whole numbers, the intervals of DLS, SLS-I and SLS-II: write [10, 8, 3]"),
+]
+SectionState = Annotated[
+    tuple[Finite, Finite, Finite],
+    _must_be(
+        "the section state before touchdown, three numbers: angle in rad, angular rate in rad/s, "
+        "rate of Leg 1 in m/s"
+    ),
+]
+Objective = Annotated[
+    str | dict[str, Finite],
+    _must_be(
+        'a measure or weights of several: write objective = "dls_fraction" or objective = '
+        "{ dls_fraction = 1.0, speed = 0.1 }"
+    ),
+]
+Constraints = Annotated[
+    dict[str, Finite],
+    _must_be("a table: write [tune.constraints] and below it lines such as clearance_sls1 = 0.001"),
+]
+
+
+def _read_bounds(bounds: Any) -> Any:
+    if not isinstance(bounds, dict) or not bounds:
+        raise ValueError(
+            "[tune] has no free parameter, but it needs at least one: add [tune.bounds] "
+            "with lines such as damping = [20.0, 215.0]."
+        )
+    _require_known_keys(bounds, PARAMETER_NAMES, "[tune.bounds]", "parameters")
+    return _read_parameters(bounds, Range)
+
+
+Bounds = Annotated[Mapping[str, tuple[float, float]], BeforeValidator(_read_bounds)]
 
 
 @dataclass(frozen=True)
@@ -87,34 +177,11 @@ class ScanConfig:
       Stiff legs on a gentle slope need [40, 32, 16].
     """
 
-    measures: tuple[str, ...] | None = None
-    chunk: int | None = None
-    tol: float | None = None
-    slope_sd: float | None = None
-    mesh_intervals: tuple[int, int, int] | None = None
-
-    @classmethod
-    def from_table(cls, config_table: ConfigTable, model: AbstractWheel) -> "ScanConfig":
-        """Read the settings of the table `[scan]`.
-
-        Raise a ValueError if the model does not have a requested measure.
-        """
-        scan_config = cls(
-            **_parse_settings(
-                config_table,
-                "[scan]",
-                measures=_parse_names,
-                chunk=_parse_whole_number,
-                tol=_parse_positive_number,
-                slope_sd=_parse_positive_number,
-                mesh_intervals=lambda _, value: CycleOptions(mesh_intervals=value).mesh_intervals,
-            )
-        )
-        check_measure_names(
-            scan_config.measures or (),
-            select_measure_catalog(model, scan_config.tol, scan_config.slope_sd),
-        )
-        return scan_config
+    measures: Measures | None = None
+    chunk: Whole | None = None
+    tol: Positive | None = None
+    slope_sd: Positive | None = None
+    mesh_intervals: MeshIntervals | None = None
 
     def make_cycle_options(self) -> CycleOptions | None:
         """Return the options of the gait search with the mesh of the config, or None."""
@@ -130,25 +197,8 @@ class GaitConfig:
       start of the model.
     """
 
-    steps: int = 30
-    start: tuple[float, float, float] | None = None
-
-    @classmethod
-    def from_table(cls, config_table: ConfigTable) -> "GaitConfig":
-        """Read the settings of the table `[gait]`."""
-        return cls(
-            **_parse_settings(
-                config_table,
-                "[gait]",
-                steps=_parse_whole_number,
-                start=partial(
-                    _parse_numbers,
-                    length=3,
-                    requirement_text="the section state before touchdown, three numbers: angle in "
-                    "rad, angular rate in rad/s, rate of Leg 1 in m/s",
-                ),
-            )
-        )
+    steps: Whole = 30
+    start: SectionState | None = None
 
 
 @dataclass(frozen=True)
@@ -162,50 +212,10 @@ class TuneConfig:
     - `evaluations`: largest number of evaluated gaits.
     """
 
-    objective: str | Mapping[str, float] = "dls_fraction"
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    constraints: Mapping[str, float] | None = None
-    evaluations: int = 200
-
-    @classmethod
-    def from_table(cls, config_table: ConfigTable) -> "TuneConfig":
-        """Read the settings of the table `[tune]` and of its subtables."""
-
-        def parse_bounds(_: str, bounds_table: object) -> dict[str, tuple[float, float]]:
-            if not isinstance(bounds_table, dict) or not bounds_table:
-                raise ValueError(
-                    "[tune] has no free parameter, but it needs at least one: add [tune.bounds] "
-                    "with lines such as damping = [20.0, 215.0]."
-                )
-            _require_known_keys(bounds_table, PARAMETER_NAMES, "[tune.bounds]", "parameters")
-            return {
-                parameter_name: _parse_parameter_range(parameter_name, parameter_bounds)
-                for parameter_name, parameter_bounds in bounds_table.items()
-            }
-
-        return cls(
-            **_parse_settings(
-                {"bounds": {}, **config_table},
-                "[tune]",
-                objective=lambda setting_name, value: (
-                    value
-                    if isinstance(value, str)
-                    else _parse_numbers_by_name(
-                        setting_name,
-                        value,
-                        "a measure or weights of several: write objective = "
-                        '"dls_fraction" or objective = { dls_fraction = 1.0, speed = 0.1 }',
-                    )
-                ),
-                bounds=parse_bounds,
-                constraints=partial(
-                    _parse_numbers_by_name,
-                    requirement_text="a table: write [tune.constraints] and below it lines such "
-                    "as clearance_sls1 = 0.001",
-                ),
-                evaluations=_parse_whole_number,
-            )
-        )
+    objective: Objective = "dls_fraction"
+    bounds: Bounds = dataclasses.field(default_factory=dict)
+    constraints: Constraints | None = None
+    evaluations: Whole = 200
 
 
 @dataclass(frozen=True)
@@ -220,98 +230,16 @@ class BranchConfig:
     """
 
     parameter: str
-    bounds: tuple[float, float]
-    period: int = 1
-    max_ds: float | None = None
-
-    @classmethod
-    def from_table(
-        cls, config_table: ConfigTable, allowed_parameter_names: tuple[str, ...]
-    ) -> "BranchConfig":
-        """Read the settings of the table `[branch]`.
-
-        Its parameter must be one of `allowed_parameter_names`.
-        """
-        _require_known_keys(config_table, cls.__dataclass_fields__, "[branch]", "settings")
-        branch_parameter = config_table.get("parameter")
-        check_parameter_name(
-            branch_parameter,
-            allowed_parameter_names,
-            "parameter that a branch of this model runs along",
-        )
-        if "bounds" not in config_table:
-            raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
-        branch_config = cls(
-            **_parse_settings(
-                config_table,
-                "[branch]",
-                parameter=lambda _, value: value,
-                bounds=lambda _, value: check_range(
-                    "bounds",
-                    _parse_parameter_range(
-                        f"bounds of {branch_parameter}", value, str(branch_parameter)
-                    ),
-                ),
-                period=_parse_whole_number,
-                max_ds=_parse_positive_number,
-            )
-        )
-        if branch_config.max_ds is not None and branch_config.max_ds > 1.0:
-            raise ValueError(
-                f"max_ds is {branch_config.max_ds:g}, but it is a share of the range: give 0.02, "
-                "say."
-            )
-        return branch_config
+    bounds: Range
+    period: Whole = 1
+    max_ds: (
+        Annotated[Positive, Field(le=1.0), _must_be("a share of the range, at most 1: give 0.02")]
+        | None
+    ) = None
 
 
 FIGURE_FORMATS = ("svg", "png", "pdf")
 """File formats in which commands write figures."""
-
-
-@dataclass(frozen=True)
-class FigureConfig:
-    """Table `[figures]`: width and files of the figures.
-
-    - `width`: "column" (86 mm), "page" (175 mm), or a number of mm; by default the usual width of
-      each figure;
-    - `formats`: file formats in the folder of the result, of "svg", "png" and "pdf";
-    - `file`: path of the figure, such as "fig3.pdf", instead of files in the folder of the result.
-      If there are several figures, their names follow the name of the file.
-    """
-
-    width: str | float | None = None
-    formats: tuple[str, ...] = ("svg", "png")
-    file: Path | None = None
-
-    @classmethod
-    def from_table(cls, config_table: ConfigTable) -> "FigureConfig":
-        """Read the settings of the table `[figures]`."""
-
-        def parse_width(_: str, width: Any) -> str | float:
-            from vrw_jax.app import figure_style as style
-
-            try:
-                style.find_width_inches(width, 1.0)
-            except TypeError as width_error:
-                raise ValueError(str(width_error)) from width_error
-            return width
-
-        def parse_formats(setting_name: str, formats: Any) -> tuple[str, ...]:
-            is_nonempty_list = isinstance(formats, list) and len(formats) > 0
-            if not is_nonempty_list or not all(name in FIGURE_FORMATS for name in formats):
-                raise _make_value_error(setting_name, formats, 'a list of "svg", "png" and "pdf"')
-            return tuple(formats)
-
-        def parse_file(setting_name: str, path_text: object) -> Path:
-            if not isinstance(path_text, str) or not is_figure_file(Path(path_text)):
-                raise _make_value_error(setting_name, path_text, 'a path, such as "fig3.pdf"')
-            return Path(path_text).expanduser()
-
-        return cls(
-            **_parse_settings(
-                config_table, "[figures]", width=parse_width, formats=parse_formats, file=parse_file
-            )
-        )
 
 
 def is_figure_file(path: Path) -> bool:
@@ -327,19 +255,62 @@ def is_figure_file(path: Path) -> bool:
     return path.suffix[1:] in FIGURE_FORMATS
 
 
+def _check_width(width: Any) -> Any:
+    from vrw_jax.app import figure_style as style
+
+    try:
+        style.find_width_inches(width, 1.0)
+    except TypeError as width_error:
+        raise ValueError(str(width_error)) from width_error
+    return width
+
+
+def _check_figure_file(path: Path) -> Path:
+    if not is_figure_file(path):
+        raise AssertionError  # pydantic catches it.
+    return path.expanduser()
+
+
 @dataclass(frozen=True)
+class FigureConfig:
+    """Table `[figures]`: width and files of the figures.
+
+    - `width`: "column" (86 mm), "page" (175 mm), or a number of mm; by default the usual width of
+      each figure;
+    - `formats`: file formats in the folder of the result, of "svg", "png" and "pdf";
+    - `file`: path of the figure, such as "fig3.pdf", instead of files in the folder of the result.
+      If there are several figures, their names follow the name of the file.
+    """
+
+    width: Annotated[Any, AfterValidator(_check_width)] = None
+    formats: Annotated[
+        tuple[Annotated[str, Field(pattern="^(svg|png|pdf)$")], ...],
+        Field(min_length=1),
+        _must_be('a list of "svg", "png" and "pdf"'),
+    ] = ("svg", "png")
+    file: (
+        Annotated[
+            Path,
+            AfterValidator(_check_figure_file),
+            _must_be('a path, such as "fig3.pdf"'),
+        ]
+        | None
+    ) = None
+
+
+@dataclasses.dataclass(frozen=True)
 class Config:
     """Validated settings from a config, and the text of the file."""
 
-    wheel_values: Mapping[str, Any] = field(default_factory=dict)
+    wheel_values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     model_name: str = "viscoelastic"
-    model_settings: Mapping[str, Any] = field(default_factory=dict)
-    step_option_values: Mapping[str, Any] = field(default_factory=dict)
-    scan: ScanConfig = ScanConfig()
-    gait: GaitConfig = GaitConfig()
+    model_settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    step_option_values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    scan: ScanConfig = dataclasses.field(default_factory=ScanConfig)
+    gait: GaitConfig = dataclasses.field(default_factory=GaitConfig)
     tune: TuneConfig | None = None
     branch: BranchConfig | None = None
-    figures: FigureConfig = FigureConfig()
+    figures: FigureConfig = dataclasses.field(default_factory=FigureConfig)
     design: designs.AbstractSampleDesign | None = None
     source_text: str = ""
     file_name: str = ""
@@ -410,81 +381,66 @@ def parse_config(config_text: str, file_name: str = "config") -> Config:
 def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name: str) -> Config:
     """Validate the parsed tables of a file. Raise a ValueError if a table is invalid."""
     _require_known_keys(config_tables, CONFIG_TABLE_NAMES, "the file", "tables")
-    for table_name, config_table in config_tables.items():
-        if not isinstance(config_table, dict):
-            requirement_text = (
-                f"a table: write [{table_name}] on a line of its own and its settings below"
-            )
-            raise _make_value_error(f"[{table_name}]", config_table, requirement_text)
-    design_kinds = [
-        design_kind for design_kind in DESIGN_TABLE_NAMES if design_kind in config_tables
-    ]
+    for name, table in config_tables.items():
+        remedy = f"a table: write [{name}] on a line of its own and its settings below"
+        _read(Annotated[dict, _must_be(remedy)], table, f"[{name}]")
+    design_kinds = [kind for kind in DESIGN_TABLE_NAMES if kind in config_tables]
     if len(design_kinds) > 1:
         raise ValueError(
             f"[{design_kinds[0]}] and [{design_kinds[1]}] are both given, but a scan has one "
             "design: keep one."
         )
     tables: dict[str, Any] = {name: {} for name in CONFIG_TABLE_NAMES} | dict(config_tables)
-    model_name = tables["model"].get("name", Config.model_name)
-    require_known_name(model_name, list_model_config_names(), "model")
+    wheel_values = _parse_wheel_table(tables["wheel"])
+    model_table = {"name": Config.model_name, **tables["model"]}
+    require_known_name(model_name := model_table.pop("name"), list_model_config_names(), "model")
     model_class = find_model_class(model_name)
-    default_settings = {
-        model_field.name: model_field.default for model_field in fields(model_class)
-    }
+    defaults = {field.name: field.default for field in dataclasses.fields(model_class)}
     _require_known_keys(
-        tables["model"],
-        ("name", *default_settings),
-        f'[model] with name = "{model_name}"',
-        "settings",
+        model_table, ("name", *defaults), f'[model] with name = "{model_name}"', "settings"
     )
-    model_settings = {
-        setting_name: setting_value
-        for setting_name, setting_value in tables["model"].items()
-        if setting_name not in ("name", *LAW_NAMES)
+    laws = {
+        name: _load_law(name, model_table.pop(name)) for name in LAW_NAMES if name in model_table
     }
-    law_settings = {
-        law_name: _load_law(law_name, tables["model"][law_name])
-        for law_name in LAW_NAMES
-        if law_name in tables["model"]
-    }
-    default_model = model_class(**law_settings)
-    parameter_names = default_model.parameter_names
-    sample_design = None
-    if design_kinds:
-        design_kind = design_kinds[0]
-        sample_design = _parse_design_table(design_kind, tables[design_kind], parameter_names)
-        for parameter_name in sample_design.swept_parameters:
-            if parameter_name in tables["wheel"]:
-                raise ValueError(
-                    f"{parameter_name} is fixed in [wheel] and swept in [{design_kind}], but it "
-                    "can only be one: drop one of the two."
-                )
+    model = model_class(**laws)
+    design = None
+    for kind in design_kinds:
+        design = _parse_design_table(kind, tables[kind], model.parameter_names)
+        for name in set(design.swept_parameters) & set(tables["wheel"]):
+            raise ValueError(
+                f"{name} is fixed in [wheel] and swept in [{kind}], but it can only be one: drop "
+                "one of the two."
+            )
+    scan = _read_table(ScanConfig, tables["scan"], "[scan]")
+    check_measure_names(scan.measures or (), select_measure_catalog(model, scan.tol, scan.slope_sd))
     default_options = vars(StepOptions())
     _require_known_keys(tables["options"], default_options, "[options]", "options")
-    checked_config = Config(
-        wheel_values=_parse_wheel_table(tables["wheel"]),
+    config = Config(
+        wheel_values=wheel_values,
         model_name=model_name,
-        model_settings=law_settings | _parse_with_default_types(model_settings, default_settings),
-        step_option_values=_parse_with_default_types(tables["options"], default_options),
-        scan=ScanConfig.from_table(tables["scan"], default_model),
-        gait=GaitConfig.from_table(tables["gait"]),
-        tune=TuneConfig.from_table(tables["tune"]) if "tune" in config_tables else None,
-        branch=BranchConfig.from_table(tables["branch"], parameter_names)
+        model_settings=laws | _read_like_defaults(model_table, defaults),
+        step_option_values=_read_like_defaults(tables["options"], default_options),
+        scan=scan,
+        gait=_read_table(GaitConfig, tables["gait"], "[gait]"),
+        tune=_read_table(TuneConfig, {"bounds": {}, **tables["tune"]}, "[tune]")
+        if "tune" in config_tables
+        else None,
+        branch=_read_branch(tables["branch"], model.parameter_names)
         if "branch" in config_tables
         else None,
-        figures=FigureConfig.from_table(tables["figures"]),
-        design=sample_design,
+        figures=_read_table(FigureConfig, tables["figures"], "[figures]"),
+        design=design,
         source_text=config_text,
         file_name=file_name,
     )
-    checked_config.make_wheel()
+    config.make_wheel()
     try:
-        checked_config.make_model()
+        config.make_model()
     # The wheel has a setting that no file can contain, such as uneven ground.
     except TypeError as model_error:
         raise ValueError(str(model_error)) from model_error
-    checked_config.make_options().check_tolerances(np.dtype(float))
-    return checked_config
+    config.make_options().check_tolerances(np.dtype(float))
+    return config
 
 
 def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
@@ -503,24 +459,17 @@ def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
     return parameter_name, _parse_wheel_table({parameter_name: assigned_number})[parameter_name]
 
 
-def _parse_wheel_table(config_table: ConfigTable) -> dict[str, float | int]:
+def _parse_wheel_table(table: ConfigTable) -> dict[str, float | int]:
     """Return the parameters in the table `[wheel]`, by name."""
-    known_wheel_keys = (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY)
-    _require_known_keys(config_table, known_wheel_keys, "[wheel]", "parameters")
-    parameter_values: dict[str, float | int] = {}
-    if (parameter_set_name := config_table.get(PARAMETER_SET_KEY)) is not None:
-        require_known_name(parameter_set_name, tuple(parameter_sets), "parameter set")
-        parameter_values |= parameter_sets[parameter_set_name].values
-    for parameter_name, config_value in config_table.items():
-        if parameter_name == PARAMETER_SET_KEY:
-            continue
-        if parameter_name == "n_legs":
-            parameter_values[parameter_name] = _parse_whole_number(
-                parameter_name, config_value, 5, MAX_CONFIG_LEGS
-            )
-        else:
-            parameter_values[parameter_name] = _parse_parameter_value(parameter_name, config_value)
-    return parameter_values
+    _require_known_keys(
+        table, (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY), "[wheel]", "parameters"
+    )
+    values = dict(table)
+    set_values: Mapping[str, float] = {}
+    if (set_name := values.pop(PARAMETER_SET_KEY, None)) is not None:
+        require_known_name(set_name, tuple(parameter_sets), "parameter set")
+        set_values = parameter_sets[set_name].values
+    return {**set_values, **_read_parameters(values, Finite)}
 
 
 def _load_law(law_name: str, location: object) -> Any:
@@ -558,237 +507,108 @@ def _load_law(law_name: str, location: object) -> Any:
     return law() if isinstance(law, type) else law
 
 
-def _parse_with_default_types(
-    config_table: ConfigTable, default_setting_values: ConfigTable
-) -> dict[str, Any]:
-    """Return the settings, converted to the types of their default values. Numbers must be
-    positive.
-    """
-    parsed_settings: dict[str, Any] = {}
-    for setting_name, config_value in config_table.items():
-        default_value = default_setting_values[setting_name]
-        if isinstance(default_value, bool | str):
-            if not isinstance(config_value, type(default_value)):
-                requirement_text = (
-                    "true or false"
-                    if isinstance(default_value, bool)
-                    else f'a name, "{default_value}"'
-                )
-                raise _make_value_error(setting_name, config_value, requirement_text)
-            parsed_settings[setting_name] = config_value
-        elif isinstance(default_value, int):
-            parsed_settings[setting_name] = _parse_whole_number(setting_name, config_value)
-        elif setting_name == FRICTION_NAME and config_value == math.inf:
-            # Infinite friction means that feet do not slip.
-            parsed_settings[setting_name] = math.inf
-        else:
-            parsed_settings[setting_name] = _parse_positive_number(setting_name, config_value)
-    return parsed_settings
+def _read_like_defaults(table: ConfigTable, defaults: ConfigTable) -> dict[str, Any]:
+    """Return settings with the types of their default values. Numbers must be positive."""
+
+    def find_kind(default: Any) -> Any:
+        if isinstance(default, bool):
+            return Annotated[bool, Strict(), _must_be("true or false")]
+        if isinstance(default, str):
+            return Annotated[str, _must_be(f'a name, "{default}"')]
+        return Whole if isinstance(default, int) else Positive
+
+    return {
+        # Infinite friction means that feet do not slip.
+        name: value
+        if name == FRICTION_NAME and value == math.inf
+        else _read(find_kind(defaults[name]), value, name)
+        for name, value in table.items()
+    }
+
+
+def _read_table(kind: Any, table: ConfigTable, location: str) -> Any:
+    """Return the settings of a table as an object of a class."""
+    _require_known_keys(table, kind.__dataclass_fields__, location, "settings")
+    return _read(kind, table)
+
+
+def _read_branch(table: ConfigTable, allowed_parameter_names: tuple[str, ...]) -> BranchConfig:
+    """Return the settings of the table `[branch]`, along an allowed parameter."""
+    _require_known_keys(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
+    name = table.get("parameter")
+    check_parameter_name(
+        name, allowed_parameter_names, "parameter that a branch of this model runs along"
+    )
+    if "bounds" not in table:
+        raise ValueError("[branch] has no bounds: write bounds = [4.0, 230.0], say.")
+    check_range("bounds", _read_parameters({str(name): table["bounds"]}, Range)[str(name)])
+    return _read(BranchConfig, table)
+
+
+def _read_parameters(table: ConfigTable, kind: Any) -> dict[str, Any]:
+    """Return values by parameter. Raise a ValueError if a number is outside its domain."""
+    kinds = {"n_legs": Annotated[int, *_limit(5, MAX_CONFIG_LEGS)]}
+    values = {name: _read(kinds.get(name, kind), value, name) for name, value in table.items()}
+    for name, numbers in values.items():
+        for number in np.ravel(numbers).tolist():
+            if name == FRICTION_NAME:
+                _read(Positive, number, name)
+            # A sample outside the domain of a leg force is BAD_INPUT.
+            elif name in PARAMETER_DOMAINS:
+                PARAMETER_DOMAINS[name].require_value_in_domain(name, number)
+    return values
 
 
 def _parse_design_table(
-    design_kind: str, config_table: ConfigTable, allowed_parameter_names: tuple[str, ...]
+    kind: str, table: ConfigTable, allowed_parameter_names: tuple[str, ...]
 ) -> designs.AbstractSampleDesign:
     """Return the sample design that a table defines.
 
     It may sweep only parameters in `allowed_parameter_names`.
     """
-    design_setting_keys = ("n", "seed") if design_kind in RANDOM_DESIGN_FUNCTIONS else ()
-    if FRICTION_NAME in config_table and FRICTION_NAME not in allowed_parameter_names:
-        model_choices = [
-            f'name = "{config_name}"'
-            for config_name in list_model_config_names("scan", FRICTION_NAME)
-        ]
+    if FRICTION_NAME in table and FRICTION_NAME not in allowed_parameter_names:
+        choices = [f'name = "{name}"' for name in list_model_config_names("scan", FRICTION_NAME)]
         raise ValueError(
-            f"[{design_kind}] sweeps friction, which does not affect this model: write [model] "
-            f"and below it {' or '.join(model_choices)}."
+            f"[{kind}] sweeps friction, which does not affect this model: write [model] and below "
+            f"it {' or '.join(choices)}."
         )
-    _require_known_keys(
-        config_table,
-        (*design_setting_keys, *allowed_parameter_names),
-        f"[{design_kind}]",
-        "settings",
+    sizes = ("n", "seed") if kind in RANDOM_DESIGN_FUNCTIONS else ()
+    _require_known_keys(table, (*sizes, *allowed_parameter_names), f"[{kind}]", "settings")
+    swept = {name: value for name, value in table.items() if name not in sizes}
+    if kind == "grid":
+        return designs.grid({name: _read_axis(name, value) for name, value in swept.items()})
+    if kind == "samples":
+        return designs.samples(_read_parameters(swept, Values))
+    ranges = _read_parameters(swept, Range)
+    if "n" not in table:
+        raise ValueError(f"[{kind}] has no number of samples: write n = 4096, say.")
+    n, seed = (
+        _read(Whole, table["n"], "n"),
+        _read(Annotated[int, *_limit(0)], table.get("seed", 0), "seed"),
     )
-    setting_parsers: dict[str, Callable] = {"grid": _parse_grid_axis, "samples": _parse_value_list}
-    parse_setting = setting_parsers.get(design_kind, _parse_parameter_range)
-    swept_settings = {
-        parameter_name: parse_setting(parameter_name, config_value)
-        for parameter_name, config_value in config_table.items()
-        if parameter_name not in design_setting_keys
-    }
-    if design_kind == "grid":
-        return designs.grid(swept_settings)
-    if design_kind == "samples":
-        return designs.samples(swept_settings)
-    if "n" not in config_table:
-        raise ValueError(f"[{design_kind}] has no number of samples: write n = 4096, say.")
-    n = _parse_whole_number("n", config_table["n"])
-    random_seed = _parse_whole_number("seed", config_table.get("seed", 0), 0)
-    return RANDOM_DESIGN_FUNCTIONS[design_kind](swept_settings, n, random_seed)
+    return RANDOM_DESIGN_FUNCTIONS[kind](ranges, n, seed)
 
 
-def _parse_grid_axis(
-    parameter_name: str, grid_axis_setting: object
-) -> np.ndarray | tuple[float, ...]:
-    """Return the values on an axis of a grid.
-
-    The setting is a list of values, or a table with the first value, the last value and the count.
-    """
-    if not isinstance(grid_axis_setting, dict):
-        return _parse_value_list(
-            parameter_name, grid_axis_setting, " or { from = ..., to = ..., count = ... }"
-        )
-    _require_known_keys(grid_axis_setting, _GRID_AXIS_KEYS, f"the axis of {parameter_name}", "keys")
-    for axis_key in _GRID_AXIS_KEYS:
-        if axis_key not in grid_axis_setting:
+def _read_axis(name: str, axis: Any) -> Any:
+    """Return the values of an axis of a grid, from a list or from { from, to, count }."""
+    if not isinstance(axis, dict):
+        return _read_parameters({name: axis}, AxisValues)[name]
+    keys = ("from", "to", "count")
+    _require_known_keys(axis, keys, f"the axis of {name}", "keys")
+    for key in keys:
+        if key not in axis:
             raise ValueError(
-                f"the axis of {parameter_name} has no '{axis_key}': write {parameter_name} = "
+                f"the axis of {name} has no '{key}': write {name} = "
                 "{ from = ..., to = ..., count = ... }."
             )
-    first_axis_value, last_axis_value = (
-        _parse_parameter_value(parameter_name, grid_axis_setting[grid_axis_key])
-        for grid_axis_key in ("from", "to")
-    )
-    n_axis_values = _parse_whole_number(f"count of {parameter_name}", grid_axis_setting["count"])
-    if n_axis_values > MAX_LISTED_SAMPLES:
+    first, last = _read_parameters({name: [axis["from"], axis["to"]]}, Range)[name]
+    count = _read(Whole, axis["count"], f"count of {name}")
+    if count > MAX_LISTED_SAMPLES:
         raise ValueError(
-            f"the axis of {parameter_name} has {n_axis_values:,} values, but "
-            f"{MAX_LISTED_SAMPLES:,} is the most: give fewer."
+            f"the axis of {name} has {count:,} values, but {MAX_LISTED_SAMPLES:,} is the most: "
+            "give fewer."
         )
-    return np.linspace(first_axis_value, last_axis_value, n_axis_values)
-
-
-def _parse_value_list(
-    parameter_name: str, config_value_list: object, alternative_text: str = ""
-) -> tuple[float, ...]:
-    """Return a list of numbers as a tuple. They must lie in the domain of the parameter."""
-    return _parse_numbers(
-        parameter_name,
-        config_value_list,
-        f"a list of numbers{alternative_text}",
-        parse_number=_parse_parameter_value,
-    )
-
-
-def _parse_parameter_range(
-    range_name: str, config_range: object, parameter_name: str = ""
-) -> tuple[float, float]:
-    """Return the lower and the upper bound of a range. They must lie in the domain of a parameter.
-
-    The default of `parameter_name` is `range_name`.
-    """
-    lower_bound, upper_bound = _parse_numbers(
-        range_name,
-        config_range,
-        f"a range of two numbers: write {range_name} = [lower, upper]",
-        2,
-        lambda _, bound_value: _parse_parameter_value(parameter_name or range_name, bound_value),
-    )
-    return lower_bound, upper_bound
-
-
-def _parse_parameter_value(parameter_name: str, config_value: object) -> float:
-    """Return a value as a number.
-
-    Raise a ValueError if it is not in the domain of the parameter.
-    """
-    if parameter_name == FRICTION_NAME:
-        return _parse_positive_number(parameter_name, config_value)
-    parameter_value = _parse_finite_number(parameter_name, config_value)
-    # A sample outside the domain of a leg force is BAD_INPUT.
-    if parameter_name in PARAMETER_DOMAINS:
-        PARAMETER_DOMAINS[parameter_name].require_value_in_domain(parameter_name, parameter_value)
-    return parameter_value
-
-
-def _parse_names(setting_name: str, config_value: object) -> tuple[str, ...]:
-    """Return a list of names as a tuple. Raise a ValueError if it is not a list of names."""
-    if not isinstance(config_value, list) or not all(
-        isinstance(name, str) for name in config_value
-    ):
-        requirement_text = f'a list of names: write {setting_name} = ["dls_fraction", "speed"]'
-        raise _make_value_error(setting_name, config_value, requirement_text)
-    return tuple(config_value)
-
-
-def _parse_numbers_by_name(
-    setting_name: str, config_value: object, requirement_text: str
-) -> dict[str, float]:
-    """Return the numbers in a table, by name. Raise a ValueError if the value is no such table."""
-    if not isinstance(config_value, dict):
-        raise _make_value_error(setting_name, config_value, requirement_text)
-    return {name: _parse_finite_number(name, number) for name, number in config_value.items()}
-
-
-def _parse_positive_number(setting_name: str, config_value: object) -> float:
-    """Return a value as a float. Raise a ValueError if it is not a positive finite number."""
-    positive_number = _parse_finite_number(setting_name, config_value)
-    if not positive_number > 0:
-        raise ValueError(f"{setting_name} is {positive_number:g}, but it must be positive.")
-    return positive_number
-
-
-def _parse_finite_number(setting_name: str, config_value: object) -> float:
-    """Return a value as a finite float. Raise a ValueError if it is not a finite number."""
-    finite_number = math.nan
-    if isinstance(config_value, int | float) and not isinstance(config_value, bool):
-        # An integer of hundreds of digits is too large for a float.
-        with contextlib.suppress(OverflowError):
-            finite_number = float(config_value)
-    if not math.isfinite(finite_number):
-        raise _make_value_error(setting_name, config_value, "a finite number")
-    return finite_number
-
-
-def _parse_numbers(
-    setting_name: str,
-    config_value: object,
-    requirement_text: str,
-    length: int | None = None,
-    parse_number: Callable[[str, Any], float] = _parse_finite_number,
-) -> tuple[float, ...]:
-    """Return a list of numbers as a tuple. Raise a ValueError if it is no list of that length."""
-    if not isinstance(config_value, list) or length not in (None, len(config_value)):
-        raise _make_value_error(setting_name, config_value, requirement_text)
-    return tuple(parse_number(setting_name, number) for number in config_value)
-
-
-def _parse_whole_number(
-    setting_name: str,
-    config_value: object,
-    min_value: int = 1,
-    max_value: int = MAX_CONFIG_INTEGER,
-) -> int:
-    """Return a value as an integer. Raise a ValueError if it is not an integer from `min_value` to
-    `max_value`.
-    """
-    if (
-        isinstance(config_value, bool)
-        or not isinstance(config_value, int)
-        or config_value < min_value
-    ):
-        raise _make_value_error(
-            setting_name, config_value, f"a whole number of at least {min_value}"
-        )
-    if config_value > max_value:
-        raise _make_value_error(setting_name, config_value, f"at most {max_value:,}")
-    return config_value
-
-
-def _parse_settings(
-    config_table: ConfigTable,
-    table_location: str,
-    **parser_by_key: Callable[[str, Any], Any],
-) -> dict[str, Any]:
-    """Return the parsed settings of a table, by key. Each parser takes the key and the value.
-
-    Raise a ValueError if a key has no parser.
-    """
-    _require_known_keys(config_table, parser_by_key, table_location, "settings")
-    return {
-        config_key: parser_by_key[config_key](config_key, config_value)
-        for config_key, config_value in config_table.items()
-    }
+    return np.linspace(first, last, count)
 
 
 def _require_known_keys(
@@ -814,7 +634,7 @@ def _make_value_error(setting_name: str, config_value: object, requirement_text:
 
     The message contains the value as written in TOML.
     """
-    value_text = format_value(config_value)
+    value_text = format_value(config_value).removesuffix(".0")
     if isinstance(config_value, bool):
         value_text = value_text.lower()
     elif isinstance(config_value, str):
