@@ -183,7 +183,6 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
 
 
 def _select_special_point_color(special_point: SpecialPoint) -> str:
-    """Return the color in which a special point is drawn."""
     return (
         BRANCH_END_COLOR
         if special_point.ends_branch
@@ -221,7 +220,6 @@ def _draw_special_points(
 
 
 def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
-    """Add a legend that explains the special points and the line styles to a figure."""
     legend_handles = []
     for special_point_number, special_point in enumerate(special_points, 1):
         value_text = format_value_label(parameter, special_point.value, 6)

@@ -364,7 +364,6 @@ def _draw_measure_samples(
 def _draw_outcome_samples(
     axes: Axes, x: np.ndarray, y: np.ndarray, outcome_codes: np.ndarray, marker_size: float
 ) -> None:
-    """Draw samples in the colors of their outcomes."""
     outcome_colors = [OUTCOME_LABELS_AND_COLORS[outcome_code][1] for outcome_code in outcome_codes]
     axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
 
@@ -493,7 +492,6 @@ def _add_color_bar(
 
 
 def _find_cell_edges(cell_center_positions: np.ndarray) -> np.ndarray:
-    """Return the edges of cells around the given positions."""
     if len(cell_center_positions) == 1:
         return cell_center_positions[0] + np.array([-0.5, 0.5]) * max(
             abs(cell_center_positions[0]) * 0.01, 1e-6

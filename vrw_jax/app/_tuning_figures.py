@@ -98,7 +98,6 @@ def tuning_figure(tuned: TuneResult, *, width: FigureWidth = None) -> Figure:
 
 
 def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
-    """Draw the objective of each evaluated gait."""
     evaluation_numbers = path_dataset.evaluation.values
     objective_values = path_dataset.objective.values
     is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))

@@ -121,7 +121,6 @@ def show_warnings_as_sentences() -> None:
 
 
 def _format_system_error(system_error: OSError) -> str:
-    """Return a sentence that describes an error of the operating system."""
     file_name_text = f"{system_error.filename}: " if system_error.filename else ""
     return f"{file_name_text}{str(system_error.strerror or system_error).rstrip('.')}."
 
@@ -345,7 +344,6 @@ def print_wheel_and_gait(
 
 
 def _print_measure_table(table_title: str, measure_values: Mapping[str, Any]) -> None:
-    """Print a table of measures, given as a mapping from names to values."""
     measure_table_rows = (
         (
             measure_description.long_name,
