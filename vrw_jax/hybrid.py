@@ -1,7 +1,6 @@
 """Simulation of any hybrid system: modes, guards, resets, events."""
 
 from vrw_jax.flow.complementarity import LCPStatus, enumerate_lcp_solutions
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins
 from vrw_jax.flow.hybrid_simulation import (
     Guard,
     HybridSolution,
@@ -11,7 +10,8 @@ from vrw_jax.flow.hybrid_simulation import (
     time_errors,
 )
 from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
-from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
+from vrw_jax.flow.integrate import PhaseEnd
+from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 from vrw_jax.flow.return_map import ReturnMap
 from vrw_jax.flow.saltation import flow_jacobian_determinant
 from vrw_jax.flow.segments import product_multipliers, segment_maps

@@ -15,8 +15,7 @@ from vrw_jax.app.reports import write_branch_report
 from vrw_jax.branches.arclength import ArclengthDriver, run_together
 from vrw_jax.branches.continuation_problems import MapProblem
 from vrw_jax.branches.roots import locate_function_roots
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins
-from vrw_jax.flow.phase_integration import integrate_phase
+from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
 LOCATION_TOLERANCE = 1e-9

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins
-from vrw_jax.flow.phase_integration import integrate_phase
+from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 
 TIGHT_OPTIONS = vrw.StepOptions.tight()
 

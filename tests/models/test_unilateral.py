@@ -13,8 +13,7 @@ from scipy.optimize import brentq
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins
-from vrw_jax.flow.phase_integration import integrate_phase
+from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 from vrw_jax.models.contact_impacts import ContactLaw, classify_event, resolve_event
 from vrw_jax.models.contact_mechanics import (
     WheelMotion,

@@ -17,7 +17,7 @@ SHARED_LIBRARIES = {"equinox", "jax", "jaxtyping", "numpy", "scipy", "xarray"}
 
 ALLOWED_IMPORTERS = {
     "PIL": "app", "anywidget": "app", "cycler": "app", "dask": "studies.scan_dask",
-    "diffrax": "flow.solver_steps", "distributed": "studies.scan_dask", "llvmlite": "lanes",
+    "diffrax": "flow.phase_integration", "distributed": "studies.scan_dask", "llvmlite": "lanes",
     "matplotlib": "app", "optax": "studies", "optimistix": "studies", "pydantic": "app.config",
     "pydantic_core": "app.config", "rich": "app", "traitlets": "app", "typer": "app",
     "zarr": "studies",

@@ -31,9 +31,8 @@ from vrw_jax.branches.branch_location import (
 )
 from vrw_jax.branches.map_branch import SWITCHED_KINDS, AbstractMapContinuation, trace_map_branch
 from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins
 from vrw_jax.flow.hybrid_system import HybridSystem
-from vrw_jax.flow.phase_integration import integrate_phase
+from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 from vrw_jax.gaits.hybrid_gait import HybridGait, find_hybrid_gait
 
 MarginFunctions = Mapping[str, Callable[[Array, Any], Array]]

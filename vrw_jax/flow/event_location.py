@@ -42,8 +42,7 @@ class IntegratorState(NamedTuple):
     next_step_length: Array
     elapsed_time: Array
     integration_status: Array  # an IntegrationStatus, after the last tried step
-    crossing_guard_bits: Array  # bit i is set if guard i crosses zero in that step
-    middle_guard_values: Vector  # guards at the middle stage of the crossing step
+    middle_guard_values: Vector  # guards at the middle stage of the last tried step
     end_guard_values: Vector
     n_tried_steps: Array
     # number of iterations after which half of the batch had ended
@@ -77,6 +76,26 @@ class EventSearch(NamedTuple):
     guard_index: Array
     n_tried_steps: Array
     n_iterations: Array
+    correction: Array | None  # change of the step length by the last iteration, s
+
+
+EVENT_TIME_ACCURACY = 1e-8
+"""Largest correction of an exact event's time that ends the search.
+
+The correction is relative to the time since the phase began. The value is chosen because the state
+is extrapolated linearly over the correction, with an error of its square, which is round-off.
+"""
+STALLED_CORRECTION_RATIO = 0.9
+"""Ratio of successive corrections of the event's time above which a correction is round-off.
+
+The value is chosen because Newton's method halves the corrections, or reduces them to two thirds at
+a triple root. Round-off does neither.
+"""
+GUARD_ROUNDOFF_IN_EPS = 32.0
+"""Largest round-off error of a guard, in units of the machine epsilon times the guard's scale.
+
+The value is chosen because a guard is a sum of several terms, each with its own round-off.
+"""
 
 
 def locate_event(
@@ -95,189 +114,245 @@ def locate_event(
 
     When the event is near and no guard is too curved for Newton's method, a short solver step of
     low order replaces the last corrections. The state is then extrapolated linearly over the
-    remaining time.
+    remaining time. A phase with `has_exact_events` takes no short step.
     """
-    step_length, event_time_rtol = integrator_state.next_step_length, jnp.sqrt(options.rtol)
-    max_extrapolation_time = 0.1 * event_time_rtol * step_length
-    max_short_step_duration = 0.3 * jnp.sqrt(event_time_rtol) * step_length
-    is_crossing = [
-        (integrator_state.crossing_guard_bits >> i) & 1 == 1
-        for i in range(len(integrator_state.guard_values))
-    ]
-
-    def improve_event_search(event_search: EventSearch) -> EventSearch:
-        (
-            event_step_length,
-            lower_step_length_bound,
-            upper_step_length_bound,
-            is_event_unresolved,
-            *previous_proposal,
-            n_tried_steps,
-            n_iterations,
-        ) = event_search
-        step_end = solver_step_function(integrator_state.state, event_step_length)[-1]
-        guard_values, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, step_end)
-        time_to_event, guard_index = _propose_earliest_event(guard_values, guard_rates, is_crossing)
-        is_before_event = jnp.ones(step_length.shape, bool)
-        is_guard_straight = jnp.ones(step_length.shape, bool)
-        for start_guard_value, guard_value, guard_rate, is_crossing_guard in zip(
-            integrator_state.guard_values, guard_values, guard_rates, is_crossing, strict=True
-        ):
-            has_crossed, is_guard_curved = _classify_guard_crossing(
-                start_guard_value, guard_value, guard_rate, event_step_length
-            )
-            is_before_event = is_before_event & ~(is_crossing_guard & has_crossed)
-            is_guard_straight = is_guard_straight & ~(is_crossing_guard & is_guard_curved)
-        lower_step_length_bound = jnp.where(
-            is_before_event, event_step_length, lower_step_length_bound
+    step_length = integrator_state.next_step_length
+    end_time = integrator_state.elapsed_time + step_length
+    event_time_rtol = jnp.sqrt(options.rtol)
+    locator = _EventLocator(
+        phase,
+        solver_step_function,
+        tableau,
+        integrator_state,
+        options,
+        is_crossing=[guard_value <= 0.0 for guard_value in integrator_state.end_guard_values],
+        max_extrapolation_time=jnp.maximum(
+            options.rtol * step_length, 1e3 * jnp.finfo(end_time.dtype).eps * end_time
         )
-        upper_step_length_bound = jnp.where(
-            is_before_event, upper_step_length_bound, event_step_length
-        )
-        proposed_step_length = event_step_length + time_to_event
-        is_proposal_in_bracket = (
-            proposed_step_length >= lower_step_length_bound - max_extrapolation_time
-        ) & (proposed_step_length <= upper_step_length_bound + max_extrapolation_time)
-        next_event_step_length = jnp.where(
-            is_proposal_in_bracket,
-            proposed_step_length,
-            0.5 * (lower_step_length_bound + upper_step_length_bound),
-        )
-        is_at_event = (
-            is_event_unresolved
-            & is_proposal_in_bracket
-            & (
-                jnp.abs(time_to_event)
-                <= jnp.where(is_guard_straight, max_short_step_duration, max_extrapolation_time)
-            )
-        )
-        end_state, remaining_time_to_event, guard_index = select_trees_by_condition(
-            is_at_event,
-            (step_end, time_to_event, guard_index),
-            tuple(previous_proposal),
-        )
-        return EventSearch(
-            event_step_length=jnp.where(
-                is_event_unresolved,
-                next_event_step_length,
-                event_step_length,
-            ),
-            lower_step_length_bound=lower_step_length_bound,
-            upper_step_length_bound=upper_step_length_bound,
-            is_event_unresolved=is_event_unresolved & ~is_at_event,
-            end_state=end_state,
-            remaining_time_to_event=remaining_time_to_event,
-            guard_index=guard_index,
-            n_tried_steps=n_tried_steps + is_event_unresolved,
-            n_iterations=n_iterations + 1,
-        )
-
-    first_crossing_fraction = jnp.ones_like(step_length)
-    for is_crossing_guard, *crossing_values in zip(
-        is_crossing,
-        integrator_state.guard_values,
-        integrator_state.middle_guard_values,
-        integrator_state.end_guard_values,
-        strict=True,
-    ):
-        fraction_to_zero = _find_parabola_zero(tableau, is_crossing_guard, *crossing_values)
-        first_crossing_fraction = jnp.where(
-            is_crossing_guard,
-            jnp.minimum(first_crossing_fraction, fraction_to_zero),
-            first_crossing_fraction,
-        )
-    initial_indices = jnp.zeros(step_length.shape, jnp.int32)
-    zero_duration = jnp.zeros_like(step_length)
-    initial_search = EventSearch(
-        step_length * first_crossing_fraction,
-        zero_duration,
-        step_length,
-        integrator_state.has_guard_crossed,
-        integrator_state.state,
-        zero_duration,
-        initial_indices,
-        initial_indices,
-        jnp.zeros((), jnp.int32),
+        if phase.has_exact_events
+        else 0.1 * event_time_rtol * step_length,
+        max_short_step_duration=0.3 * jnp.sqrt(event_time_rtol) * step_length,
     )
-    needs_iteration = lambda event_search: (
-        jnp.any(event_search.is_event_unresolved)
-        & (event_search.n_iterations < options.max_event_iterations)
+    needs_iteration = lambda search: (
+        jnp.any(search.is_event_unresolved) & (search.n_iterations < options.max_event_iterations)
     )
-    event_search = lax.while_loop(needs_iteration, improve_event_search, initial_search)
-
-    # One short solver step suffices unless a guard grazes zero. The event stays unresolved if
-    # Newton's method diverges. A method of order 3 is accurate to round-off during a thousandth of
-    # a solver step.
-    low_order_tableau = load_explicit_tableau("Bosh3")
-    assert low_order_tableau is not None
-
-    can_take_short_step = lambda is_event_distant, remaining_time_to_event: (
-        is_event_distant & (jnp.abs(remaining_time_to_event) <= max_short_step_duration)
-    )
-
-    def take_short_step(event_search: EventSearch) -> EventSearch:
-        is_step_taken = can_take_short_step(
-            event_search.is_event_unresolved, event_search.remaining_time_to_event
-        )
-        short_step = take_rk_step(
-            low_order_tableau,
-            phase.evaluate_acceleration,
-            event_search.end_state,
-            event_search.remaining_time_to_event,
-        )
-        end_state = select_trees_by_condition(is_step_taken, short_step[-1], event_search.end_state)
-        time_to_event, guard_index = _propose_earliest_event(
-            *phase.evaluate_with_rates(phase.evaluate_guards, end_state), is_crossing
-        )
-        remaining_time_to_event = jnp.where(
-            is_step_taken, time_to_event, event_search.remaining_time_to_event
-        )
-        return event_search._replace(
-            event_step_length=jnp.where(
-                can_take_short_step(is_step_taken, time_to_event),
-                event_search.event_step_length + time_to_event,
-                event_search.event_step_length,
-            ),
-            is_event_unresolved=event_search.is_event_unresolved
-            & (jnp.abs(remaining_time_to_event) > max_extrapolation_time),
-            end_state=end_state,
-            remaining_time_to_event=remaining_time_to_event,
-            guard_index=jnp.where(is_step_taken, guard_index, event_search.guard_index),
-            n_iterations=event_search.n_iterations + 1,
-        )
-
-    needs_short_step = lambda event_search: (
-        jnp.any(
-            can_take_short_step(
-                event_search.is_event_unresolved, event_search.remaining_time_to_event
-            )
-        )
-        & (event_search.n_iterations < options.max_event_iterations)
-    )
-    is_event_distant = (
-        integrator_state.has_guard_crossed
-        & ~event_search.is_event_unresolved
-        & (jnp.abs(event_search.remaining_time_to_event) > max_extrapolation_time)
-    )
-    refined_search = lax.while_loop(
-        needs_short_step,
-        take_short_step,
-        event_search._replace(
-            is_event_unresolved=is_event_distant, n_iterations=jnp.zeros((), jnp.int32)
-        ),
-    )
-    extrapolate = lambda x, y: x + refined_search.remaining_time_to_event * y
-    event_state = refined_search.end_state
+    search = lax.while_loop(needs_iteration, locator.iterate, locator.begin())
+    is_failed = search.is_event_unresolved
+    if not phase.has_exact_events:
+        search = locator.take_short_steps(search)
+    extrapolate = lambda x, y: x + search.remaining_time_to_event * y
+    event_state = search.end_state
     event_state = event_state._replace(
         q=tuple(map(extrapolate, event_state.q, event_state.v)),
         v=tuple(map(extrapolate, event_state.v, event_state.acceleration.acceleration)),
     )
-    return refined_search._replace(
-        is_event_unresolved=event_search.is_event_unresolved | refined_search.is_event_unresolved,
+    return search._replace(
+        is_event_unresolved=is_failed | search.is_event_unresolved,
         end_state=select_trees_by_condition(
-            refined_search.is_event_unresolved, integrator_state.state, event_state
+            search.is_event_unresolved, integrator_state.state, event_state
         ),
     )
+
+
+class _EventLocator(NamedTuple):
+    """Iterations of `locate_event`, whose arguments are the first fields."""
+
+    phase: BatchPhase
+    take_solver_step: SolverStepFunction
+    tableau: ButcherTableau
+    step_start: IntegratorState
+    options: StepOptions
+    is_crossing: list[Array]  # whether each guard crosses zero in the solver step
+    max_extrapolation_time: Array  # longest time to the event that ends the search, s
+    max_short_step_duration: Array  # s
+
+    def begin(self) -> EventSearch:
+        """Return the search before its first iteration."""
+        step_start, step_length = self.step_start, self.step_start.next_step_length
+        first_crossing_fraction = jnp.ones_like(step_length)
+        for is_crossing_guard, *crossing_values in zip(
+            self.is_crossing,
+            step_start.guard_values,
+            step_start.middle_guard_values,
+            step_start.end_guard_values,
+            strict=True,
+        ):
+            fraction_to_zero = _find_parabola_zero(
+                self.tableau, is_crossing_guard, *crossing_values
+            )
+            first_crossing_fraction = jnp.where(
+                is_crossing_guard,
+                jnp.minimum(first_crossing_fraction, fraction_to_zero),
+                first_crossing_fraction,
+            )
+        initial_indices = jnp.zeros(step_length.shape, jnp.int32)
+        zero_duration = jnp.zeros_like(step_length)
+        return EventSearch(
+            step_length * first_crossing_fraction,
+            zero_duration,
+            step_length,
+            step_start.has_guard_crossed,
+            step_start.state,
+            zero_duration,
+            initial_indices,
+            initial_indices,
+            jnp.zeros((), jnp.int32),
+            zero_duration + jnp.inf if self.phase.has_exact_events else None,
+        )
+
+    def iterate(self, search: EventSearch) -> EventSearch:
+        """Return the search after one more solver step."""
+        step_length = search.event_step_length
+        step_end = self.take_solver_step(self.step_start.state, step_length)[0][-1]
+        step_end, guard_values, guard_rates = lax.stop_gradient(
+            (step_end, *self.phase.evaluate_with_rates(self.phase.evaluate_guards, step_end))
+        )
+        time_to_event, guard_index = _propose_earliest_event(
+            guard_values, guard_rates, self.is_crossing
+        )
+        is_before_event = jnp.ones(step_length.shape, bool)
+        is_guard_straight = jnp.ones(step_length.shape, bool)
+        for start_guard_value, guard_value, guard_rate, is_crossing_guard in zip(
+            self.step_start.guard_values, guard_values, guard_rates, self.is_crossing, strict=True
+        ):
+            has_crossed, is_guard_curved = _classify_guard_crossing(
+                start_guard_value, guard_value, guard_rate, step_length
+            )
+            is_before_event = is_before_event & ~(is_crossing_guard & has_crossed)
+            is_guard_straight = is_guard_straight & ~(is_crossing_guard & is_guard_curved)
+        lower_bound = jnp.where(is_before_event, step_length, search.lower_step_length_bound)
+        upper_bound = jnp.where(is_before_event, search.upper_step_length_bound, step_length)
+        proposed_step_length = step_length + time_to_event
+        is_proposal_in_bracket = (
+            proposed_step_length >= lower_bound - self.max_extrapolation_time
+        ) & (proposed_step_length <= upper_bound + self.max_extrapolation_time)
+        next_step_length = jnp.where(
+            is_proposal_in_bracket, proposed_step_length, 0.5 * (lower_bound + upper_bound)
+        )
+        if self.phase.has_exact_events:
+            guard_index = jnp.where(jnp.isposinf(time_to_event), -1, guard_index)
+            time_to_event = next_step_length - step_length
+            is_near, guard_index = self._confirm_exact_event(
+                search, time_to_event, guard_index, guard_values
+            )
+        else:
+            is_near = is_proposal_in_bracket & (
+                jnp.abs(time_to_event)
+                <= jnp.where(
+                    is_guard_straight, self.max_short_step_duration, self.max_extrapolation_time
+                )
+            )
+        is_at_event = search.is_event_unresolved & is_near
+        end_state, remaining_time_to_event, guard_index = select_trees_by_condition(
+            is_at_event,
+            (step_end, time_to_event, guard_index),
+            (search.end_state, search.remaining_time_to_event, search.guard_index),
+        )
+        return EventSearch(
+            event_step_length=jnp.where(search.is_event_unresolved, next_step_length, step_length),
+            lower_step_length_bound=lower_bound,
+            upper_step_length_bound=upper_bound,
+            is_event_unresolved=search.is_event_unresolved & ~is_at_event,
+            end_state=end_state,
+            remaining_time_to_event=remaining_time_to_event,
+            guard_index=guard_index,
+            n_tried_steps=search.n_tried_steps + search.is_event_unresolved,
+            n_iterations=search.n_iterations + 1,
+            correction=None if search.correction is None else jnp.abs(time_to_event),
+        )
+
+    def _confirm_exact_event(
+        self, search: EventSearch, time_to_event: Array, guard_index: Array, guard_values: Vector
+    ) -> tuple[Array, Array]:
+        """Return whether an exact event is located, and the index of its guard.
+
+        The last correction must be small compared with the solver step and with the time since the
+        phase began. The second comparison is skipped if the correction is only the guard's
+        round-off. A guard within round-off of its scale is at its event.
+
+        - `guard_index`: index of the guard that proposes the event; -1 if none does.
+        """
+        assert search.correction is not None
+        correction = jnp.abs(time_to_event)
+        event_time = self.step_start.elapsed_time + search.event_step_length + time_to_event
+        is_near = (correction <= self.max_extrapolation_time) & (
+            (correction <= EVENT_TIME_ACCURACY * event_time)
+            | (correction >= STALLED_CORRECTION_RATIO * search.correction)
+        )
+        scales = self.phase.guard_scales
+        values = jnp.stack(guard_values)
+        scaled_values = jnp.where(
+            jnp.stack(self.is_crossing), values if scales is None else values / scales, jnp.inf
+        )
+        roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(values.dtype).eps
+        is_at_roundoff = (jnp.abs(jnp.min(scaled_values)) <= roundoff) & (scales is not None)
+        return is_near | is_at_roundoff, jnp.where(
+            is_at_roundoff | (guard_index < 0),
+            jnp.argmin(scaled_values).astype(jnp.int32),
+            guard_index,
+        )
+
+    def take_short_steps(self, search: EventSearch) -> EventSearch:
+        """Return the search after short solver steps of low order to distant events.
+
+        One short solver step suffices unless a guard grazes zero. The event stays unresolved if
+        Newton's method diverges. A method of order 3 is accurate to round-off during a thousandth
+        of a solver step.
+        """
+        needs_short_step = lambda search: (
+            jnp.any(
+                self._can_take_short_step(
+                    search.is_event_unresolved, search.remaining_time_to_event
+                )
+            )
+            & (search.n_iterations < self.options.max_event_iterations)
+        )
+        is_event_distant = (
+            self.step_start.has_guard_crossed
+            & ~search.is_event_unresolved
+            & (jnp.abs(search.remaining_time_to_event) > self.max_extrapolation_time)
+        )
+        search = search._replace(
+            is_event_unresolved=is_event_distant, n_iterations=jnp.zeros((), jnp.int32)
+        )
+        return lax.while_loop(needs_short_step, self._take_short_step, search)
+
+    def _can_take_short_step(self, is_event_distant: Array, time_to_event: Array) -> Array:
+        return is_event_distant & (jnp.abs(time_to_event) <= self.max_short_step_duration)
+
+    def _take_short_step(self, search: EventSearch) -> EventSearch:
+        low_order_tableau = load_explicit_tableau("Bosh3")
+        assert low_order_tableau is not None
+        is_step_taken = self._can_take_short_step(
+            search.is_event_unresolved, search.remaining_time_to_event
+        )
+        short_step = take_rk_step(
+            low_order_tableau,
+            self.phase.evaluate_acceleration,
+            search.end_state,
+            search.remaining_time_to_event,
+        )
+        end_state = select_trees_by_condition(is_step_taken, short_step[-1], search.end_state)
+        time_to_event, guard_index = _propose_earliest_event(
+            *self.phase.evaluate_with_rates(self.phase.evaluate_guards, end_state),
+            self.is_crossing,
+        )
+        remaining_time_to_event = jnp.where(
+            is_step_taken, time_to_event, search.remaining_time_to_event
+        )
+        return search._replace(
+            event_step_length=jnp.where(
+                self._can_take_short_step(is_step_taken, time_to_event),
+                search.event_step_length + time_to_event,
+                search.event_step_length,
+            ),
+            is_event_unresolved=search.is_event_unresolved
+            & (jnp.abs(remaining_time_to_event) > self.max_extrapolation_time),
+            end_state=end_state,
+            remaining_time_to_event=remaining_time_to_event,
+            guard_index=jnp.where(is_step_taken, guard_index, search.guard_index),
+            n_iterations=search.n_iterations + 1,
+        )
 
 
 def compute_event_time_tangent(

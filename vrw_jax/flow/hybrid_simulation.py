@@ -25,13 +25,14 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.diffrax_minima import (
+from vrw_jax.flow.integrate import PhaseEnd
+from vrw_jax.flow.phase_integration import (
     GuardsAndMargins,
     StateArray,
+    VectorField,
+    integrate_phase,
     select_entry_by_mask,
 )
-from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase
-from vrw_jax.flow.solver_steps import VectorField
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 MAX_STORED_NUMBERS = 100_000_000

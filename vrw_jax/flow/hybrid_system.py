@@ -38,7 +38,6 @@ from vrw_jax.base.walker import (
     make_return_map,
     step_batch_of_walker,
 )
-from vrw_jax.flow.diffrax_minima import StateArray
 from vrw_jax.flow.hybrid_simulation import (
     Event,
     Guard,
@@ -48,6 +47,7 @@ from vrw_jax.flow.hybrid_simulation import (
     run_events,
     simulate_modes,
 )
+from vrw_jax.flow.phase_integration import StateArray
 
 MAX_EVENTS_PER_STEP = 16
 """Default limit of the events in one step, chosen above those of walkers with several legs."""

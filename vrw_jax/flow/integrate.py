@@ -6,6 +6,7 @@ Newton's method corrects its length. An element that has ended does not change, 
 depends on the other elements.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -49,18 +50,23 @@ from vrw_jax.flow.tangents import (
 )
 
 
-class BatchPhaseEnd(NamedTuple):
-    """State at the end of a phase, duration, triggered guard and failure flags of each element."""
+class PhaseEnd(NamedTuple):
+    """State at the end of a phase, duration, triggered guard, failure flags and margin minima."""
 
-    state: StageState
+    state: Any  # a StageState, or an array
     duration: Array  # s
     end_guard_index: Array  # index of the guard that ended the phase; -1 if none did
     is_timed_out: Array
     # whether the element is a straggler, see `integrate_batch_phase`
     is_unfinished: Array
-    n_tried_steps: Array  # number of solver steps, accepted or not
+    solver_steps: Array  # number of tried solver steps, accepted or not
     next_solver_dt: Array  # next step length that the controller proposes, s
-    margin_minima: Array | None  # minima of the margins, (margins, batch)
+    margin_minima: Any  # minima of the margins, (margins, batch); None if there are none
+
+    @property
+    def has_integration_failed(self) -> Array:
+        """Return whether an active phase has ended without event or time limit."""
+        return (self.end_guard_index < 0) & ~self.is_timed_out
 
 
 STRAGGLER_ITERATION_FACTOR = 2
@@ -81,7 +87,7 @@ def integrate_batch_phase(
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None = None,
-) -> BatchPhaseEnd:
+) -> PhaseEnd:
     """Return the end of a phase that begins at positions `q` and rates `v`, for each batch element.
 
     - `make_phase`: function that returns the phase for `phase_constants` and `held_constants`;
@@ -101,22 +107,31 @@ def integrate_batch_phase(
     The result is differentiable with respect to `phase_constants`, `held_constants`, `q` and `v`,
     see `tangents`.
     """
-    integrate_with_rule = jax.custom_jvp(
-        lambda *arguments: _integrate_to_event(make_phase, tableau, None, *arguments)[0]
-    )
+
+    def integrate(
+        phase_tangents: PhaseTangents | None,
+        phase_constants: Any,
+        held_constants: Vector,
+        q: Vector,
+        v: Vector,
+        *arguments: Any,
+    ) -> tuple[PhaseEnd, Any]:
+        phase = make_phase(phase_constants, held_constants)
+        return integrate_to_event(phase, phase_tangents, tableau, q, v, *arguments)
+
+    integrate_with_rule = jax.custom_jvp(lambda *arguments: integrate(None, *arguments)[0])
 
     @integrate_with_rule.defjvp
     @lanes.with_default_jax_settings
-    def compute_integration_jvp(
-        primals: tuple, state_tangents: tuple
-    ) -> tuple[BatchPhaseEnd, BatchPhaseEnd]:
-        def integrate_with_tangents(primals: tuple, directions: tuple) -> tuple[BatchPhaseEnd, Any]:
+    def compute_integration_jvp(primals: tuple, state_tangents: tuple) -> tuple[PhaseEnd, PhaseEnd]:
+        def integrate_with_tangents(primals: tuple, directions: tuple) -> tuple[PhaseEnd, Any]:
             phase_constants_tangents, held_constants, q, v = directions
             start_tangents = stack_directions((*q, *v, *held_constants))
             phase_tangents = PhaseTangents(
                 make_phase, primals[0], primals[1], phase_constants_tangents, start_tangents
             )
-            return _integrate_to_event(make_phase, tableau, phase_tangents, *primals)
+            phase_end, search_end = integrate(phase_tangents, *primals)
+            return phase_end, _compute_phase_end_jvp(tableau, phase_tangents, phase_end, search_end)
 
         phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
             integrate_with_tangents, primals, state_tangents[:4]
@@ -132,27 +147,32 @@ def integrate_batch_phase(
     )
 
 
+class SearchEnd(NamedTuple):
+    """What derivatives of the end of a phase need of its integration."""
+
+    solver_step_function: SolverStepFunction
+    start_state: StageState
+    integrator_state: IntegratorState  # after the loop, with the minima of the whole phase
+    margin_minima_result: MarginMinimaResult | None
+
+
 def _compute_phase_end_jvp(
     tableau: ButcherTableau,
     phase_tangents: PhaseTangents,
-    solver_step_function: SolverStepFunction,
-    start_state: StageState,
-    phase_end: BatchPhaseEnd,
-    integrator_state: IntegratorState,
-    margin_minima_result: MarginMinimaResult | None,
+    phase_end: PhaseEnd,
+    search_end: SearchEnd,
 ) -> tuple[Vector, Vector, Array, Array | None]:
     """Return the tangents at the end of a phase, for given tangents of its start and constants.
 
     The result contains the tangents of positions, rates, duration and minima of the margins. The
     first axis contains the directions.
-
-    - `integrator_state`: state of the loop after it has ended, with the minima of the whole phase.
     """
+    solver_step_function, start_state, integrator_state, margin_minima_result = search_end
     n = len(start_state.q)
     last_step_length = jnp.where(
         integrator_state.has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
     )
-    stage_states = solver_step_function(integrator_state.state, last_step_length)
+    stage_states, _ = solver_step_function(integrator_state.state, last_step_length)
     assert integrator_state.state_tangents is not None
     end_state_tangents = phase_tangents.propagate_to_step_end(
         tableau, stage_states, integrator_state.state_tangents, last_step_length
@@ -190,31 +210,30 @@ def _compute_phase_end_jvp(
     return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
 
 
-def _integrate_to_event(
-    make_phase: MakeBatchPhase,
-    tableau: ButcherTableau,
+def integrate_to_event(
+    phase: BatchPhase,
     phase_tangents: PhaseTangents | None,
-    phase_constants: Any,
-    held_constants: Vector,
+    tableau: ButcherTableau,
     q: Vector,
     v: Vector,
     is_active: Array,
     initial_dt: Array,
     options: StepOptions,
-    straggler_count: Array | None,
-) -> tuple[BatchPhaseEnd, Any]:
-    """Return the end of a phase for each batch element, and its tangents.
+    straggler_count: Array | None = None,
+) -> tuple[PhaseEnd, SearchEnd]:
+    """Return the end of a phase for each batch element, and what its derivatives need.
 
-    The tangents are those of `_compute_phase_end_jvp`; None without `phase_tangents`.
+    The arguments are those of `integrate_batch_phase`.
     """
-    phase = make_phase(phase_constants, held_constants)
     phase = _wrap_each_phase_function(
         phase, lanes.mark_noinline if phase.is_compiled_separately else jax.jit
     )
-    solver_step_function = _make_solver_step_function(phase, tableau)
+    solver_step_function = _make_solver_step_function(phase, tableau, options)
     start_state = phase.make_state(q, v)
-    guard_values, guard_rates = phase.evaluate_with_rates(phase.evaluate_guards, start_state)
-    is_guard_met_at_start = tuple(
+    guard_values, guard_rates = lax.stop_gradient(
+        phase.evaluate_with_rates(phase.evaluate_guards, start_state)
+    )
+    is_guard_met_at_start = phase.guards_met_at_start or tuple(
         (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
         for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
     )
@@ -240,8 +259,10 @@ def _integrate_to_event(
     if phase.margins_include_start or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
         phase = _wrap_each_phase_function(phase, lanes.mark_noinline)
-        solver_step_function = _make_solver_step_function(phase, tableau)
-    event_search = locate_event(phase, solver_step_function, tableau, integrator_state, options)
+        solver_step_function = _make_solver_step_function(phase, tableau, options)
+    event_search = locate_event(
+        phase, solver_step_function, tableau, lax.stop_gradient(integrator_state), options
+    )
     is_crossing_event_unresolved = has_guard_crossed & event_search.is_event_unresolved
     duration = integrator_state.elapsed_time + jnp.where(
         has_guard_crossed, event_search.event_step_length, 0.0
@@ -266,6 +287,7 @@ def _integrate_to_event(
             margin_minima_state,
             jnp.stack(phase.evaluate_margins(start_state)),
             options,
+            min_iterations=3 if phase.has_exact_events else 1,
         )
     is_event_too_late = (
         has_guard_crossed & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
@@ -275,7 +297,7 @@ def _integrate_to_event(
         start_event_guard_index,
         jnp.where(has_guard_crossed, event_search.guard_index, -1),
     )
-    phase_end = BatchPhaseEnd(
+    phase_end = PhaseEnd(
         state=end_state,
         duration=duration,
         end_guard_index=jnp.where(
@@ -284,32 +306,36 @@ def _integrate_to_event(
         is_timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
         | is_event_too_late,
         is_unfinished=integrator_state.is_running,
-        n_tried_steps=integrator_state.n_tried_steps
+        solver_steps=integrator_state.n_tried_steps
         + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),
         next_solver_dt=integrator_state.next_step_length,
         margin_minima=None
         if margin_minima_result is None
         else margin_minima_result.phase_margin_minima,
     )
-    if phase_tangents is None:
-        return phase_end, None
-    return phase_end, _compute_phase_end_jvp(
-        tableau,
-        phase_tangents,
+    return phase_end, SearchEnd(
         solver_step_function,
         start_state,
-        phase_end,
         integrator_state._replace(margin_minima_state=margin_minima_state),
         margin_minima_result,
     )
 
 
-def _make_solver_step_function(phase: BatchPhase, tableau: ButcherTableau) -> SolverStepFunction:
-    """Return a function of state and length that takes one Runge-Kutta step in the phase.
+def _make_solver_step_function(
+    phase: BatchPhase, tableau: ButcherTableau, options: StepOptions
+) -> SolverStepFunction:
+    """Return a function of state and length that takes one solver step in the phase.
 
     The function is traced once for all its calls.
     """
-    return jax.jit(lambda state, h: take_rk_step(tableau, phase.evaluate_acceleration, state, h))
+
+    def take_step(state: StageState, h: Array) -> tuple[list[StageState], Array]:
+        stage_states = take_rk_step(tableau, phase.evaluate_acceleration, state, h)
+        return stage_states, _compute_mean_squared_error(
+            tableau, stage_states, h, options, phase.state_units
+        )
+
+    return jax.jit(phase.take_solver_step or take_step)
 
 
 def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
@@ -342,21 +368,24 @@ def _integrate_until_crossing(
 
     def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:
         step_length = integrator_state.next_step_length
-        stage_states = solver_step_function(integrator_state.state, step_length)
-        inner_guard_values = [
-            integrator_state.guard_values,
-            *(phase.evaluate_guards(stage_states[i]) for i in tableau.guard_stage_indices),
-        ]
-        end_guard_values = phase.evaluate_guards(stage_states[-1])
-        mean_squared_error = _compute_mean_squared_error(
-            tableau, stage_states, step_length, end_guard_values, options, phase.state_units
+        stage_states, mean_squared_error = solver_step_function(integrator_state.state, step_length)
+        *later_guard_values, end_guard_values = lax.stop_gradient(
+            [phase.evaluate_guards(stage_states[i]) for i in (*tableau.guard_stage_indices, -1)]
         )
+        inner_guard_values = [integrator_state.guard_values, *later_guard_values]
+        finite_sum = functools.reduce(jnp.add, [0.0 * value for value in end_guard_values])
+        mean_squared_error = jnp.where(jnp.isfinite(finite_sum), mean_squared_error, jnp.inf)
         guard_minimum_fraction = find_earliest_guard_minimum_fraction(
             tableau, [*inner_guard_values, end_guard_values]
         )
         is_within_tolerance = mean_squared_error <= 1.0
         # A step inside which a guard may be negative is repeated up to the guard's minimum.
-        may_cross_inside = is_within_tolerance & (guard_minimum_fraction < 1.0)
+        elapsed_time = integrator_state.elapsed_time
+        may_cross_inside = (
+            is_within_tolerance
+            & (guard_minimum_fraction < 1.0)
+            & (elapsed_time + step_length * guard_minimum_fraction > elapsed_time)
+        )
         controller_factor = compute_step_size_factor(
             tableau, mean_squared_error, guard_minimum_fraction.dtype
         )
@@ -440,7 +469,6 @@ def _integrate_until_crossing(
         integration_status=jnp.where(
             is_phase_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
         ).astype(jnp.int32),
-        crossing_guard_bits=initial_counts,
         middle_guard_values=guard_values,
         end_guard_values=guard_values,
         n_tried_steps=initial_counts,
@@ -461,20 +489,16 @@ def _classify_solver_step(
 ) -> tuple[IntegratorState, Array]:
     """Return the status of each batch element after a solver step, and whether it accepts the step.
 
-    The returned state has a new status, new bits of the crossing guards, the new elapsed time, and
-    the length of the next solver step. If a guard crosses zero within the solver step, the length
+    The returned state has a new status, the new elapsed time, and the length of the next solver
+    step. If a guard crosses zero within the solver step, the length
     is instead that of the step just taken. A step that would end after the time limit is shortened
     to end there. An element fails if its next step is too short for the time to advance, or if the
     number of its solver steps reaches the limit.
     """
     is_running = integrator_state.is_running
     is_valid_step = is_running & ~is_step_rejected
-    crossing_guard_bits = jnp.zeros_like(integrator_state.crossing_guard_bits)
-    for candidate_guard_index, end_guard_value in enumerate(end_guard_values):
-        crossing_guard_bits = crossing_guard_bits | jnp.where(
-            end_guard_value <= 0.0, 1 << candidate_guard_index, 0
-        )
-    has_guard_crossed = is_valid_step & (crossing_guard_bits > 0)
+    is_guard_met = functools.reduce(jnp.logical_or, [value <= 0.0 for value in end_guard_values])
+    has_guard_crossed = is_valid_step & is_guard_met
     is_accepted = is_valid_step & ~has_guard_crossed
     step_length = integrator_state.next_step_length
     elapsed_time = integrator_state.elapsed_time
@@ -503,9 +527,6 @@ def _classify_solver_step(
     )
     next_state = integrator_state._replace(
         integration_status=integration_status.astype(jnp.int32),
-        crossing_guard_bits=jnp.where(
-            is_running, crossing_guard_bits, integrator_state.crossing_guard_bits
-        ),
         elapsed_time=elapsed_time,
         next_step_length=jnp.where(
             is_running & ~has_guard_crossed, next_step_length_limit, step_length
@@ -518,7 +539,6 @@ def _compute_mean_squared_error(
     tableau: ButcherTableau,
     stage_states: list[StageState],
     step_length: Array,
-    end_guard_values: Vector,
     options: StepOptions,
     state_units: Vector | None,
 ) -> Array:
@@ -527,7 +547,6 @@ def _compute_mean_squared_error(
     The result is infinite for a solver step whose end is not finite. The mean is computed in
     float32, because an error estimate needs no higher precision.
 
-    - `end_guard_values`: guards at the end of the step, which must be finite;
     - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
       units.
     """
@@ -550,8 +569,6 @@ def _compute_mean_squared_error(
         )
         relative_error = convert_to_float32(component_error) / convert_to_float32(error_tolerance)
         sum_of_squares = sum_of_squares + relative_error * relative_error
-    for end_guard_value in end_guard_values:
-        sum_of_squares = sum_of_squares + convert_to_float32(0.0 * end_guard_value)
     return jnp.where(
         jnp.isfinite(sum_of_squares), sum_of_squares / len(start_state_components), jnp.inf
     )
@@ -575,7 +592,7 @@ def sample_batch_phase(
     def solver_step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
         stage_states = take_rk_step(tableau, phase.evaluate_acceleration, state, step_length)
         return stage_states[-1], _compute_mean_squared_error(
-            tableau, stage_states, step_length, (), options, phase.state_units
+            tableau, stage_states, step_length, options, phase.state_units
         )
 
     pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
@@ -610,7 +627,7 @@ def sample_at_equal_times(
 
     def take_solver_step_to_sample(loop_carry: tuple) -> tuple:
         sample_state, h, remaining_time_to_sample, n_tried_steps = loop_carry
-        sampled_step_length = jnp.minimum(h, remaining_time_to_sample)
+        sampled_step_length = jnp.where(h < remaining_time_to_sample, h, remaining_time_to_sample)
         step_end, mean_squared_error = solver_step_function(sample_state, sampled_step_length)
         step_length_factor = compute_step_size_factor(
             tableau, mean_squared_error, sampled_step_length.dtype
@@ -625,7 +642,7 @@ def sample_at_equal_times(
         is_running = remaining_time_to_sample > 0.0
         return (
             select_trees_by_condition(is_running & is_within_tolerance, step_end, sample_state),
-            jnp.where(is_running, h, loop_carry[1]),
+            lax.stop_gradient(jnp.where(is_running, h, loop_carry[1])),
             jnp.where(
                 is_running & is_within_tolerance,
                 jnp.where(

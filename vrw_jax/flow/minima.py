@@ -1,22 +1,21 @@
 """Minima of margins during a phase of a batch, as accurate as the integration.
 
-The method is that of `flow/diffrax_minima`, applied to all batch elements. During the integration,
-the solver step that contains the lowest minimum of each margin is stored. Afterwards, a secant
-iteration for the root of the margin's time derivative locates each minimum, one margin after
-another.
+During the integration, the solver step that contains the lowest minimum of each margin is stored.
+Afterwards, a secant iteration for the root of the margin's time derivative locates each minimum,
+one margin after another.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Vector
 from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
 from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
 
@@ -26,7 +25,7 @@ because the error of the minimum is proportional to the square of the error of i
 """
 
 
-def evaluate_cubic(
+def _evaluate_cubic(
     x: Array,
     cubic_value_at_0: Array,
     cubic_rate_at_0: Array,
@@ -46,7 +45,7 @@ def evaluate_cubic(
 
 
 @jax.jit  # The function is traced once for all margins.
-def find_cubic_minimum(
+def _find_cubic_minimum(
     cubic_value_at_0: Array, cubic_rate_at_0: Array, cubic_value_at_1: Array, cubic_rate_at_1: Array
 ) -> tuple[Array, Array]:
     """Return the location and the value of the interior minimum of the cubic Hermite interpolant.
@@ -79,12 +78,12 @@ def find_cubic_minimum(
     x = jnp.where(has_interior_minimum, x, 0.5)
     return x, jnp.where(
         has_interior_minimum,
-        evaluate_cubic(x, cubic_value_at_0, cubic_rate_at_0, cubic_value_at_1, cubic_rate_at_1),
+        _evaluate_cubic(x, cubic_value_at_0, cubic_rate_at_0, cubic_value_at_1, cubic_rate_at_1),
         jnp.minimum(cubic_value_at_0, cubic_value_at_1),
     )
 
 
-def refine_minimum_location(
+def _refine_minimum_location(
     step_length: Array,
     margin_rate: Array,
     max_step_length: Array,
@@ -128,8 +127,8 @@ class MarginMinimaState(NamedTuple):
     lowest_margin_values: (
         Array  # lowest interior minimum, (margins, batch); infinity if there is none
     )
-    step_start_q: Array  # positions at the start of that step, (margins, coordinates, batch)
-    step_start_v: Array
+    step_start_q: Vector  # positions at the start of that step, each (margins, batch)
+    step_start_v: Vector
     step_length: Array  # length of that step, (margins, batch), s
     time_to_minimum: Array  # time from the step's start to the minimum, s
     step_start_margin_rates: Array  # rates of the margins at the step's start
@@ -145,13 +144,11 @@ def init_margin_minima_state(
     A margin that is zero at the start of the phase by construction cannot fall there. Its negative
     time derivative at the start is round-off and is replaced by zero.
     """
-    margin_values, margin_rates = map(
-        jnp.stack, phase.evaluate_with_rates(phase.evaluate_margins, start_state)
-    )
-    includes_phase_start = jnp.asarray(phase.margins_include_start)[:, None]
+    margin_values, margin_rates = _evaluate_margins_with_rates(phase, start_state)
+    includes_phase_start = _spread_over_batch(phase.margins_include_start, margin_values)
     zero_margins = jnp.zeros_like(margin_values)
-    zero_start_coordinates = jnp.zeros(
-        (len(margin_values), len(start_state.q), margin_values.shape[-1]), margin_values.dtype
+    make_zeros = lambda coordinates: tuple(
+        jnp.zeros((len(margin_values), *x.shape), x.dtype) for x in coordinates
     )
     margin_rates = jnp.where(includes_phase_start, margin_rates, jnp.maximum(margin_rates, 0.0))
     zero_tangents = (
@@ -163,8 +160,8 @@ def init_margin_minima_state(
         margin_values,
         margin_rates,
         zero_margins + jnp.inf,
-        zero_start_coordinates,
-        zero_start_coordinates,
+        make_zeros(start_state.q),
+        make_zeros(start_state.v),
         zero_margins,
         zero_margins,
         zero_margins,
@@ -186,10 +183,8 @@ def update_margin_minima_state(
     - `is_accepted`: whether each batch element accepts the step;
     - `step_start_tangents`: tangents of the step's start.
     """
-    margin_values, margin_rates = map(
-        jnp.stack, phase.evaluate_with_rates(phase.evaluate_margins, step_end)
-    )
-    margin_minimum_location, margin_minimum = find_cubic_minimum(
+    margin_values, margin_rates = _evaluate_margins_with_rates(phase, step_end)
+    margin_minimum_location, margin_minimum = _find_cubic_minimum(
         margin_minima_state.margin_values,
         margin_minima_state.margin_rates * step_length,
         margin_values,
@@ -203,13 +198,15 @@ def update_margin_minima_state(
     )
 
     def replace_if_lower(old_value: Array, new_value: Array) -> Array:
-        is_lower = is_minimum_lower.reshape(len(old_value), *(1,) * (old_value.ndim - 2), -1)
+        n_margins, *batch_shape = is_minimum_lower.shape
+        n_inner_axes = old_value.ndim - is_minimum_lower.ndim
+        is_lower = is_minimum_lower.reshape(n_margins, *(1,) * n_inner_axes, *batch_shape)
         return jnp.where(is_lower, new_value, old_value)
 
     minimum_of_step = margin_minima_state._replace(
         lowest_margin_values=margin_minimum,
-        step_start_q=jnp.stack(step_start.q),
-        step_start_v=jnp.stack(step_start.v),
+        step_start_q=step_start.q,
+        step_start_v=step_start.v,
         step_length=step_length,
         time_to_minimum=margin_minimum_location * step_length,
         step_start_margin_rates=margin_minima_state.margin_rates,
@@ -220,6 +217,11 @@ def update_margin_minima_state(
     )
     lowest_minimum = jax.tree.map(replace_if_lower, margin_minima_state, minimum_of_step)
     return lowest_minimum._replace(margin_values=margin_values, margin_rates=margin_rates)
+
+
+def _evaluate_margins_with_rates(phase: BatchPhase, state: StageState) -> tuple[Array, Array]:
+    margins_and_rates = phase.evaluate_with_rates(phase.evaluate_margins, state)
+    return lax.stop_gradient((jnp.stack(margins_and_rates[0]), jnp.stack(margins_and_rates[1])))
 
 
 class MarginMinimaResult(NamedTuple):
@@ -249,12 +251,15 @@ def refine_margin_minima(
     margin_minima_state: MarginMinimaState,
     start_margin_values: Array,
     options: StepOptions,
+    min_iterations: int = 1,
 ) -> MarginMinimaResult:
     """Return the minima of the margins over the phase, refined by a secant iteration.
 
     `start_margin_values` are the margins at the start of the phase, (margins, batch). Each
     iteration takes a solver step from the start of the solver step that contains the minimum. At
-    most `max_margin_search_iterations` iterations are made per margin.
+    most `max_margin_search_iterations` iterations are made per margin, and at least
+    `min_iterations`. Each iteration makes more digits of the derivatives of the minimum's time
+    right.
     """
 
     def refine_one_margin_minimum(
@@ -262,7 +267,7 @@ def refine_margin_minima(
     ) -> tuple[None, tuple[Array, Array]]:
         margin_index, margin_minimum_state = margin_scan_inputs
         minimum_step_start_state = phase.make_state(
-            tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+            margin_minimum_state.step_start_q, margin_minimum_state.step_start_v
         )
 
         evaluate_selected_margin = lambda state: (
@@ -273,12 +278,12 @@ def refine_margin_minima(
             margin_minimum_search: _MarginMinimumSearch,
         ) -> _MarginMinimumSearch:
             step_length, *best_step, _, is_minimum_unresolved, n_iterations = margin_minimum_search
-            step_end = solver_step_function(minimum_step_start_state, step_length)[-1]
+            step_end = solver_step_function(minimum_step_start_state, step_length)[0][-1]
             (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
                 evaluate_selected_margin, step_end
             )
             step_length, best_step_length, best_margin_rate, has_secant_converged = (
-                refine_minimum_location(
+                _refine_minimum_location(
                     step_length, margin_rate, margin_minimum_state.step_length, *best_step
                 )
             )
@@ -289,7 +294,8 @@ def refine_margin_minima(
                     best_step_length,
                     best_margin_rate,
                     margin_value,
-                    is_minimum_unresolved & ~has_secant_converged,
+                    is_minimum_unresolved
+                    & (~has_secant_converged | (n_iterations + 1 < min_iterations)),
                     n_iterations,
                 ),
                 margin_minimum_search,
@@ -313,12 +319,12 @@ def refine_margin_minima(
         )
         return None, (final_search.margin_value, final_search.step_length)
 
-    includes_phase_start = np.asarray(phase.margins_include_start)[:, None]
+    includes_phase_start = _spread_over_batch(phase.margins_include_start, start_margin_values)
     end_margin_minima = jnp.minimum(
         jnp.where(includes_phase_start, start_margin_values, jnp.inf),
         margin_minima_state.margin_values,
     )
-    margin_indices = jnp.arange(len(includes_phase_start), dtype=jnp.int32)
+    margin_indices = jnp.arange(len(start_margin_values), dtype=jnp.int32)
     interior_margin_minima, step_length_to_minimum = lax.scan(
         refine_one_margin_minimum,
         None,
@@ -331,10 +337,16 @@ def refine_margin_minima(
     )
 
 
-def _select_margin(margins: Array, margin_index: Array) -> Array:
-    """Return the margin with the given index, from margins of shape (..., margins, batch)."""
-    is_selected_margin = jnp.arange(margins.shape[-2]) == margin_index
-    return jnp.sum(jnp.where(is_selected_margin[:, None], margins, 0.0), -2)
+def _spread_over_batch(flags_of_margins: Any, margins: Array) -> Array:
+    """Return one flag for each margin in a shape that broadcasts with (margins, batch)."""
+    return jnp.asarray(flags_of_margins).reshape(-1, *(1,) * (margins.ndim - 1))
+
+
+def _select_margin(margins: Array, margin_index: Array, axis: int = 0) -> Array:
+    """Return the margin with the given index along an axis."""
+    is_selected = jnp.arange(margins.shape[axis]) == margin_index
+    is_selected = is_selected.reshape(-1, *(1,) * (margins.ndim - 1 - axis))
+    return jnp.sum(jnp.where(is_selected, margins, 0.0), axis)
 
 
 def compute_margin_minima_jvp(
@@ -362,14 +374,14 @@ def compute_margin_minima_jvp(
     def compute_margin_tangent(_: None, margin_scan_inputs: tuple) -> tuple[None, Array]:
         margin_index, margin_minimum_state, step_length = margin_scan_inputs
         minimum_step_start_state = phase.make_state(
-            tuple(margin_minimum_state.step_start_q), tuple(margin_minimum_state.step_start_v)
+            margin_minimum_state.step_start_q, margin_minimum_state.step_start_v
         )
-        stage_states = solver_step_function(minimum_step_start_state, step_length)
+        stage_states = solver_step_function(minimum_step_start_state, step_length)[0]
         state_tangents = phase_tangents.propagate_to_step_end(
             tableau, stage_states, margin_minimum_state.step_start_tangents, step_length
         )
         return None, _select_margin(
-            compute_margin_tangents(stage_states[-1], state_tangents), margin_index
+            compute_margin_tangents(stage_states[-1], state_tangents), margin_index, 1
         )
 
     margin_indices = jnp.arange(len(margin_minima_result.phase_margin_minima), dtype=jnp.int32)

@@ -8,8 +8,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.options import StepOptions
-from vrw_jax.flow.diffrax_minima import StateArray
 from vrw_jax.flow.hybrid_simulation import HybridSolution, Mode, Termination, simulate_hybrid
+from vrw_jax.flow.phase_integration import StateArray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -5,9 +5,14 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
-from vrw_jax.flow.phase_integration import PhaseEnd, integrate_phase, sample_phase
-from vrw_jax.flow.solver_steps import VectorField
+from vrw_jax.flow.integrate import PhaseEnd
+from vrw_jax.flow.phase_integration import (
+    GuardsAndMargins,
+    StateArray,
+    VectorField,
+    integrate_phase,
+    sample_phase,
+)
 
 
 def integrate_phase_in_scaled_units(

@@ -19,8 +19,7 @@ from jaxtyping import Array, Float
 from vrw_jax.base.forward_only import forbid_reverse_mode
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.phase_integration import sample_phase
-from vrw_jax.flow.solver_steps import VectorField
+from vrw_jax.flow.phase_integration import VectorField, sample_phase
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 

@@ -116,7 +116,8 @@ def load_explicit_tableau(solver_name: str) -> ButcherTableau | None:
         guard_stage_indices=guard_stage_indices,
         bernstein_matrix=np.linalg.inv(np.stack(bernstein_basis, 1))[1:-1],
         middle_guard_index=middle_guard_index,
-        middle_node=float(guard_nodes[middle_guard_index]),
+        # A step without inner stages has a line instead of a parabola.
+        middle_node=float(guard_nodes[middle_guard_index]) or -math.inf,
     )
 
 
@@ -188,8 +189,11 @@ def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tu
         min_bernstein_coefficient = jnp.minimum(
             inner_bernstein_coefficient, min_bernstein_coefficient
         )
-    has_guard_risen = inner_bernstein_coefficients[-1] < guard_values[-1]
-    for preceding_guard_value, following_guard_value in itertools.pairwise(guard_values):
+    has_guard_risen = jnp.zeros(minimum_fraction.shape, bool)
+    for preceding_guard_value, following_guard_value in (
+        *zip(inner_bernstein_coefficients[-1:], guard_values[-1:], strict=False),
+        *itertools.pairwise(guard_values),
+    ):
         has_guard_risen = has_guard_risen | (preceding_guard_value < following_guard_value)
     has_guard_minimum = (
         (min_bernstein_coefficient <= 0.0)
@@ -266,10 +270,13 @@ def _set_roundoff_to_zero(x: np.ndarray) -> np.ndarray:
 
 
 class StageAccelerations(NamedTuple):
-    """Accelerations at one state, and sine and cosine of the wheel's angle theta."""
+    """Accelerations at one state, and sine and cosine of the wheel's angle theta.
 
-    sin: Array  # sine of theta
-    cos: Array
+    Of a state without positions, it contains the time derivatives of the rates only.
+    """
+
+    sin: Any  # sine of theta
+    cos: Any
     acceleration: Vector  # accelerations of all three coordinates, those of the phase first
 
 
@@ -300,10 +307,11 @@ class StageState(NamedTuple):
 
 
 EvaluateAcceleration = Callable[[Vector, Vector], StageAccelerations]
-SolverStepFunction = Callable[[StageState, Array], list[StageState]]
-"""Function of a state and a step length that returns all stages of a Runge-Kutta step.
+SolverStepFunction = Callable[[StageState, Array], tuple[list[StageState], Array]]
+"""Function of a state and a step length that returns all stages of a solver step, and its error.
 
-The first state is the start of the step, and the last state is its end.
+The first stage is the start of the step, and the last stage is its end. The error is the mean
+square of the error divided by the tolerance, and infinite if the end is not finite.
 """
 
 
@@ -317,7 +325,7 @@ def take_rk_step(
 
     The first state is the start of the step, and the last state is its end.
     """
-    n = len(start_state.q)
+    n = len(start_state.v)
     stage_states, stage_accelerations = [start_state], [start_state.acceleration.acceleration[:n]]
     for i in range(1, len(tableau.stage_nodes)):
         q, v = evaluate_stage(tableau, i, start_state.q, start_state.v, stage_accelerations, h)
@@ -333,11 +341,11 @@ def estimate_step_error(
     """Return the errors of the positions and then of the rates after a step of length `h`, s."""
     accelerations_by_coordinate = [
         [stage_state.acceleration.acceleration[i] for stage_state in stage_states]
-        for i in range(len(stage_states[0].q))
+        for i in range(len(stage_states[0].v))
     ]
     position_errors = [
         h * h * _sum_weighted_terms(tableau.position_error_weights, accelerations)
-        for accelerations in accelerations_by_coordinate
+        for accelerations in accelerations_by_coordinate[: len(stage_states[0].q)]
     ]
     rate_errors = [
         h * _sum_weighted_terms(tableau.rate_error_weights, accelerations)
@@ -360,30 +368,39 @@ def evaluate_stage(
     `h` is the length of the solver step, s.
     """
     stage_positions, stage_rates = [], []
-    for coordinate in range(len(start_positions)):
+    has_positions = len(start_positions) > 0
+    for coordinate in range(len(start_rates)):
         coordinate_accelerations = [
             stage_acceleration[coordinate] for stage_acceleration in stage_accelerations
         ]
-        twice_integrated_acceleration = _sum_weighted_terms(
-            tableau.squared_stage_matrix[stage_index], coordinate_accelerations
-        )
+        if has_positions:
+            twice_integrated_acceleration = _sum_weighted_terms(
+                tableau.squared_stage_matrix[stage_index], coordinate_accelerations
+            )
+            displacement_per_time = (
+                float(tableau.stage_nodes[stage_index]) * start_rates[coordinate]
+            )
+            if twice_integrated_acceleration is not None:
+                displacement_per_time = displacement_per_time + h * twice_integrated_acceleration
+            stage_positions.append(start_positions[coordinate] + h * displacement_per_time)
         integrated_acceleration = _sum_weighted_terms(
-            tableau.stage_matrix[stage_index], coordinate_accelerations
+            tableau.stage_matrix[stage_index], coordinate_accelerations, is_sorted=not has_positions
         )
-        displacement_per_time = float(tableau.stage_nodes[stage_index]) * start_rates[coordinate]
-        if twice_integrated_acceleration is not None:
-            displacement_per_time = displacement_per_time + h * twice_integrated_acceleration
-        stage_positions.append(start_positions[coordinate] + h * displacement_per_time)
         stage_rates.append(start_rates[coordinate] + h * integrated_acceleration)
     return tuple(stage_positions), tuple(stage_rates)
 
 
-def _sum_weighted_terms(term_weights: np.ndarray, terms_to_sum: list[Array]) -> Any:
+def _sum_weighted_terms(
+    term_weights: np.ndarray, terms_to_sum: list[Array], is_sorted: bool = False
+) -> Any:
     """Return the sum of `term_weights` times `terms_to_sum`, or None if all weights are zero.
 
     Half of the operations in a solver step are such sums. The sum uses functions of `lax`, because
-    they are traced in a third of the time of Python's operators.
+    they are traced in a third of the time of Python's operators. With `is_sorted`, small weights
+    come first, so that the weights of Dopri8 add up to 1 without round-off.
     """
-    weights_and_terms = zip(term_weights, terms_to_sum, strict=False)
-    weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms if w != 0.0]
+    weights_and_terms = [(w, x) for w, x in zip(term_weights, terms_to_sum, strict=False) if w]
+    if is_sorted:
+        weights_and_terms.sort(key=lambda weight_and_term: abs(weight_and_term[0]))
+    weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms]
     return functools.reduce(lax.add, weighted_terms) if weighted_terms else None

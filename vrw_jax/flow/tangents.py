@@ -29,6 +29,7 @@ from vrw_jax.base.types import Vector
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
     EvaluateAcceleration,
+    SolverStepFunction,
     StageAccelerations,
     StageState,
     evaluate_stage,
@@ -71,6 +72,14 @@ class BatchPhase(NamedTuple):
 
     The default is SI units.
     """
+    take_solver_step: SolverStepFunction | None = None
+    """Solver step of the phase; by default, a step of the tableau."""
+    has_exact_events: bool = False
+    """Whether an event is located to round-off, and not to the tolerances."""
+    guard_scales: Array | None = None
+    """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
+    guards_met_at_start: Vector | None = None
+    """Whether each guard ends the phase at its start; by default, its value and rate decide."""
 
     def make_state(self, q: Vector, v: Vector) -> StageState:
         """Return the state with positions `q`, rates `v` and the accelerations there."""
@@ -83,7 +92,7 @@ class BatchPhase(NamedTuple):
         return jax.jvp(
             lambda q, v: evaluate_functions(self.make_state(q, v)),
             (state.q, state.v),
-            (state.v, state.acceleration.acceleration[: len(state.q)]),
+            (state.v[: len(state.q)], state.acceleration.acceleration[: len(state.v)]),
         )
 
 

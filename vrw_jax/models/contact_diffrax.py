@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins
+from vrw_jax.flow.phase_integration import GuardsAndMargins
 from vrw_jax.flow.scaled_integration import (
     integrate_phase_in_scaled_units,
     sample_phase_in_scaled_units,

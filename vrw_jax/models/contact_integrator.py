@@ -27,7 +27,7 @@ from jaxtyping import Array
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.diffrax_minima import GUARD_ROUNDOFF_IN_EPS
+from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
     compute_step_size_factor,

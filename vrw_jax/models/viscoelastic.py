@@ -26,13 +26,12 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.flow.diffrax_minima import GuardsAndMargins, StateArray
 from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
+from vrw_jax.flow.phase_integration import GuardsAndMargins, StateArray, VectorField
 from vrw_jax.flow.scaled_integration import (
     integrate_phase_in_scaled_units,
     sample_phase_in_scaled_units,
 )
-from vrw_jax.flow.solver_steps import VectorField
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
     StageAccelerations,
@@ -646,11 +645,12 @@ def _make_phase_runner(
             straggler_count,
         )
         return PhaseResult(
-            *phase_end.state[:2],
+            q=phase_end.state.q,
+            v=phase_end.state.v,
             duration=phase_end.duration,
             end_guard_index=phase_end.end_guard_index,
             is_timed_out=phase_end.is_timed_out,
-            n_solver_steps=phase_end.n_tried_steps,
+            n_solver_steps=phase_end.solver_steps,
             margin_minima=phase_end.margin_minima,
             next_phase_inputs=_NextPhaseInputs(
                 phase_end.next_solver_dt, is_active_lane, phase_end.is_unfinished
