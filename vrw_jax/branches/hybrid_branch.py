@@ -143,8 +143,7 @@ def _measure_margins(
     """Return the minimum of each margin over one step of `n_events` events."""
     start = system.embed(x, params)
     simulation = system.simulate(params, start, events=system.max_events, options=options)
-    starts = jnp.concatenate([start[None], simulation.states_after[:-1]])
-    durations = jnp.diff(simulation.times, prepend=0.0)
+    starts, durations = simulation.find_phases(start)
 
     def measure_mode(field: Callable, start: Array, duration: Array, is_active: Array) -> Array:
         evaluate = lambda y: jnp.stack(

@@ -130,6 +130,14 @@ class HybridSolution(NamedTuple):
         """Return a sentence on how the simulation ended; for a batch, an array of sentences."""
         return describe_step_ending(self.termination, Termination)
 
+    def find_phases(self, start: StateArray) -> tuple[Array, Array]:
+        """Return the state at the start and the duration, s, of the phase before each event.
+
+        - `start`: state at which the simulation begins, shape (dim,).
+        """
+        phase_starts = jnp.concatenate([start[None], self.states_after[:-1]])
+        return phase_starts, jnp.diff(self.times, prepend=0.0)
+
 
 @announce_wait("the system's equations and guards", "10 s")
 def simulate_hybrid(

@@ -589,11 +589,11 @@ def sample_batch_phase(
     has the shape (samples, 2 coordinates, batch), with the positions before the rates.
     """
 
+    take_solver_step = _make_solver_step_function(phase, tableau, options)
+
     def solver_step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
-        stage_states = take_rk_step(tableau, phase.evaluate_acceleration, state, step_length)
-        return stage_states[-1], _compute_mean_squared_error(
-            tableau, stage_states, step_length, options, phase.state_units
-        )
+        stage_states, mean_squared_error = take_solver_step(state, step_length)
+        return stage_states[-1], mean_squared_error
 
     pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
     return sample_at_equal_times(

@@ -27,7 +27,7 @@ from vrw_jax.flow.integrate import (
     PhaseEnd,
     SearchEnd,
     integrate_to_event,
-    sample_at_equal_times,
+    sample_batch_phase,
 )
 from vrw_jax.flow.tableaus import (
     STEP_LENGTH_SAFETY_FACTOR,
@@ -332,18 +332,5 @@ def sample_phase(
     The first sample is `start_state` and the last is the state after `duration`, s.
     """
     phase, tableau = _make_phase(vector_field, options)
-
-    def take_step(state: StageState, h: Scalar) -> tuple[StageState, Array]:
-        assert phase.take_solver_step is not None
-        stage_states, squared_error = phase.take_solver_step(state, h)
-        return stage_states[-1], squared_error
-
-    return sample_at_equal_times(
-        take_step,
-        lambda state: state.v[0],
-        phase.make_state((), (start_state,)),
-        tableau,
-        duration,
-        n_samples,
-        options,
-    )
+    samples = sample_batch_phase(phase, tableau, (), (start_state,), duration, n_samples, options)
+    return samples[:, 0]

@@ -68,8 +68,7 @@ def _multiply_event_determinants(
     first_guard_index_by_mode = jnp.cumsum(jnp.asarray([0, *(len(mode.guards) for mode in modes)]))[
         :-1
     ]
-    phase_start_states = jnp.concatenate([start[None], solution.states_after[:-1]])
-    durations = jnp.diff(solution.times, prepend=0.0)
+    phase_start_states, durations = solution.find_phases(start)
     next_modes = jnp.append(solution.modes[1:], solution.mode)
     event_indices = jnp.arange(len(solution.times))
     next_modes = jnp.where(event_indices == solution.n_events - 1, solution.mode, next_modes)

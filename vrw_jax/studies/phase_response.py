@@ -237,18 +237,17 @@ def _sample_hybrid_stride(
     jacobian, period_gradient = evaluate_with_jacobian(advance, x)[1]
     start, n_events = system.embed(x, params), int(step.n_events)
     simulation = system.simulate(params, start, events=n_events, options=options)
-    starts = jnp.concatenate([start[None], simulation.states_after[:-1]])
+    starts, durations = simulation.find_phases(start)
     times = np.concatenate([[0.0], np.asarray(simulation.times)])
     phases: list[_Phase] = []
     mode_names = tuple(system.modes)
     for event in range(n_events):
         mode = int(simulation.modes[event])
-        duration = times[event + 1] - times[event]
-        if not duration > 0.0:
+        if not durations[event] > 0.0:
             continue
         vector_field: Any = system.modes[mode_names[mode]].field
         field = functools.partial(lambda field, y: field(y, params), vector_field)
-        states = sample_phase(field, starts[event], jnp.asarray(duration), n_samples, options)
+        states = sample_phase(field, starts[event], durations[event], n_samples, options)
 
         def finish(mode: str, n_left: int, y: Array) -> Array:
             rest = system.simulate(params, y, events=n_left, mode=mode, options=options)
