@@ -100,6 +100,7 @@ def integrate_phase(
     start_state: StateArray,
     is_active: Bool[Array, ""],
     options: StepOptions,
+    state_units: StateArray | None = None,
 ) -> PhaseEnd:
     """Return the end of the phase that begins at `start_state`, where a guard first falls to zero.
 
@@ -110,7 +111,8 @@ def integrate_phase(
 
     The integration also detects a guard that is negative only inside a solver step. If two guards
     are zero at the same time, the first in the list ends the phase. If `is_active` is False,
-    nothing is integrated. Errors are those of the solver for the tolerances of `options`.
+    nothing is integrated. Errors are those of the solver for the tolerances of `options`. The
+    absolute tolerance is multiplied by `state_units`, whose default is 1.
     """
     options = lax.stop_gradient(options)
     evaluate, n_guards = guards_and_margins.evaluate_guards_and_margins, guards_and_margins.n_guards
@@ -118,7 +120,7 @@ def integrate_phase(
     is_guard_met, is_guard_falling = guards_and_margins.find_guards_met_at_start(
         *lax.stop_gradient((start_values[:n_guards], start_rates[:n_guards]))
     )
-    phase, tableau = _make_phase(vector_field, options)
+    phase, tableau = _make_phase(vector_field, options, state_units)
     phase = phase._replace(
         evaluate_guards=lambda state: tuple(evaluate(state.v[0])[:n_guards]),
         evaluate_margins=lambda state: tuple(evaluate(state.v[0])[n_guards:]),
@@ -225,11 +227,14 @@ which is more than a hundred times the round-off.
 """
 
 
-def _make_phase(field: VectorField, options: StepOptions) -> tuple[BatchPhase, ButcherTableau]:
+def _make_phase(
+    field: VectorField, options: StepOptions, state_units: StateArray | None
+) -> tuple[BatchPhase, ButcherTableau]:
     """Return the phase of a vector field without guards, and the tableau of its solver.
 
     diffrax takes the steps of implicit solvers, and of all solvers with `engine="diffrax"`.
     """
+    atol: Any = options.atol * (1.0 if state_units is None else lax.stop_gradient(state_units))
     evaluate_field = lanes.mark_noinline(field)
     evaluate_rates = lambda _, v: StageAccelerations((), (), (evaluate_field(v[0]),))
     tableau: Any = load_explicit_tableau(options.solver)
@@ -240,7 +245,7 @@ def _make_phase(field: VectorField, options: StepOptions) -> tuple[BatchPhase, B
             return stage_states, estimate_step_error(tableau, stage_states, h)[0]
 
     else:
-        take_step, tableau = _make_diffrax_step(field, options)
+        take_step, tableau = _make_diffrax_step(field, options, atol)
     # An error below the limit of growth is round-off.
     min_squared_error = (STEP_LENGTH_SAFETY_FACTOR / MAX_STEP_GROWTH) ** (
         2 * tableau.convergence_order
@@ -249,7 +254,7 @@ def _make_phase(field: VectorField, options: StepOptions) -> tuple[BatchPhase, B
     def take_solver_step(state: StageState, h: Scalar) -> tuple[list[StageState], Array]:
         stage_states, error = take_step(state, h)
         start, end = jnp.abs(state.v[0]), jnp.abs(stage_states[-1].v[0])
-        tolerance = options.atol + options.rtol * jnp.maximum(start, end)
+        tolerance = atol + options.rtol * jnp.maximum(start, end)
         squared_error = jnp.maximum(jnp.mean(jnp.square(error / tolerance)), min_squared_error)
         return stage_states, lax.stop_gradient(
             jnp.where(jnp.isfinite(squared_error), squared_error, jnp.inf)
@@ -266,7 +271,9 @@ def _make_phase(field: VectorField, options: StepOptions) -> tuple[BatchPhase, B
     )
 
 
-def _make_diffrax_step(field: VectorField, options: StepOptions) -> tuple[Callable, ButcherTableau]:
+def _make_diffrax_step(
+    field: VectorField, options: StepOptions, atol: Any
+) -> tuple[Callable, ButcherTableau]:
     """Return a function that takes one step by diffrax, and a tableau for its inner states.
 
     Inner states at which guards are evaluated are those of the solver's interpolant.
@@ -276,7 +283,7 @@ def _make_diffrax_step(field: VectorField, options: StepOptions) -> tuple[Callab
     solver_class = getattr(diffrax, options.solver)
     field_names = solver_class.__dataclass_fields__
     settings: dict[str, Any] = {}
-    tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": options.atol}
+    tolerances: dict[str, Any] = {"rtol": options.rtol, "atol": atol}
     if "scan_kind" in field_names:
         settings["scan_kind"] = "lax"  # for forward-mode derivatives
     if "root_finder" in field_names:
@@ -326,11 +333,13 @@ def sample_phase(
     duration: Scalar,
     n_samples: int,
     options: StepOptions,
+    state_units: StateArray | None = None,
 ) -> Float[Array, "n_samples dim"]:
     """Return the states at `n_samples` equally spaced times of a phase, as accurate as the solver.
 
-    The first sample is `start_state` and the last is the state after `duration`, s.
+    The first sample is `start_state` and the last is the state after `duration`, s. The absolute
+    tolerance is multiplied by `state_units`.
     """
-    phase, tableau = _make_phase(vector_field, options)
+    phase, tableau = _make_phase(vector_field, options, state_units)
     samples = sample_batch_phase(phase, tableau, (), (start_state,), duration, n_samples, options)
     return samples[:, 0]

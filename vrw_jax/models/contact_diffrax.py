@@ -17,11 +17,7 @@ from jaxtyping import Array, Float
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.phase_integration import GuardsAndMargins
-from vrw_jax.flow.scaled_integration import (
-    integrate_phase_in_scaled_units,
-    sample_phase_in_scaled_units,
-)
+from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase, sample_phase
 from vrw_jax.models.contact_integrator import (
     N_ACCUMULATOR_ROWS,
     ContactIntervalPoint,
@@ -117,7 +113,7 @@ def integrate_by_diffrax(
     guard_offset = guard_offset.at[guard_layout.rolling_rate_guard].set(
         jnp.where((end_rates < 0.0) & (end_acceleration > 0.0), end_rates, 0.0)
     )
-    end_result = integrate_phase_in_scaled_units(
+    end_result = integrate_phase(
         partial(evaluate_vector_field, contact_mode_dynamics),
         GuardsAndMargins(
             lambda packed_state: (
@@ -130,9 +126,8 @@ def integrate_by_diffrax(
             unpack_motion(contact_interval_state.contact_interval_point), start_accumulators
         ),
         is_running,
-        options,
+        compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options),
         compute_packed_units(contact_mode_dynamics.s),
-        compute_wheel_units(contact_mode_dynamics.s).time_unit,
     )
     end_motion, end_accumulators = unpack_state(end_result.state)
     q, v = pack_coordinates(end_motion)
@@ -182,16 +177,12 @@ def sample_by_diffrax(
             force_solution.normal_forces
         )
 
-    wheel_units = (
-        compute_packed_units(contact_mode_dynamics.s),
-        compute_wheel_units(contact_mode_dynamics.s).time_unit,
-    )
-    packed_states = sample_phase_in_scaled_units(
+    packed_states = sample_phase(
         partial(evaluate_vector_field, contact_mode_dynamics),
         start_state,
         duration,
         n_samples,
-        options,
-        *wheel_units,
+        compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options),
+        compute_packed_units(contact_mode_dynamics.s),
     )
     return packed_states, *jax.vmap(compute_foot_forces)(packed_states)

@@ -27,10 +27,12 @@ from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
-from vrw_jax.flow.phase_integration import GuardsAndMargins, StateArray, VectorField
-from vrw_jax.flow.scaled_integration import (
-    integrate_phase_in_scaled_units,
-    sample_phase_in_scaled_units,
+from vrw_jax.flow.phase_integration import (
+    GuardsAndMargins,
+    StateArray,
+    VectorField,
+    integrate_phase,
+    sample_phase,
 )
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
@@ -229,14 +231,13 @@ class ViscoelasticWheel(AbstractWheel):
             strict=True,
         ):
             phase_samples.append(
-                sample_phase_in_scaled_units(
+                sample_phase(
                     make_diffrax_phase(phase, records_margins=False).vector_field,
                     jnp.stack([*phase_start[0], *phase_start[1]]),
                     phase_end.duration,
                     n_samples,
-                    options,
+                    compute_wheel_units(phase.s).scale_times_to_seconds(options),
                     jnp.stack(phase.coordinate_units),
-                    compute_wheel_units(phase.s).time_unit,
                 )
             )
         return make_trajectory(phase_sequence, phase_samples)
@@ -736,14 +737,13 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
         phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: PhaseResult | None
     ) -> PhaseResult:
         diffrax_phase = make_diffrax_phase(phase, records_margins)
-        phase_end = integrate_phase_in_scaled_units(
+        phase_end = integrate_phase(
             diffrax_phase.vector_field,
             diffrax_phase.guards,
             jnp.stack([*q, *v]),
             is_phase_active,
-            options,
+            compute_wheel_units(phase.s).scale_times_to_seconds(options),
             jnp.stack(phase.coordinate_units),
-            compute_wheel_units(phase.s).time_unit,
         )
         end_state = tuple(phase_end.state)
         return PhaseResult(
