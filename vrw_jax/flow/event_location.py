@@ -1,6 +1,7 @@
 """Locate the earliest root of the guards inside a solver step, for each batch element."""
 
 import functools
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -376,6 +377,14 @@ def compute_event_time_tangent(
             event_time_tangent,
         )
     return event_time_tangent
+
+
+def find_first_guard(is_guard_met: Sequence[Array] | Array, index_if_none: int) -> Array:
+    """Return the index of the first guard whose flag is True, or `index_if_none`."""
+    first_guard = jnp.full(is_guard_met[0].shape, index_if_none, jnp.int32)
+    for guard_index in reversed(range(len(is_guard_met))):
+        first_guard = jnp.where(is_guard_met[guard_index], guard_index, first_guard)
+    return first_guard
 
 
 @jax.jit  # The function is traced once for all guards.

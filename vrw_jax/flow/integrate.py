@@ -23,6 +23,7 @@ from vrw_jax.flow.event_location import (
     IntegrationStatus,
     IntegratorState,
     compute_event_time_tangent,
+    find_first_guard,
     locate_event,
 )
 from vrw_jax.flow.minima import (
@@ -237,10 +238,8 @@ def integrate_to_event(
         (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
         for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
     )
-    # The index is that of the first guard whose event is the start itself; -1 if there is none.
-    start_event_guard_index = jnp.full(is_guard_met_at_start[0].shape, -1, jnp.int32)
-    for guard_index, is_guard_met in reversed(list(enumerate(is_guard_met_at_start))):
-        start_event_guard_index = jnp.where(is_guard_met, guard_index, start_event_guard_index)
+    # The index is that of the first guard whose event is the start itself.
+    start_event_guard_index = find_first_guard(is_guard_met_at_start, -1)
     is_phase_started = is_active & (start_event_guard_index < 0)
 
     integrator_state = _integrate_until_crossing(
@@ -399,16 +398,17 @@ def _integrate_until_crossing(
         state, guard_values = select_trees_by_condition(
             is_accepted,
             (stage_states[-1], end_guard_values),
-            integrator_state[:2],
+            (integrator_state.state, integrator_state.guard_values),
         )
         middle_guard_values, end_guard_values = select_trees_by_condition(
             integrator_state.is_running,
             (inner_guard_values[tableau.middle_guard_index], end_guard_values),
             (integrator_state.middle_guard_values, integrator_state.end_guard_values),
         )
-        *_, n_iterations_until_half_ended, n_iterations, margin_minima_state, state_tangents = (
-            integrator_state
-        )
+        n_iterations = integrator_state.n_iterations + 1
+        n_iterations_until_half_ended = integrator_state.n_iterations_until_half_ended
+        margin_minima_state = integrator_state.margin_minima_state
+        state_tangents = integrator_state.state_tangents
         if margin_minima_state is not None:
             margin_minima_state = update_margin_minima_state(
                 phase,
@@ -427,7 +427,7 @@ def _integrate_until_crossing(
             n_running_elements = jnp.sum(next_state.is_running, dtype=jnp.int32)
             n_iterations_until_half_ended = jnp.where(
                 2 * n_running_elements > is_accepted.size,
-                n_iterations + 1,
+                n_iterations,
                 n_iterations_until_half_ended,
             )
         return next_state._replace(
@@ -437,7 +437,7 @@ def _integrate_until_crossing(
             end_guard_values=end_guard_values,
             n_tried_steps=integrator_state.n_tried_steps + integrator_state.is_running,
             n_iterations_until_half_ended=n_iterations_until_half_ended,
-            n_iterations=n_iterations + 1,
+            n_iterations=n_iterations,
             margin_minima_state=margin_minima_state,
             state_tangents=state_tangents,
         )
@@ -626,7 +626,8 @@ def sample_at_equal_times(
     initial_count = jnp.zeros((), jnp.int32)
 
     def take_solver_step_to_sample(loop_carry: tuple) -> tuple:
-        sample_state, h, remaining_time_to_sample, n_tried_steps = loop_carry
+        sample_state, previous_h, remaining_time_to_sample, n_tried_steps = loop_carry
+        h = previous_h
         sampled_step_length = jnp.where(h < remaining_time_to_sample, h, remaining_time_to_sample)
         step_end, mean_squared_error = solver_step_function(sample_state, sampled_step_length)
         step_length_factor = compute_step_size_factor(
@@ -642,7 +643,7 @@ def sample_at_equal_times(
         is_running = remaining_time_to_sample > 0.0
         return (
             select_trees_by_condition(is_running & is_within_tolerance, step_end, sample_state),
-            lax.stop_gradient(jnp.where(is_running, h, loop_carry[1])),
+            lax.stop_gradient(jnp.where(is_running, h, previous_h)),
             jnp.where(
                 is_running & is_within_tolerance,
                 jnp.where(

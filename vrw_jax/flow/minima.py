@@ -213,7 +213,9 @@ def update_margin_minima_state(
         step_start_tangents=step_start_tangents,
     )
     margin_values, margin_rates = select_trees_by_condition(
-        is_accepted, (margin_values, margin_rates), margin_minima_state[:2]
+        is_accepted,
+        (margin_values, margin_rates),
+        (margin_minima_state.margin_values, margin_minima_state.margin_rates),
     )
     lowest_minimum = jax.tree.map(replace_if_lower, margin_minima_state, minimum_of_step)
     return lowest_minimum._replace(margin_values=margin_values, margin_rates=margin_rates)
@@ -277,24 +279,29 @@ def refine_margin_minima(
         def improve_margin_minimum_search(
             margin_minimum_search: _MarginMinimumSearch,
         ) -> _MarginMinimumSearch:
-            step_length, *best_step, _, is_minimum_unresolved, n_iterations = margin_minimum_search
+            step_length = margin_minimum_search.step_length
+            n_iterations = margin_minimum_search.n_iterations
             step_end = solver_step_function(minimum_step_start_state, step_length)[0][-1]
             (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
                 evaluate_selected_margin, step_end
             )
             step_length, best_step_length, best_margin_rate, has_secant_converged = (
                 _refine_minimum_location(
-                    step_length, margin_rate, margin_minimum_state.step_length, *best_step
+                    step_length,
+                    margin_rate,
+                    margin_minimum_state.step_length,
+                    margin_minimum_search.best_step_length,
+                    margin_minimum_search.best_margin_rate,
                 )
             )
             return select_trees_by_condition(
-                is_minimum_unresolved,
+                margin_minimum_search.is_minimum_unresolved,
                 _MarginMinimumSearch(
                     step_length,
                     best_step_length,
                     best_margin_rate,
                     margin_value,
-                    is_minimum_unresolved
+                    margin_minimum_search.is_minimum_unresolved
                     & (~has_secant_converged | (n_iterations + 1 < min_iterations)),
                     n_iterations,
                 ),

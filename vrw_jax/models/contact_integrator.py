@@ -27,7 +27,7 @@ from jaxtyping import Array
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS
+from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS, find_first_guard
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
     compute_step_size_factor,
@@ -288,7 +288,7 @@ def init_contact_interval(
         lane_status=jnp.where(
             jnp.any(is_guard_triggered, axis=0), LaneStatus.EVENT, LaneStatus.RUNNING
         ).astype(jnp.int32),
-        triggered_guard_index=_find_first_guard(is_guard_triggered),
+        triggered_guard_index=find_first_guard(is_guard_triggered, 0),
         n_solver_steps=int_zero_lanes,
     )
 
@@ -753,14 +753,6 @@ def _flag_initiating_guards(lane_states: ContactIntervalState) -> Array:
     return (lane_states.time_since_event == 0.0) & (lane_states.guard_offset != 0.0)
 
 
-def _find_first_guard(guard_flags: Array) -> Array:
-    """Return the index of the first guard whose flag is True, or 0 if there is none."""
-    first_guard = jnp.zeros(guard_flags.shape[1:], jnp.int32)
-    for guard_index in reversed(range(len(guard_flags))):
-        first_guard = jnp.where(guard_flags[guard_index], guard_index, first_guard)
-    return first_guard
-
-
 def _find_lowest_guard(
     guard_values: Array, is_candidate: Array, index_without_candidate: Array | None = None
 ) -> tuple[Array, Array]:
@@ -822,4 +814,4 @@ def _find_earliest_root(
     )
     root_fraction = jnp.where(is_already_negative, -jnp.inf, root_fraction)
     has_guard_root = has_guard_root | is_already_negative
-    return _find_lowest_guard(root_fraction, has_guard_root, _find_first_guard(is_guard_crossing))
+    return _find_lowest_guard(root_fraction, has_guard_root, find_first_guard(is_guard_crossing, 0))
