@@ -16,7 +16,7 @@ from vrw_jax.app.config import (
     TuneConfig,
 )
 from vrw_jax.base import StepOptions, format_markdown_table
-from vrw_jax.models import find_model_class, list_model_config_names
+from vrw_jax.models import MODEL_CLASSES, list_model_config_names
 from vrw_jax.models.measures import (
     CONTACT_MEASURES,
     FORCE_PEAK_MEASURES,
@@ -66,7 +66,7 @@ def toml_page() -> str:
     for model_name in model_names:
         rows += [
             (f"`{n}`", f'`"{model_name}"`', v, text)
-            for n, v, text in _settings(find_model_class(model_name))
+            for n, v, text in _settings(MODEL_CLASSES[model_name])
         ]
     lines += format_markdown_table(("key", "model", "default", "meaning"), rows)
     for name, kind, what in _TABLES:

@@ -6,25 +6,14 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.app.config import parse_config
-from vrw_jax.models import (
-    REGISTERED_MODEL_CLASSES,
-    GaitMethod,
-    ModelCapabilities,
-    describe_accepted_models,
-)
-from vrw_jax.wheel import PARAMETER_NAMES
+from vrw_jax.models import MODEL_CLASSES, describe_accepted_models
 
 
 class PointFeetWheel(vrw.AbstractWheel):
     """A user's model, whose motion is that of the rigid wheel."""
 
     model_name: ClassVar[str] = "point_feet"
-    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
-        config_name="point_feet",
-        gait_method=GaitMethod.RETURN_MAP,
-        accepted_cli_commands=frozenset({"branch"}),
-    )
-    parameter_names: ClassVar[tuple[str, ...]] = PARAMETER_NAMES
+    commands = frozenset({"branch"})
     reports_contacts: ClassVar[bool] = False
     is_compliant: ClassVar[bool] = False
 
@@ -60,20 +49,11 @@ def test_a_new_model_in_the_registry_is_known_to_configurations_and_messages(mon
     text = '[model]\nname = "point_feet"\n[branch]\nparameter = "slope"\nbounds = [0.1, 0.2]\n'
     with pytest.raises(ValueError, match="viscoelastic"):
         parse_config(text)
-    monkeypatch.setattr(
-        "vrw_jax.models.registry.REGISTERED_MODEL_CLASSES",
-        [*REGISTERED_MODEL_CLASSES, PointFeetWheel],
-    )
+    monkeypatch.setitem(MODEL_CLASSES, "point_feet", PointFeetWheel)
     assert isinstance(parse_config(text).make_model(), PointFeetWheel)
     assert describe_accepted_models("branch").endswith(" or vrw.PointFeetWheel()")
 
 
-@pytest.mark.parametrize("model_class", REGISTERED_MODEL_CLASSES, ids=lambda entry: entry.__name__)
+@pytest.mark.parametrize("model_class", MODEL_CLASSES.values(), ids=lambda entry: entry.__name__)
 def test_each_model_declares_known_commands(model_class):
-    assert model_class.capabilities.accepted_cli_commands <= {
-        "scan",
-        "map",
-        "tune",
-        "branch",
-        "explore",
-    }
+    assert model_class.commands <= {"scan", "map", "tune", "branch", "explore"}

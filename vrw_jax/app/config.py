@@ -35,7 +35,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.registry import find_model_class, list_model_config_names
+from vrw_jax.models.registry import MODEL_CLASSES, list_model_config_names
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies.measure_catalog import check_measure_names, select_measure_catalog
 from vrw_jax.studies.scan_design import MAX_LISTED_SAMPLES
@@ -324,7 +324,7 @@ class Config:
 
     def make_model(self) -> AbstractWheel:
         """Return the model with the settings from the config."""
-        return find_model_class(self.model_name)(**self.model_settings)
+        return MODEL_CLASSES[self.model_name](**self.model_settings)
 
     def make_options(self) -> StepOptions:
         """Return the numerical options of the walking steps."""
@@ -394,7 +394,7 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
     wheel_values = _parse_wheel_table(tables["wheel"])
     model_table = {"name": Config.model_name, **tables["model"]}
     require_known_name(model_name := model_table.pop("name"), list_model_config_names(), "model")
-    model_class = find_model_class(model_name)
+    model_class = MODEL_CLASSES[model_name]
     defaults = {field.name: field.default for field in dataclasses.fields(model_class)}
     _require_known_keys(
         model_table, ("name", *defaults), f'[model] with name = "{model_name}"', "settings"

@@ -28,7 +28,6 @@ from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_me
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.stepping import start_walk_toward_gait
 from vrw_jax.wheel.params import WheelParams
@@ -198,16 +197,19 @@ def find_return_map_starts(branch_request: BranchRequest, known_start_cycle: Any
     )
 
 
-def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) -> BranchStart:
-    """Return the starts of branches whose gaits have unilateral contact.
+def find_branch_starts(branch_request: BranchRequest, start_cycle: Any) -> BranchStart:
+    """Return the starts of branches of any model.
 
-    If no start gaits are given, each branch starts from the slowest attracting gait.
+    If no start gaits are given, each branch with unilateral contact starts from the slowest
+    attracting gait.
     """
     params, step_options = branch_request.params, branch_request.step_options
     model: Any = branch_request.model
     gait_finder: Any = make_finder(
         model, params.n_legs, step_options=step_options, period_n=branch_request.period_n
     )
+    if gait_finder.supports_cold_start:
+        return find_collocation_starts(branch_request, start_cycle)
     if not gait_finder.is_multistable:  # The model has no batched engine.
         return find_return_map_starts(branch_request, start_cycle)
     wheels = branch_request.make_wheels()
@@ -223,12 +225,3 @@ def find_contact_gait_starts(branch_request: BranchRequest, start_cycle: Any) ->
     return BranchStart(
         problem, wheels, np.asarray(start_cycle.section_state), np.asarray(start_cycle.outcome)
     )
-
-
-START_FUNCTION_BY_METHOD: dict[GaitMethod, Callable[[BranchRequest, Any], BranchStart]] = {
-    GaitMethod.COLLOCATION: find_collocation_starts,
-    GaitMethod.CONTACT_WALKS: find_contact_gait_starts,
-    GaitMethod.RETURN_MAP: find_return_map_starts,
-    GaitMethod.SELECTION: find_return_map_starts,
-}
-"""Function that returns the starts of branches, by the gait method of a model."""

@@ -40,7 +40,7 @@ from vrw_jax.branches.branch_location import (
     QuantitiesByName,
     continue_and_locate_special_points,
 )
-from vrw_jax.branches.branch_starts import START_FUNCTION_BY_METHOD, BranchRequest
+from vrw_jax.branches.branch_starts import BranchRequest, find_branch_starts
 from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS, BranchWheel
 from vrw_jax.branches.hybrid_branch import continue_hybrid_branch
 from vrw_jax.branches.map_branch import check_arclength_options, make_stability_variables
@@ -415,9 +415,7 @@ def _continue_gait_branches(
     """
     can_refine_mesh = branch_request.cycle_options is None
     for refinement_index in range(1 + MAX_BRANCH_MESH_REFINEMENTS):
-        branch_start = START_FUNCTION_BY_METHOD[branch_request.model.capabilities.gait_method](
-            branch_request, start_cycle
-        )
+        branch_start = find_branch_starts(branch_request, start_cycle)
         branch_continuation = GaitContinuation(
             branch_start.continuation_problem,
             arclength_options,

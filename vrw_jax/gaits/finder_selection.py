@@ -22,7 +22,6 @@ from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
 from vrw_jax.gaits.walker_finder import make_walker_finder
-from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -33,14 +32,6 @@ from vrw_jax.models.stepping import (
 
 UserCycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
 """Guess that a user provides: a similar wheel's cycle, or a section state near the gait."""
-
-FINDER_CLASS_BY_METHOD: dict[GaitMethod, type[AbstractGaitFinder]] = {
-    GaitMethod.COLLOCATION: CollocationFinder,
-    GaitMethod.CONTACT_WALKS: UnilateralFinder,
-    GaitMethod.RETURN_MAP: ReturnMapFinder,
-    GaitMethod.SELECTION: ReturnMapFinder,
-}
-"""Class of the gait finder, by the gait method of a model."""
 
 
 def make_finder(
@@ -61,9 +52,11 @@ def make_finder(
             "number of steps: give period_n=2 to vrw.limit_cycle, vrw.limit_cycles or "
             "vrw.continue_branch."
         )
-    finder_class: Any = FINDER_CLASS_BY_METHOD[resolved_model.capabilities.gait_method]
+    kernel = resolved_model.batch_kernel
+    finder_class: Any = UnilateralFinder if kernel == "legs" else ReturnMapFinder
     search_options = {}
-    if finder_class.options_type is CycleOptions:
+    if kernel == "phases":
+        finder_class = CollocationFinder
         default_options = CycleOptions()
         if resolved_model.own_parameters is not None:
             # With a user's law, the fast mode of the airborne leg may decay at a varying rate. The

@@ -16,7 +16,6 @@ from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_batch import step_batch
@@ -58,7 +57,7 @@ def describe_last_gait(
     def search_on_way(fractions: Any) -> Iterator[Any]:
         """Yield the cycle at each fraction of the way."""
         wheels = list(map(make_wheel, fractions))
-        if model.capabilities.gait_method == GaitMethod.CONTACT_WALKS:
+        if model.batch_kernel == "legs":
             # All wheels walk together.
             cycles = find_gaits(jax.tree.map(lambda *x: np.stack(x), *wheels), model=model)
             yield from (select_tree_rows(cycles, index) for index in range(len(wheels)))

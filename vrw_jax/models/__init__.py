@@ -1,7 +1,6 @@
 """Models of the wheel: what one step is."""
 
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_mechanics import compute_foot_heights, compute_leg_directions
 from vrw_jax.models.contact_state import unpack_state
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian
@@ -20,9 +19,8 @@ from vrw_jax.models.measures import (
     describe_violation,
 )
 from vrw_jax.models.registry import (
-    REGISTERED_MODEL_CLASSES,
+    MODEL_CLASSES,
     describe_accepted_models,
-    find_model_class,
     list_model_config_names,
 )
 from vrw_jax.models.rigid import RigidWheel

@@ -15,7 +15,6 @@ from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult
-from vrw_jax.models.capabilities import ModelCapabilities
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_results import SectionState
 from vrw_jax.wheel.ground import compute_foot_distance
@@ -49,18 +48,28 @@ class AbstractWheel(AbstractWalker, eqx.Module):
     is_wheel = True  # type: ignore[misc]  # without annotation no field
     model_name: eqx.AbstractClassVar[str]
     """Name of the model that results report."""
-    capabilities: eqx.AbstractClassVar[ModelCapabilities]
-    """Features of the library that the model supports."""
     reports_contacts: eqx.AbstractClassVar[bool]
     """Whether trajectories report the contact mode of every leg instead of the paper's phases."""
     batch_kernel: ClassVar[str] = ""
     """Kind of the compiled batch kernel: "phases" for the paper's phases, "legs", or "" for no
-    kernel.
+    kernel. Gaits of the paper's phases are found by collocation, and gaits of "legs" by walks of
+    many wheels. Any other gait is found by Newton's method for the return map.
     """
     is_compliant: ClassVar[bool] = True
     """Whether springs and dampers affect the motion. Only then do tuning and scans vary their
     parameters.
     """
+    # Without annotation, the following attributes are no fields, and stores do not contain them.
+    commands = frozenset[str]()
+    """Commands that accept the model: "scan", "map", "tune", "branch" and "explore"."""
+    fixed_fields_of_tolerance = None
+    """Fields that must have their default values for a measure requested to a tolerance. None means
+    that the model does not support measures to a tolerance.
+    """
+    can_walk_on_uneven_ground = True
+    """Whether the slope may change from step to step of a walk."""
+    can_start_within_gait_step = False
+    """Whether the model has `finish_step`, so that a step can be disturbed at any instant."""
 
     def __new__(cls, *_: Any, **settings: Any) -> "AbstractWheel":
         """Raise a `TypeError` if a model with the paper's laws is given another law."""
@@ -263,9 +272,16 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         - `foot_distance`: distance between the two feet in the double support of this step, m;
         - `phase_state`: (theta, L1, L2) and their rates, rad, m, rad/s, m/s.
 
-        Only models whose capabilities have `can_start_within_gait_step` implement this method.
+        Only models with `can_start_within_gait_step` implement this method.
         """
-        raise NotImplementedError(f"{type(self).__name__} cannot begin within a step.")
+        raise NotImplementedError
+
+    def make_vertical_rate_map(self, params: WheelParams) -> Any:
+        """Return the map of a step in closed form, by which `first_passage` computes means.
+
+        The result is None if there is no such map, so that walks are sampled.
+        """
+        return None
 
     def explain_impossible_gait(self, params: WheelParams) -> str:
         """Return a sentence that states why one wheel can't have a gait, or "" if it may have one.
@@ -292,7 +308,7 @@ class AbstractWheel(AbstractWalker, eqx.Module):
 
         Return None otherwise, and for models that do not support uneven ground.
         """
-        if not self.capabilities.supports_uneven_ground:
+        if not self.can_walk_on_uneven_ground:
             return None
         if heights is not None:
             rises = compute_rises(heights, n_steps)

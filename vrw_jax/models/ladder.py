@@ -22,7 +22,6 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_each_batch_element
 from vrw_jax.base.types import RealInput, Scalar
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET, FullState, embed_section_state
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES, make_flag_attributes
@@ -235,12 +234,8 @@ class LadderWheel(AbstractContactWheel):
     """
 
     model_name: ClassVar[str] = "ladder"
-    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
-        config_name="auto",
-        gait_method=GaitMethod.SELECTION,
-        accepted_cli_commands=frozenset({"scan"}),
-        supports_uneven_ground=False,
-    )
+    commands = frozenset({"scan"})
+    can_walk_on_uneven_ground = False
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
 

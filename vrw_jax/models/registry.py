@@ -1,4 +1,4 @@
-"""Registry of models. To add a model, only the list in this module has to be extended."""
+"""Registry of models. To add a model, only the table in this module has to be extended."""
 
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import LadderWheel
@@ -6,26 +6,15 @@ from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 
-REGISTERED_MODEL_CLASSES: list[type[AbstractWheel]] = [
-    ViscoelasticWheel,
-    RigidWheel,
-    UnilateralWheel,
-    LadderWheel,
-]
-"""Classes of all models, in the order in which error messages list them. The first class is the
-default model.
+MODEL_CLASSES: dict[str, type[AbstractWheel]] = {
+    "viscoelastic": ViscoelasticWheel,
+    "rigid": RigidWheel,
+    "unilateral": UnilateralWheel,
+    "auto": LadderWheel,
+}
+"""Classes of all models by their names in a configuration, in the order in which error messages
+list them. The first class is the default model.
 """
-
-
-def find_model_class(config_name: str) -> type[AbstractWheel]:
-    """Return the class of the model whose name in a configuration is `config_name`.
-
-    Raise a `KeyError` if no model has this name.
-    """
-    return {
-        model_class.capabilities.config_name: model_class
-        for model_class in REGISTERED_MODEL_CLASSES
-    }[config_name]
 
 
 def list_model_config_names(
@@ -37,9 +26,9 @@ def list_model_config_names(
     - `parameter_name`: parameter on which the model's motion must depend.
     """
     return tuple(
-        model_class.capabilities.config_name
-        for model_class in REGISTERED_MODEL_CLASSES
-        if (command_name is None or command_name in model_class.capabilities.accepted_cli_commands)
+        config_name
+        for config_name, model_class in MODEL_CLASSES.items()
+        if (command_name is None or command_name in model_class.commands)
         and (parameter_name is None or parameter_name in model_class().parameter_names)
     )
 
@@ -51,13 +40,8 @@ def describe_accepted_models(
 
     An example is `vrw.RigidWheel() or "auto"`.
     """
-    model_expressions = [
-        f'"{config_name}"'
-        if config_name == "auto"
-        else f"vrw.{find_model_class(config_name).__name__}()"
-        for config_name in list_model_config_names(command_name, parameter_name)
-    ]
-    *first_expressions, last_expression = model_expressions
-    if not first_expressions:
-        return last_expression
-    return f"{', '.join(first_expressions)} or {last_expression}"
+    *first_expressions, last_expression = (
+        f'"{name}"' if name == "auto" else f"vrw.{MODEL_CLASSES[name].__name__}()"
+        for name in list_model_config_names(command_name, parameter_name)
+    )
+    return " or ".join(filter(None, (", ".join(first_expressions), last_expression)))

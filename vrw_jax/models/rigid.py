@@ -16,7 +16,6 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.lanes.autodiff import compute_square_root
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities, PassageMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_sequence import replace_invalid_inputs, select_stance_line
 from vrw_jax.models.step_results import (
@@ -64,13 +63,8 @@ class RigidWheel(AbstractWheel):
     """
 
     model_name: ClassVar[str] = "rigid"
-    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
-        config_name="rigid",
-        gait_method=GaitMethod.RETURN_MAP,
-        accepted_cli_commands=frozenset({"branch", "explore"}),
-        passage_method=PassageMethod.QUADRATURE,
-        can_start_within_gait_step=True,
-    )
+    commands = frozenset({"branch", "explore"})
+    can_start_within_gait_step = True
     reports_contacts: ClassVar[bool] = False
     is_compliant: ClassVar[bool] = False
 

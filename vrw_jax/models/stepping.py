@@ -617,7 +617,7 @@ def convert_heights(
             "heights are given and slope is an array over steps, but heights are measured from a "
             "line of one slope: give one slope, or no heights."
         )
-    if not model.capabilities.supports_uneven_ground:
+    if not model.can_walk_on_uneven_ground:
         raise ValueError(
             f"heights are given, but a {type(model).__name__} walks on even ground only: take "
             "vrw.UnilateralWheel()."

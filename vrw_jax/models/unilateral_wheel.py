@@ -18,7 +18,6 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.contact_section import (
     FullState,
@@ -193,17 +192,8 @@ class UnilateralWheel(AbstractContactWheel):
     """
 
     model_name: ClassVar[str] = "unilateral"
-    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
-        config_name="unilateral",
-        gait_method=GaitMethod.CONTACT_WALKS,
-        accepted_cli_commands=frozenset({"scan", "tune", "branch", "explore"}),
-        fields_with_fixed_defaults=(
-            "restitution",
-            "infinite_friction_rule",
-            "uneven",
-            "max_events",
-        ),
-    )
+    commands = frozenset({"scan", "tune", "branch", "explore"})
+    fixed_fields_of_tolerance = ("restitution", "infinite_friction_rule", "uneven", "max_events")  # type: ignore[assignment]
     batch_kernel: ClassVar[str] = "legs"
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)

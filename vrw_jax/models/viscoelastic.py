@@ -41,7 +41,6 @@ from vrw_jax.flow.tableaus import (
     load_explicit_tableau,
 )
 from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
-from vrw_jax.models.capabilities import GaitMethod, ModelCapabilities
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
 from vrw_jax.models.phase_sequence import (
     PhaseResult,
@@ -105,12 +104,8 @@ class ViscoelasticWheel(AbstractWheel):
     """
 
     model_name: ClassVar[str] = "viscoelastic"
-    capabilities: ClassVar[ModelCapabilities] = ModelCapabilities(
-        config_name="viscoelastic",
-        gait_method=GaitMethod.COLLOCATION,
-        accepted_cli_commands=frozenset({"scan", "map", "tune", "branch", "explore"}),
-        can_start_within_gait_step=True,
-    )
+    commands = frozenset({"scan", "map", "tune", "branch", "explore"})
+    can_start_within_gait_step = True
     reports_contacts: ClassVar[bool] = False
     batch_kernel: ClassVar[str] = "phases"
 

@@ -80,7 +80,7 @@ def measure_basins(
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
     box_bounds = None if box is None else parse_start_box(box)
     point_indices = _select_branch_points(branch, checked_model, n_points)
-    can_start_within_gait_step = checked_model.capabilities.can_start_within_gait_step
+    can_start_within_gait_step = checked_model.can_start_within_gait_step
     variable_names = [
         *(["basin_share", "basin_share_error"] if box_bounds else []),
         *(

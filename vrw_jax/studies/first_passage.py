@@ -25,7 +25,6 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.lanes.autodiff import make_zero_tangent
-from vrw_jax.models.capabilities import PassageMethod
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -253,7 +252,7 @@ def first_passage(
     n_walkers, max_steps = check_int("n_walkers", n_walkers), check_int("max_steps", max_steps)
     tol = None if tol is None else check_positive("tol", tol)
     resolved_model: Any = convert_model_argument(resolve_model(params, model))
-    if resolved_model.capabilities.passage_method == PassageMethod.QUADRATURE:
+    if resolved_model.make_vertical_rate_map(params) is not None:
         return _solve_passage_by_quadrature(
             params, jnp.asarray(ground_sd), resolved_model, n_nodes, tol, sd_name
         )

@@ -89,6 +89,20 @@ class StableGait(NamedTuple):
             )
         return stable_gait
 
+    def require_start_within_step(self, changes: str) -> None:
+        """Raise a ValueError unless the gait has one step, within which its model can start."""
+        if not self.model.can_start_within_gait_step:
+            raise ValueError(
+                f"{type(self.model).__name__} cannot begin within a step, so that {changes} within "
+                "a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb "
+                "starts by vrw.basin_share."
+            )
+        if len(self.section_states) > 1:
+            raise ValueError(
+                f"cycle repeats after {len(self.section_states)} steps, but {changes} within a "
+                "step need a gait of one step: give a cycle with period_n=1."
+            )
+
     def is_on_gait(self, section_states: np.ndarray) -> np.ndarray:
         """Return whether each section state agrees with a section state of the gait, shape
         (states,).

@@ -12,7 +12,6 @@ from vrw_jax.base.checks import format_name_suggestion
 from vrw_jax.base.measures import Measure
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
-from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.models.measures import (
@@ -23,7 +22,7 @@ from vrw_jax.models.measures import (
     make_measure_attributes,
 )
 from vrw_jax.studies.step_quantities import MEASURE_FUNCTIONS
-from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES
+from vrw_jax.wheel.params import PARAMETER_NAMES
 
 ValuesByVariable = dict[str, np.ndarray]
 """Values of each variable for samples, by the name of the variable; the sample axes come first."""
@@ -86,7 +85,7 @@ UNILATERAL_MEASURE_CATALOG = MeasureCatalog(
     (*UnilateralFinder.differentiable_measures, "spectral_margin"),
     ("outcome", "spectral_radius"),
     UnilateralFinder.differentiable_measures,
-    (*PARAMETER_NAMES, FRICTION_NAME),
+    PARAMETER_NAMES,
     _CONTACT_DEFAULT_MEASURES,
     16,
 )
@@ -102,12 +101,6 @@ MODEL_SELECTION_MEASURE_CATALOG = MeasureCatalog(
     _CONTACT_DEFAULT_MEASURES,
     64,
 )
-MEASURE_CATALOGS = {
-    GaitMethod.COLLOCATION: PAPER_MEASURE_CATALOG,
-    GaitMethod.CONTACT_WALKS: UNILATERAL_MEASURE_CATALOG,
-    GaitMethod.SELECTION: MODEL_SELECTION_MEASURE_CATALOG,
-}
-"""Measure catalog for each gait method that scans support."""
 TOLERANCE_MEASURE_CATALOG = MeasureCatalog(
     tuple(MEASURE_FUNCTIONS), ("outcome", "rung"), (), (), ("dls_fraction", "speed", "period"), 16
 )
@@ -117,7 +110,7 @@ ERROR_VARIABLE_SUFFIX = "_error"
 
 
 def select_measure_catalog(
-    wheel_model: AbstractWheel | type[AbstractWheel],
+    wheel_model: AbstractWheel,
     error_tolerance: float | None,
     slope_standard_deviation: float | None,
 ) -> MeasureCatalog:
@@ -130,12 +123,10 @@ def select_measure_catalog(
     """
     if error_tolerance is not None:
         return TOLERANCE_MEASURE_CATALOG
-    measure_catalog = MEASURE_CATALOGS.get(
-        wheel_model.capabilities.gait_method, PAPER_MEASURE_CATALOG
-    )
-    if isinstance(wheel_model, AbstractWheel) and wheel_model.own_parameter_domains.keys() - {
-        FRICTION_NAME
-    }:
+    measure_catalog = MODEL_SELECTION_MEASURE_CATALOG
+    if wheel_model.fallback_model is wheel_model:
+        has_legs = wheel_model.batch_kernel == "legs"
+        measure_catalog = UNILATERAL_MEASURE_CATALOG if has_legs else PAPER_MEASURE_CATALOG
         measure_catalog = measure_catalog._replace(
             differentiation_parameters=wheel_model.parameter_names
         )

@@ -140,16 +140,7 @@ def phase_response(
         stride = _sample_hybrid_stride(model, params, cycle.section_state, n_samples, options)
     else:
         gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options)
-        if not gait.model.capabilities.can_start_within_gait_step:
-            raise ValueError(
-                f"{type(gait.model).__name__} cannot begin within a step, so that pushes within a "
-                "step are not available: take ViscoelasticWheel() or RigidWheel()."
-            )
-        if len(gait.section_states) > 1:
-            raise ValueError(
-                f"cycle repeats after {len(gait.section_states)} steps, but responses are those of "
-                "gaits of one step: give a cycle with period_n=1."
-            )
+        gait.require_start_within_step("pushes")
         stride = _sample_wheel_stride(gait, n_samples)
     jacobian, samples = stride.return_map_jacobian, concatenate_tree_rows(*stride.phases)
     if not np.max(np.abs(np.linalg.eigvals(jacobian))) < 1.0:

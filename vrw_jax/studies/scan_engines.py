@@ -30,7 +30,6 @@ from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder
 from vrw_jax.lanes.batching import map_in_batches, map_in_numpy_batches
 from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.models.capabilities import GaitMethod
 from vrw_jax.models.ladder import ModelCode, find_selection_reason
 from vrw_jax.models.measures import PASSAGE_MEASURES, SELECTION_MARGIN_NAMES
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
@@ -425,16 +424,11 @@ def make_scan_engine(
         return functools.partial(evaluate_to_tolerance, evaluation_request)
     if evaluation_request.slope_standard_deviation is not None:
         return PassageScanEngine(evaluation_request, n_threads)
-    if not evaluation_request.wheel_model.is_wheel:
+    model = evaluation_request.wheel_model
+    if not model.is_wheel:
         return WalkerScanEngine(evaluation_request, n_threads)
-    gait_method = evaluation_request.wheel_model.capabilities.gait_method
-    scan_engine_class: Any = SCAN_ENGINE_CLASSES[gait_method]
-    return scan_engine_class(evaluation_request, n_threads)
-
-
-SCAN_ENGINE_CLASSES = {
-    GaitMethod.COLLOCATION: CollocationScanEngine,
-    GaitMethod.CONTACT_WALKS: UnilateralScanEngine,
-    GaitMethod.SELECTION: ModelSelectionScanEngine,
-}
-"""Engine class for each gait method that scans support."""
+    if model.fallback_model is not model:
+        return ModelSelectionScanEngine(evaluation_request, n_threads)
+    if model.batch_kernel == "legs":
+        return UnilateralScanEngine(evaluation_request, n_threads)
+    return CollocationScanEngine(evaluation_request, n_threads)

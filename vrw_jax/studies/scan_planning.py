@@ -27,7 +27,6 @@ from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.walker_finder import ParameterizedWalker, make_walker_finder
 from vrw_jax.lanes.disk_cache import compute_source_digest
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
-from vrw_jax.models.capabilities import ModelCapabilities
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     describe_parameter,
@@ -247,7 +246,7 @@ def plan_scan(
     if tol is not None:
         tol = check_positive("tol", tol)
         model_fields: dict[str, Any] = type(model).__dataclass_fields__
-        fixed_fields = model.capabilities.fields_with_fixed_defaults
+        fixed_fields = model.fixed_fields_of_tolerance
         if fixed_fields is None or any(
             getattr(model, field_name) != model_fields[field_name].default
             for field_name in fixed_fields
@@ -459,8 +458,8 @@ def _convert_settings_to_json(settings_object: object) -> JsonObject:
     )
     for field_name in type(settings_object).__dataclass_fields__:  # type: ignore[attr-defined]
         field_value = getattr(settings_object, field_name)
-        if isinstance(field_value, StepOptions | ModelCapabilities):
-            continue  # Options are recorded separately, and capabilities are code.
+        if isinstance(field_value, StepOptions):
+            continue  # Options are recorded separately.
         if field_name in LAW_NAMES:
             if field_value is None:
                 continue

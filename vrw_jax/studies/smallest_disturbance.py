@@ -137,17 +137,7 @@ def smallest_disturbance(
     """
     max_steps = check_int("max_steps", max_steps)
     stable_gait = StableGait.from_cycle("vrw.smallest_disturbance", params, model, cycle, options)
-    if not stable_gait.model.capabilities.can_start_within_gait_step:
-        raise ValueError(
-            f"{type(stable_gait.model).__name__} cannot begin within a step, so that disturbances "
-            "within a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb "
-            "starts by vrw.basin_share."
-        )
-    if len(stable_gait.section_states) > 1:
-        raise ValueError(
-            f"cycle repeats after {len(stable_gait.section_states)} steps, but disturbances are "
-            "those of gaits of one step: give a cycle with period_n=1."
-        )
+    stable_gait.require_start_within_step("disturbances")
     max_size = None if max_size is None else check_positive("max_size", max_size)
     return compute_smallest_disturbance(stable_gait, max_size, max_steps)
 

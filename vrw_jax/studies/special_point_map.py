@@ -116,7 +116,7 @@ def map_special_points(
     if on_stage is not None:
         check_callable("on_stage", on_stage, "that takes a sentence")
     wheel_model: Any = convert_model_argument(model)
-    if "map" not in wheel_model.capabilities.accepted_cli_commands:
+    if "map" not in wheel_model.commands:
         raise ValueError(
             f"model is {type(wheel_model).__name__}, but special points are mapped for "
             f"{describe_accepted_models('map')}: give that."
