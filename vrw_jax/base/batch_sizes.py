@@ -17,10 +17,6 @@ CONTACT_XLA_BATCH_SIZE = 2048
 """Number of steps with unilateral contact that one XLA call computes, on devices without machine
 code.
 """
-ATTRACTOR_BATCH_SIZE = 128
-"""Number of walks toward attractors that one call computes. After each round, the remaining walks
-are gathered in new batches.
-"""
 DISTURBANCE_BATCH_SIZES = (64, 1024)
 """Numbers of disturbed steps that one call computes: one disturbance size at each instant, or
 many.

@@ -4,23 +4,16 @@ Starts may belong to different wheels. Walks are tested after each round of seve
 Only walks that are neither periodic nor failed continue, so that long transients cost little.
 """
 
-import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
-from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
-from vrw_jax.models.stepping import walk
-from vrw_jax.models.unilateral_wheel import UnilateralWheel
+from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.models.step_batch import step_batch
 
 
 class PeriodicWalkEnds(NamedTuple):
@@ -33,44 +26,6 @@ class PeriodicWalkEnds(NamedTuple):
     """Section states of the orbit, (start, max_period, m), where m is the number of entries of a
     section state. The state with the lowest dtheta- comes first, and the array is padded with NaN.
     """
-
-
-@eqx.filter_jit
-def _simulate_block_of_starts(
-    model: Any, options: StepOptions, n_steps: int, params: Any, x: Array
-) -> tuple[Array, Array]:
-    """Return the section states and outcomes after each step of one round of walking steps.
-
-    The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
-    entries of a section state.
-    """
-    simulate_from_start = lambda params, x: walk(params, x, n_steps, model=model, options=options)
-    walks_of_block = jax.vmap(simulate_from_start)(params, x)
-    return walks_of_block.steps.section_state, walks_of_block.steps.outcome
-
-
-def _simulate_starts_with_contact(
-    model: Any, options: StepOptions, n_steps: int, params: Any, x: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the section states and outcomes of one round of walking steps with unilateral contact.
-
-    The arrays have the shapes (starts, steps, m) and (starts, steps), where m is the number of
-    entries of a section state. The batch kernel computes the steps for any number of starts.
-    """
-    parameter_rows = _stack_contact_parameters(model, params)
-    x = embed_section_states(parameter_rows, np.asarray(x), params.n_legs)
-    states_by_step, outcomes_by_step = list[np.ndarray](), [np.zeros(len(x), np.int32)]
-    for _ in range(n_steps):
-        x, _, step_outcomes, *_ = walk_batch(parameter_rows, x, 1, model, options, params.n_legs)
-        states_by_step.append(x)
-        # A wheel that fell has no section state, so its outcome does not change.
-        outcomes_by_step.append(np.where(outcomes_by_step[-1], outcomes_by_step[-1], step_outcomes))
-    return np.stack(states_by_step, 1), np.stack(outcomes_by_step[1:], 1)
-
-
-def _stack_contact_parameters(model: Any, params: Any) -> np.ndarray:
-    """Return the parameters of wheels with unilateral contact, shape (parameters, wheels)."""
-    return np.asarray(jax.vmap(model.collect_parameter_values)(params)).T
 
 
 # Number of walking steps between two tests for periodic motion.
@@ -104,30 +59,23 @@ def walk_until_periodic(
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
     unsettled_walk_indices = np.arange(n_starts)
-    simulate_round: Callable[..., tuple] = functools.partial(
-        _simulate_starts_with_contact, model, options, N_STEPS_PER_ROUND
-    )
-    if getattr(model, "batch_kernel", "") != "legs":
-        simulate_round = functools.partial(
-            map_in_batches,
-            functools.partial(_simulate_block_of_starts, model, options, N_STEPS_PER_ROUND),
-            (batch_sizes.ATTRACTOR_BATCH_SIZE,),
-        )
     for first_step in range(0, n_rounds * N_STEPS_PER_ROUND, N_STEPS_PER_ROUND):
         last_step = first_step + N_STEPS_PER_ROUND
-        section_states, step_outcomes = map(
-            np.asarray,
-            simulate_round(
-                select_tree_rows(repeated_wheels, unsettled_walk_indices),
-                state_history[unsettled_walk_indices, first_step],
-            ),
-        )
-        state_history[unsettled_walk_indices, first_step + 1 : last_step + 1] = section_states
-        walk_outcomes[unsettled_walk_indices] = step_outcomes[:, -1]
-        n_steps_to_orbit[unsettled_walk_indices] = first_step + np.sum(
-            step_outcomes == Outcome.STEPPED, 1
-        )
-        is_walking = step_outcomes[:, -1] == Outcome.STEPPED
+        wheels = select_tree_rows(repeated_wheels, unsettled_walk_indices)
+        section_states = state_history[unsettled_walk_indices, first_step]
+        outcomes = np.zeros(len(section_states), int)
+        for step_index in range(first_step, last_step):
+            steps = step_batch(
+                wheels, section_states, model=model, options=options, engine=options.engine
+            )
+            section_states = steps.section_state
+            state_history[unsettled_walk_indices, step_index + 1] = section_states
+            # A walk that has failed has no section state, so its outcome does not change.
+            is_walking = outcomes == Outcome.STEPPED
+            outcomes[is_walking] = steps.outcome[is_walking]
+            is_walking = outcomes == Outcome.STEPPED
+            n_steps_to_orbit[unsettled_walk_indices] += is_walking
+        walk_outcomes[unsettled_walk_indices] = outcomes
         detected_periods = is_walking * _detect_walk_periods(
             state_history[unsettled_walk_indices, : last_step + 1], max_period
         )
@@ -206,14 +154,6 @@ def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> tuple[np.ndarray, list[
     return rank_by_orbit[orbit_indices], [distinct_orbits[j] for j in orbit_sort_order]
 
 
-@eqx.filter_jit
-def _measure_steps_of_block(
-    model: Any, options: StepOptions, params: Any, x: Array
-) -> dict[str, Array]:
-    """Return all measures of one step from each start in a batch, by name."""
-    return jax.vmap(lambda p, x: model.take_step(p, x, options).measures())(params, x)
-
-
 def measure_orbit_steps(
     params: Any, section_states: np.ndarray, model: Any, options: StepOptions
 ) -> dict[str, np.ndarray]:
@@ -221,24 +161,5 @@ def measure_orbit_steps(
 
     `section_states` has the shape (states, entries).
     """
-    n_states = len(section_states)
-    repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_states), params)
-    if model.batch_kernel == "legs":
-        step_results, _ = step_batch_with_jacobian(
-            _stack_contact_parameters(model, repeated_wheels),
-            section_states,
-            cast(UnilateralWheel, model),
-            options,
-            params.n_legs,
-            (),
-        )
-        return jax.tree.map(np.asarray, jax.tree.map(jnp.asarray, step_results).measures())
-    return jax.tree.map(
-        np.asarray,
-        map_in_batches(
-            functools.partial(_measure_steps_of_block, model, options),
-            (batch_sizes.ATTRACTOR_BATCH_SIZE,),
-            repeated_wheels,
-            section_states,
-        ),
-    )
+    measures = [model.take_step(params, jnp.asarray(x), options).measures() for x in section_states]
+    return jax.tree.map(lambda *values: np.stack(values), *measures)
