@@ -9,7 +9,7 @@ per GPU. Samples that need walks or finer meshes are then gathered in smaller ba
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from threading import Lock
@@ -335,20 +335,6 @@ class _CompiledDevicePrograms(NamedTuple):
     device: jax.Device
     cycle_program: Callable
     step_program: Callable
-
-
-def concatenate_results(
-    results_by_batch: Sequence[ValuesByVariable],
-) -> ValuesByVariable:
-    """Return the values of each variable for the samples of all batches, by the name of the
-    variable.
-    """
-    return {
-        variable_name: np.concatenate(
-            [results_of_batch[variable_name] for results_of_batch in results_by_batch]
-        )
-        for variable_name in results_by_batch[0]
-    }
 
 
 def mask_failed_samples(

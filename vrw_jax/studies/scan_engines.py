@@ -10,7 +10,7 @@ then evaluated with unilateral contact.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -28,7 +28,12 @@ from vrw_jax.gaits.finder import MeasureReader, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder
-from vrw_jax.lanes.batching import map_in_batches, map_in_numpy_batches
+from vrw_jax.lanes.batching import (
+    concatenate_tree_rows,
+    map_in_batches,
+    map_in_numpy_batches,
+    select_tree_rows,
+)
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.ladder import ModelCode, find_selection_reason
 from vrw_jax.models.measures import PASSAGE_MEASURES, SELECTION_MARGIN_NAMES
@@ -43,7 +48,6 @@ from vrw_jax.studies.measure_catalog import (
 from vrw_jax.studies.scan_collocation import (
     CollocationScanEngine,
     EvaluationRequest,
-    concatenate_results,
     mask_failed_samples,
 )
 from vrw_jax.studies.scan_design import ParameterSamples
@@ -54,104 +58,71 @@ SampleEvaluator = Callable[[ParameterSamples], ValuesByVariable]
 """Function that returns the values of each variable for samples, by the name of the variable."""
 
 
-class UnilateralScanEngine:
-    """Scan engine for unilateral contact and a fixed set of measures."""
+def _evaluate_blocks(
+    evaluate: Callable[[np.ndarray], ValuesByVariable],
+    blocks: Iterable[np.ndarray],
+    n_threads: int,
+) -> ValuesByVariable:
+    """Return the values of each variable for blocks of samples, computed in threads."""
+    first_block, *other_blocks = blocks
+    results = [evaluate(first_block)]  # This call compiles for all threads.
+    # Threads have separate settings.
+    evaluate = with_default_jax_settings(evaluate)
+    with ThreadPoolExecutor(n_threads) as thread_pool:
+        return concatenate_tree_rows(*results, *thread_pool.map(evaluate, other_blocks))
 
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
-        self._evaluation_request = evaluation_request
-        variable_names, base_wheel, self._wheel_model, step_options, *_ = evaluation_request
-        self._n_threads = n_threads or lanes.count_available_cores()
-        self._requested_derivatives = evaluation_request.requested_derivatives
-        measure_names = [name for name in variable_names if parse_derivative(name) is None]
-        gait_finder: Any = make_finder(
-            self._wheel_model, base_wheel.n_legs, step_options=step_options
+
+def evaluate_contact_gaits(
+    evaluation_request: EvaluationRequest, n_threads: int, samples_by_parameter: ParameterSamples
+) -> ValuesByVariable:
+    """Return the value of each variable for all samples, with unilateral contact, by name."""
+    rows = evaluation_request.stack_parameter_rows(samples_by_parameter)
+    n_blocks = max(n_threads, -(-len(rows) // batch_sizes.SCAN_TASK_SIZE))
+    # Of few samples, the last blocks are empty.
+    blocks = filter(len, np.array_split(rows, n_blocks))
+    return _evaluate_blocks(
+        functools.partial(_evaluate_contact_block, evaluation_request), blocks, n_threads
+    )
+
+
+def _evaluate_contact_block(
+    evaluation_request: EvaluationRequest, rows: np.ndarray
+) -> ValuesByVariable:
+    """Return the values of the gaits to which walks from slow starts converge, by name.
+
+    - `rows`: parameters of the wheels, shape (samples, parameters).
+    """
+    model, batch_size = evaluation_request.wheel_model, (batch_sizes.GAIT_READ_BATCH_SIZE,)
+    gait_finder: Any = make_finder(
+        model, evaluation_request.base_wheel.n_legs, step_options=evaluation_request.step_options
+    )
+    gait_finder = dataclasses.replace(gait_finder, gait_batch_sizes=batch_size)
+    # Over a period friction balances the weight along the slope. Without enough friction no gait
+    # exists.
+    friction, slope = rows[:, -1], rows[:, PARAMETER_NAMES.index("slope")]
+    has_enough_friction = friction >= np.tan(slope)
+    rows = rows[has_enough_friction] if has_enough_friction.any() else rows[:1]
+    slow_gaits = find_slow_gaits(gait_finder, rows)
+    make_reader = functools.partial(MeasureReader, gait_finder.measure_reader)
+    derivatives = evaluation_request.requested_derivatives
+    names = [name for name in evaluation_request.measure_names if parse_derivative(name) is None]
+    read_gaits = functools.partial(_read_gait_measures, make_reader((*names, "spectral_radius")))
+    results = map_in_batches(read_gaits, batch_size, slow_gaits)
+    if derivatives:
+        names = list(dict.fromkeys(derivative.measure_name for derivative in derivatives))
+        _, jacobians = map_in_batches(
+            functools.partial(evaluate_on_gaits, make_reader(tuple(names))),
+            batch_size,
+            gait_finder.find_gaits(jnp.asarray(rows), slow_gaits.section_state),
         )
-        self._gait_finder = dataclasses.replace(
-            gait_finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,)
-        )
-        read_measure = type(gait_finder).read_measure
-        self._measure_reader = MeasureReader(read_measure, (*measure_names, "spectral_radius"))
-        differentiated_measures = dict.fromkeys(
-            derivative.measure_name for derivative in self._requested_derivatives
-        )
-        self._derivative_reader = MeasureReader(read_measure, tuple(differentiated_measures))
-
-    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
-        """Return the value of each variable for all samples, by the name of the variable.
-
-        - `samples_by_parameter`: value of each swept parameter for each sample.
-        """
-        parameter_rows = self._evaluation_request.stack_parameter_rows(samples_by_parameter)
-        parameter_row_subsets = np.array_split(
-            parameter_rows,
-            max(self._n_threads, -(-len(parameter_rows) // batch_sizes.SCAN_TASK_SIZE)),
-        )
-        # Of few samples, the last subsets are empty. The first call compiles for all threads.
-        first_parameter_rows, *remaining_parameter_rows = filter(len, parameter_row_subsets)
-        results_by_subset = [self._evaluate_sample_subset(first_parameter_rows)]
-        with ThreadPoolExecutor(self._n_threads) as scan_thread_pool:
-            results_by_subset += scan_thread_pool.map(
-                self._evaluate_sample_subset, remaining_parameter_rows
-            )
-        return concatenate_results(results_by_subset)
-
-    @with_default_jax_settings  # It runs in a thread of its own.
-    def _evaluate_sample_subset(self, parameter_rows: np.ndarray) -> ValuesByVariable:
-        """Return the value of each variable for a subset of the samples, by the name of the
-        variable.
-
-        The values are those of the gait to which a walk from a slow start converges.
-
-        - `parameter_rows`: parameters of the wheels, shape (samples, parameters).
-        """
-        # Over a period friction balances the weight along the slope. Without enough friction no
-        # gait exists.
-        friction, slope = parameter_rows[:, -1], parameter_rows[:, PARAMETER_NAMES.index("slope")]
-        has_enough_friction = friction >= np.tan(slope)
-        gait_results = self._evaluate_gaits(
-            parameter_rows[has_enough_friction] if has_enough_friction.any() else parameter_rows[:1]
-        )
-        # Samples without a gait may have any index.
-        gait_indices = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
-        sample_results = {
-            variable_name: variable_values[gait_indices]
-            for variable_name, variable_values in gait_results.items()
-        }
-        outcome_by_sample = np.where(
-            has_enough_friction, sample_results.pop("outcome"), Outcome.NO_CYCLE_FOUND
-        )
-        return mask_failed_samples(outcome_by_sample, sample_results)
-
-    def _evaluate_gaits(self, parameter_rows: np.ndarray) -> ValuesByVariable:
-        """Return outcomes, measures and derivatives for the gaits of some wheels, by name.
-
-        Each array has the shape (wheels,).
-        """
-        slow_gaits = find_slow_gaits(self._gait_finder, parameter_rows)
-        gait_results = map_in_batches(
-            lambda gait_batch: _read_gait_measures(self._measure_reader, gait_batch),
-            (batch_sizes.GAIT_READ_BATCH_SIZE,),
-            slow_gaits,
-        )
-        if self._requested_derivatives:
-            differentiable_cycles = self._gait_finder.find_gaits(
-                jnp.asarray(parameter_rows), slow_gaits.section_state
-            )
-            _, measure_jacobians = map_in_batches(
-                lambda gait_batch: evaluate_on_gaits(self._derivative_reader, gait_batch),
-                (batch_sizes.GAIT_READ_BATCH_SIZE,),
-                differentiable_cycles,
-            )
-            parameter_names = self._wheel_model.parameter_names
-            for derivative in self._requested_derivatives:
-                gait_results[derivative.variable_name] = measure_jacobians[derivative.measure_name][
-                    :, parameter_names.index(derivative.parameter_name)
-                ]
-        gait_results["outcome"] = slow_gaits.outcome
-        return {
-            variable_name: np.asarray(variable_values)
-            for variable_name, variable_values in gait_results.items()
-        }
+        for derivative in derivatives:
+            index = model.parameter_names.index(derivative.parameter_name)
+            results[derivative.variable_name] = jacobians[derivative.measure_name][:, index]
+    # Samples without a gait may have any index.
+    gait_indices = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
+    outcomes, results = select_tree_rows((slow_gaits.outcome, results), gait_indices)
+    outcomes = np.where(has_enough_friction, outcomes, Outcome.NO_CYCLE_FOUND)
+    return mask_failed_samples(outcomes, results)
 
 
 @eqx.filter_jit
@@ -184,9 +155,8 @@ class ModelSelectionScanEngine:
     sample.
     """
 
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
+    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int) -> None:
         self._measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
-        self._paper_model = ViscoelasticWheel()
         paper_measure_names = (
             paper_measure
             for measure_name in self._measure_names
@@ -194,12 +164,17 @@ class ModelSelectionScanEngine:
                 measure_name, (measure_name,)
             )
         )
-        paper_evaluation_request = evaluation_request._replace(
-            measure_names=tuple(dict.fromkeys(paper_measure_names)), wheel_model=self._paper_model
+        self._paper_engine = CollocationScanEngine(
+            evaluation_request._replace(
+                measure_names=tuple(dict.fromkeys(paper_measure_names)),
+                wheel_model=ViscoelasticWheel(),
+            ),
+            n_threads,
         )
-        self._paper_engine = CollocationScanEngine(paper_evaluation_request, n_threads)
-        self._unilateral_engine = UnilateralScanEngine(
-            evaluation_request._replace(wheel_model=self._wheel_model.fallback_model), n_threads
+        self._evaluate_contact_gaits = functools.partial(
+            evaluate_contact_gaits,
+            evaluation_request._replace(wheel_model=self._wheel_model.fallback_model),
+            n_threads,
         )
 
     def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
@@ -209,61 +184,46 @@ class ModelSelectionScanEngine:
         for the choice of this model.
         """
         n_samples = len(next(iter(samples_by_parameter.values())))
-        sample_friction = samples_by_parameter.get(
+        paper_samples = {"damping": np.full(n_samples, float(self._base_wheel.damping))}
+        paper_samples |= samples_by_parameter
+        friction = paper_samples.pop(
             FRICTION_NAME, np.full(n_samples, float(self._wheel_model.friction))
         )
-        paper_results = self._paper_engine(
-            {"damping": np.full(n_samples, float(self._base_wheel.damping))}
-            | {
-                parameter_name: parameter_samples
-                for parameter_name, parameter_samples in samples_by_parameter.items()
-                if parameter_name != FRICTION_NAME
-            }
-        )
-        selection_reasons = self.compute_selection_reasons(paper_results, sample_friction)
-        model_codes = np.where(
-            selection_reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL
-        ).astype(np.int8)
+        paper_results = self._paper_engine(paper_samples)
+        reasons = self.compute_selection_reasons(paper_results, friction)
+        model_codes = np.where(reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL)
         variable_names = (*self._measure_names, "outcome", "spectral_radius")
         for contact_measure, paper_measures in PAPER_MEASURES_BY_CONTACT_MEASURE.items():
             if contact_measure in variable_names:
                 paper_results[contact_measure] = sum(
                     map(paper_results.__getitem__, paper_measures), start=np.zeros(n_samples)
                 )
-        sample_results = {
-            variable_name: paper_results[variable_name] for variable_name in variable_names
-        }
-        unilateral_samples = np.flatnonzero(model_codes == ModelCode.UNILATERAL)
-        if unilateral_samples.size:
-            unilateral_results = self._unilateral_engine(
-                {
-                    parameter_name: parameter_samples[unilateral_samples]
-                    for parameter_name, parameter_samples in samples_by_parameter.items()
-                }
+        results = {name: paper_results[name] for name in variable_names}
+        contact_samples = np.flatnonzero(model_codes == ModelCode.UNILATERAL)
+        if contact_samples.size:
+            contact_results = self._evaluate_contact_gaits(
+                select_tree_rows(samples_by_parameter, contact_samples)
             )
-            for variable_name in variable_names:
-                sample_results[variable_name][unilateral_samples] = unilateral_results[
-                    variable_name
-                ]
-        return sample_results | {"rung": model_codes, "reason": selection_reasons}
+            for name, values in results.items():
+                values[contact_samples] = contact_results[name]
+        return results | {"rung": model_codes.astype(np.int8), "reason": reasons}
 
     def compute_selection_reasons(
-        self, paper_results: ValuesByVariable, sample_friction: np.ndarray
+        self, paper_results: ValuesByVariable, friction: np.ndarray
     ) -> np.ndarray:
         """Return `ModelChoice.reason_code` for each sample.
 
         - `paper_results`: margins and outcomes of the gaits computed with the paper's model, by
           name;
-        - `sample_friction`: friction coefficient of the ground for each sample.
+        - `friction`: friction coefficient of the ground for each sample.
         """
-        variable_names = (*SELECTION_MARGIN_NAMES, "outcome")
-        selection_reasons, _ = map_in_numpy_batches(
+        reasons, _ = map_in_numpy_batches(
             _find_selection_reason,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
-            {variable_name: paper_results[variable_name] for variable_name in variable_names},
-            sample_friction - self._paper_model.friction,
+            {name: paper_results[name] for name in (*SELECTION_MARGIN_NAMES, "outcome")},
+            friction - ViscoelasticWheel().friction,
         )
-        return selection_reasons.astype(np.int8)
+        return reasons.astype(np.int8)
 
 
 def evaluate_to_tolerance(
@@ -298,39 +258,29 @@ def evaluate_to_tolerance(
     return mask_failed_samples(measure_result.outcomes, sample_results | {"rung": model_codes})
 
 
-class WalkerScanEngine:
-    """Scan engine for a walker of the user and a fixed set of measures."""
-
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
-        self._request = evaluation_request
-        self._n_threads = n_threads or lanes.count_available_cores()
-        self._finder = make_walker_finder(
-            evaluation_request.wheel_model.walker,
-            evaluation_request.base_wheel,
-            evaluation_request.step_options,
-        )
-
-    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
-        """Return the value of each variable for all samples, by the name of the variable."""
-        rows = self._request.stack_parameter_rows(samples_by_parameter)
-        domains = self._finder.model.parameter_domains.values()
-        is_in_domain = np.all(
-            [domain.contains_parameter_value(x) for domain, x in zip(domains, rows.T, strict=True)],
-            axis=0,
-        )
-        blocks = np.split(rows, range(WALKER_BLOCK_SIZE, len(rows), WALKER_BLOCK_SIZE))
-        results_by_block = [self._evaluate_block(blocks[0])]  # It compiles for all threads.
-        with ThreadPoolExecutor(self._n_threads) as thread_pool:
-            results_by_block += thread_pool.map(self._evaluate_block, blocks[1:])
-        results = concatenate_results(results_by_block)
-        outcomes = np.where(is_in_domain, results.pop("outcome"), Outcome.BAD_INPUT)
-        return mask_failed_samples(outcomes, results)
-
-    @with_default_jax_settings  # It runs in a thread of its own.
-    def _evaluate_block(self, rows: np.ndarray) -> ValuesByVariable:
-        padded_rows = np.pad(rows, ((0, WALKER_BLOCK_SIZE - len(rows)), (0, 0)), "edge")
-        results = _evaluate_walkers(self._finder, self._request.measure_names, padded_rows)
-        return {name: np.asarray(values)[: len(rows)] for name, values in results.items()}
+def evaluate_own_gaits(
+    evaluation_request: EvaluationRequest, n_threads: int, samples_by_parameter: ParameterSamples
+) -> ValuesByVariable:
+    """Return the value of each variable for all samples, for a walker of the user, by name."""
+    rows = evaluation_request.stack_parameter_rows(samples_by_parameter)
+    finder = make_walker_finder(
+        evaluation_request.wheel_model.walker,
+        evaluation_request.base_wheel,
+        evaluation_request.step_options,
+    )
+    domains = finder.model.parameter_domains.values()
+    is_in_domain = np.all(
+        [domain.contains_parameter_value(x) for domain, x in zip(domains, rows.T, strict=True)],
+        axis=0,
+    )
+    evaluate = functools.partial(_evaluate_walkers, finder, evaluation_request.measure_names)
+    results = _evaluate_blocks(
+        lambda block: map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block),
+        np.split(rows, range(WALKER_BLOCK_SIZE, len(rows), WALKER_BLOCK_SIZE)),
+        n_threads,
+    )
+    outcomes = np.where(is_in_domain, results.pop("outcome"), Outcome.BAD_INPUT)
+    return mask_failed_samples(outcomes, results)
 
 
 WALKER_BLOCK_SIZE = 64
@@ -361,56 +311,34 @@ def _evaluate_walkers(
     return results
 
 
-class PassageScanEngine:
-    """Scan engine that combines the results of another engine with measures of walks over random
-    slopes.
+def evaluate_passages(
+    evaluation_request: EvaluationRequest,
+    evaluate_gaits: SampleEvaluator,
+    samples_by_parameter: ParameterSamples,
+) -> ValuesByVariable:
+    """Return the results of another engine, with measures of walks over random slopes.
 
     Samples are computed one after another, each with the same random numbers.
     """
-
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int | None) -> None:
-        measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
-        self._slope_standard_deviation = evaluation_request.slope_standard_deviation
-        self._passage_measure_names = [name for name in measure_names if name in PASSAGE_MEASURES]
-        gait_measure_names = tuple(name for name in measure_names if name not in PASSAGE_MEASURES)
-        gait_request = evaluation_request._replace(
-            measure_names=gait_measure_names, slope_standard_deviation=None
-        )
-        self._gait_engine = make_scan_engine(gait_request, n_threads)
-
-    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
-        """Return the value of each variable for all samples, by the name of the variable.
-
-        - `samples_by_parameter`: value of each swept parameter for each sample.
-        """
-        sample_results = self._gait_engine(samples_by_parameter)
-        gait_outcomes = sample_results["outcome"]
-        passage_measures = {
-            measure_name: np.full(len(gait_outcomes), np.nan, self._base_wheel.damping.dtype)
-            for measure_name in self._passage_measure_names
-        }
-        for sample_index in (
-            np.flatnonzero(gait_outcomes == Outcome.STEPPED) if passage_measures else ()
-        ):
-            wheel_model, params = self._wheel_model, self._base_wheel
-            for parameter_name, parameter_samples in samples_by_parameter.items():
-                wheel_model, params = wheel_model.with_parameter(
-                    params, parameter_name, jnp.asarray(float(parameter_samples[sample_index]))
-                )
-            # Hardly any step of the walks succeeds if `first_passage` raises an error.
-            with contextlib.suppress(ValueError):
-                assert self._slope_standard_deviation is not None  # The measures need it.
-                passage_result = first_passage(
-                    params, self._slope_standard_deviation, model=wheel_model
-                )
-                measures_by_name = {
-                    "mean_steps": passage_result.mean_steps,
-                    "mean_steps_error": passage_result.error,
-                    "failure_probability": passage_result.failure_probability,
-                }
-                for measure_name, measure_values in passage_measures.items():
-                    measure_values[sample_index] = measures_by_name[measure_name]
-        return sample_results | passage_measures
+    results = evaluate_gaits(samples_by_parameter)
+    slope_sd = evaluation_request.slope_standard_deviation
+    assert slope_sd is not None  # The measures need it.
+    outcomes, dtype = results["outcome"], evaluation_request.base_wheel.damping.dtype
+    passage_measures = {
+        name: np.full(len(outcomes), np.nan, dtype)
+        for name in evaluation_request.measure_names
+        if name in PASSAGE_MEASURES
+    }
+    for index in np.flatnonzero(outcomes == Outcome.STEPPED) if passage_measures else ():
+        model, params = evaluation_request.wheel_model, evaluation_request.base_wheel
+        for name, samples in samples_by_parameter.items():
+            model, params = model.with_parameter(params, name, jnp.asarray(float(samples[index])))
+        # Hardly any step of the walks succeeds if `first_passage` raises an error.
+        with contextlib.suppress(ValueError):
+            passage = first_passage(params, slope_sd, model=model)
+            for name, values in passage_measures.items():
+                values[index] = getattr(passage, "error" if name == "mean_steps_error" else name)
+    return results | passage_measures
 
 
 def make_scan_engine(
@@ -420,15 +348,21 @@ def make_scan_engine(
 
     - `n_threads`: number of CPU threads, by default one per core.
     """
+    n_threads, model = n_threads or lanes.count_available_cores(), evaluation_request.wheel_model
     if evaluation_request.error_tolerance is not None:
         return functools.partial(evaluate_to_tolerance, evaluation_request)
     if evaluation_request.slope_standard_deviation is not None:
-        return PassageScanEngine(evaluation_request, n_threads)
-    model = evaluation_request.wheel_model
+        names = evaluation_request.measure_names
+        gait_request = evaluation_request._replace(
+            measure_names=tuple(name for name in names if name not in PASSAGE_MEASURES),
+            slope_standard_deviation=None,
+        )
+        gait_engine = make_scan_engine(gait_request, n_threads)
+        return functools.partial(evaluate_passages, evaluation_request, gait_engine)
     if not model.is_wheel:
-        return WalkerScanEngine(evaluation_request, n_threads)
+        return functools.partial(evaluate_own_gaits, evaluation_request, n_threads)
     if model.fallback_model is not model:
         return ModelSelectionScanEngine(evaluation_request, n_threads)
     if model.batch_kernel == "legs":
-        return UnilateralScanEngine(evaluation_request, n_threads)
+        return functools.partial(evaluate_contact_gaits, evaluation_request, n_threads)
     return CollocationScanEngine(evaluation_request, n_threads)
