@@ -1,17 +1,24 @@
-"""Locate peaks of the ground's normal force in a gait of the paper's model.
+"""Locate peaks of the ground's normal force in a gait of the paper's model, or in a sampled walk.
 
-The peaks are located on the collocation solution of the gait. A peak is a smooth maximum inside a
-phase. Impacts and changes of phase are no peaks. The largest force may also occur there.
+The peaks of a gait are located on its collocation solution, and those of a walk on a spline through
+samples of each interval between two events. A peak is a smooth maximum inside a phase. Impacts and
+changes of phase are no peaks. The largest force may also occur there.
 """
 
+from __future__ import annotations
+
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.checks import check_type
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.extrema import (
@@ -23,6 +30,7 @@ from vrw_jax.gaits.extrema import (
     locate_extrema,
 )
 from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.models.measures import FORCE_PEAK_MEASURES, make_measure_attributes
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant, make_paper_phases
 
@@ -127,22 +135,12 @@ def evaluate_force_peaks(
             evaluate_extrema(*forces, extrema)
             for forces, extrema in zip(step_forces, step_extrema, strict=True)
         ]
-        fore_peaks, total_force_peaks = (
-            _summarize_force_extrema(step_extrema, values, durations, force_index)
-            for force_index in range(2)
-        )
+        forces = (_join_phases(step_extrema, values, durations, index) for index in range(2))
         peaks_by_step.append(
-            {
-                **fore_peaks,
-                "n_total_force_peaks": total_force_peaks["n_force_peaks"],
-                "peak_total_force": total_force_peaks["peak_force"],
-                "smooth_peak_total_force": total_force_peaks["smooth_peak_force"],
-                "landing_impulse": landing_impulse,
-            }
+            {**_summarize_forces(jnp, *forces), "landing_impulse": landing_impulse}
         )
-    return jax.tree.map(
-        lambda *values_by_step: jnp.nanmax(jnp.stack(values_by_step)), *peaks_by_step
-    )
+    dtype = solution.durations.dtype
+    return jax.tree.map(lambda *values: jnp.nanmax(jnp.stack(values).astype(dtype)), *peaks_by_step)
 
 
 def compute_force_peaks(
@@ -153,64 +151,262 @@ def compute_force_peaks(
     return evaluate_force_peaks(collocation_system, parameters, solution, extrema)
 
 
-def _summarize_force_extrema(
+class _ForceExtrema(NamedTuple):
+    """Extrema of a force in one gait step, in chronological order."""
+
+    times: Any  # s
+    forces: Any  # N
+    is_peak: Any
+    is_trough: Any
+    rate_times: Any  # of extrema of the rate, s
+    rates: Any  # N/s
+    is_rate_maximum: Any
+    other_forces: Any  # at the ends of phases, or of all samples, N
+
+
+def _join_phases(
     extrema_of_phases: list[LocatedExtrema],
     values_of_phases: list[ExtremumValues],
     phase_durations: Array,
     force_index: int,
-) -> dict[str, Scalar]:
-    """Return the measures of one force over a gait step, from the extrema in each phase.
-
-    The measures are those of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name.
+) -> _ForceExtrema:
+    """Return the extrema of one force over a gait step, from the extrema in each phase.
 
     - `force_index`: 0 for the force on the fore foot, 1 for the total force.
     """
     extrema_of_phases, values_of_phases = jax.tree.map(
         lambda x: x[min(force_index, len(x) - 1)], (extrema_of_phases, values_of_phases)
     )
+    join = lambda name, phases: jnp.concatenate([getattr(phase, name) for phase in phases])
     start_times = jnp.cumsum(phase_durations) - phase_durations
-    extrema, values = (
-        jax.tree.map(lambda *by_phase: jnp.concatenate(by_phase), *phases)
-        for phases in (
+    times, rate_times = (
+        jnp.concatenate(
             [
-                extrema._replace(
-                    times=extrema.times + start_time,
-                    rate_times=extrema.rate_times + start_time,
-                    node_accelerations=jnp.zeros(0),
-                    inverse_jacobian=jnp.zeros(0),
-                )
+                getattr(extrema, name) + start_time
                 for extrema, start_time in zip(extrema_of_phases, start_times, strict=True)
-            ],
-            values_of_phases,
+            ]
         )
+        for name in ("times", "rate_times")
     )
-    extremum_values = values.values
-    is_peak = extrema.is_maximum
-    peak_forces = jnp.where(is_peak, extremum_values, -jnp.inf)
-    extremum_indices = jnp.arange(len(peak_forces))
-    find_highest_peak_force = lambda extremum_mask: jnp.max(
-        jnp.where(extremum_mask, peak_forces, -jnp.inf), axis=1
-    )
-    lower_neighbor_peak_force = jnp.minimum(
-        find_highest_peak_force(extremum_indices < extremum_indices[:, None]),
-        find_highest_peak_force(extremum_indices > extremum_indices[:, None]),
-    )
-    is_force_trough = extrema.is_minimum & jnp.isfinite(lower_neighbor_peak_force)
-    force_trough_depths = jnp.where(
-        is_force_trough,
-        jnp.where(is_force_trough, lower_neighbor_peak_force, 0.0) - extremum_values,
-        0.0,
-    )
-    first_peak_time = jnp.min(jnp.where(is_peak, extrema.times, jnp.inf))
-    is_later_rate_maximum = extrema.is_rate_maximum & (extrema.rate_times > first_peak_time)
     has_phase_occurred = jnp.repeat(phase_durations > 0.0, 2)
-    candidate_forces = jnp.append(peak_forces, jnp.where(has_phase_occurred, values.ends, -jnp.inf))
-    largest_force_rate = jnp.max(jnp.where(is_later_rate_maximum, values.rates, -jnp.inf))
+    return _ForceExtrema(
+        times,
+        join("values", values_of_phases),
+        join("is_maximum", extrema_of_phases),
+        join("is_minimum", extrema_of_phases),
+        rate_times,
+        join("rates", values_of_phases),
+        join("is_rate_maximum", extrema_of_phases),
+        jnp.where(has_phase_occurred, join("ends", values_of_phases), -jnp.inf),
+    )
+
+
+def _summarize_forces(xp: Any, fore: _ForceExtrema, total: _ForceExtrema) -> dict[str, Any]:
+    """Return the measures of a step from extrema of the force on the fore foot and of their sum.
+
+    - `xp`: `jax.numpy`, or `numpy` for numbers of extrema that differ from step to step.
+    """
+    fore_peaks, total_peaks = (_summarize_force(extrema, xp) for extrema in (fore, total))
+    names = {"n_force_peaks": "n_total_force_peaks", "peak_force": "peak_total_force"}
+    names["smooth_peak_force"] = "smooth_peak_total_force"
+    return fore_peaks | {names[name]: total_peaks[name] for name in names}
+
+
+def _summarize_force(extrema: _ForceExtrema, xp: Any) -> dict[str, Any]:
+    """Return the measures of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name."""
+    find_largest = lambda values, **axes: xp.max(values, initial=-xp.inf, **axes)
+    peak_forces = xp.where(extrema.is_peak, extrema.forces, -xp.inf)
+    indices = xp.arange(len(peak_forces))
+    find_highest_peak = lambda mask: find_largest(xp.where(mask, peak_forces, -xp.inf), axis=1)
+    lower_neighbor_peak = xp.minimum(
+        find_highest_peak(indices < indices[:, None]), find_highest_peak(indices > indices[:, None])
+    )
+    is_trough = extrema.is_trough & xp.isfinite(lower_neighbor_peak)
+    trough_depths = xp.where(
+        is_trough, xp.where(is_trough, lower_neighbor_peak, 0.0) - extrema.forces, 0.0
+    )
+    first_peak_time = xp.min(xp.where(extrema.is_peak, extrema.times, xp.inf), initial=xp.inf)
+    is_later_rate_maximum = extrema.is_rate_maximum & (extrema.rate_times > first_peak_time)
+    largest_rate = find_largest(xp.where(is_later_rate_maximum, extrema.rates, -xp.inf))
+    candidate_forces = xp.append(peak_forces, extrema.other_forces)
     return {
-        "n_force_peaks": jnp.sum(is_peak).astype(phase_durations.dtype),
+        "n_force_peaks": xp.sum(extrema.is_peak),
         # The maximum of tied forces has one-sided derivatives. Selection returns one of them.
-        "peak_force": candidate_forces[jnp.argmax(candidate_forces)],
-        "smooth_peak_force": jnp.where(jnp.any(is_peak), jnp.max(peak_forces), jnp.nan),
-        "force_trough_depth": jnp.max(force_trough_depths),
-        "second_peak_rate": jnp.where(jnp.any(is_later_rate_maximum), largest_force_rate, jnp.nan),
+        "peak_force": candidate_forces[xp.argmax(candidate_forces)],
+        "smooth_peak_force": xp.where(xp.any(extrema.is_peak), find_largest(peak_forces), xp.nan),
+        "force_trough_depth": xp.max(trough_depths, initial=0.0),
+        "second_peak_rate": xp.where(xp.any(is_later_rate_maximum), largest_rate, xp.nan),
     }
+
+
+SPLINE_DEGREE = 7
+"""Degree of the spline through the samples of an interval. The value is chosen because the spline's
+error with the default number of samples is that of the solver.
+"""
+MIN_EXTREMUM_HEIGHT_FRACTION = 1e-7
+"""Smallest height of an extremum above or below its neighborhood, as a fraction of the largest
+force. The value is chosen because errors of the solver would otherwise be extrema of a constant
+force.
+"""
+
+
+SAMPLED_FORCE_PEAK_MEASURES = tuple(
+    name for name in FORCE_PEAK_MEASURES if name != "landing_impulse"
+)
+"""Measures of the peaks of the normal force between impacts."""
+
+
+@announce_wait("samples of gait steps", "10 s")
+def force_peaks(walk: xr.Dataset) -> xr.Dataset:
+    """Return the peaks of the normal force in each step of a walk that `vrw.simulate` returned.
+
+    A peak is a smooth maximum of the force on the fore foot, Leg 1, between two events. Impacts and
+    changes of phase or contact are not peaks, but the largest force may occur there. Peaks are
+    located on a spline of degree 7 through the samples of each interval. For gaits, the method
+    `measures` of the result of `vrw.limit_cycle` returns the same measures without samples, and
+    with derivatives.
+
+    Args:
+        walk: a trajectory with at least 9 samples per phase.
+
+    Returns:
+        A dataset of the force measures over `step`. Its variables `force`, `force_time`,
+        `force_step` and `is_maximum` over `extremum` describe the extrema of the fore foot's force.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> wheel = vrw.parameter_sets["two_peaks"].params
+        >>> start = vrw.limit_cycle(wheel).section_state
+        >>> peaks = vrw.force_peaks(vrw.simulate(wheel, start, n_steps=1))
+        >>> peaks.n_force_peaks.values, peaks.force.values.round(2)
+        (array([2]), array([223.2 , 133.5 , 158.84]))
+    """
+    check_type("walk", walk, xr.Dataset, "give the result of vrw.simulate")
+    if "lambda_2" in walk:
+        fore_force, rear_force = walk.lambda_2.values, walk.lambda_4.values
+        total_force = fore_force + rear_force
+    elif "normal" in walk:
+        fore_force, total_force = walk.normal.values[:, 0], walk.normal.values.sum(1)
+    else:
+        raise ValueError(
+            f"walk holds {', '.join(map(str, walk)) or 'nothing'}, but no normal force of the "
+            "feet: give the result of vrw.simulate."
+        )
+    sample_times, sample_steps = walk.time.values, walk.step.values
+    if not len(sample_times):
+        raise ValueError(
+            f"the walk has no samples, because its outcome is {walk.attrs.get('outcome')}: give a "
+            "walk that leaves its start."
+        )
+    # The time of an event is listed twice, up to round-off.
+    time_roundoff = 4.0 * np.finfo(float).eps * np.max(sample_times)
+    is_interval_end = (np.diff(sample_times) <= time_roundoff) | (np.diff(sample_steps) != 0)
+    interval_starts = np.flatnonzero(is_interval_end) + 1
+    sampled_intervals = np.split(np.arange(len(sample_times)), interval_starts)
+    min_samples_per_phase = SPLINE_DEGREE + 2
+    n_samples = max(map(len, sampled_intervals))
+    if n_samples < min_samples_per_phase:
+        raise ValueError(
+            f"the phases of the walk have {n_samples} samples, but its peaks need at least "
+            f"{min_samples_per_phase}: give simulate(..., n_samples={min_samples_per_phase}) or "
+            "more."
+        )
+    step_indices = np.unique(sample_steps)
+    fore_force_extrema, measures_by_step = [], []
+    for step_index in step_indices:
+        intervals_of_step = [
+            sample_indices
+            for sample_indices in sampled_intervals
+            if len(sample_indices) == n_samples and sample_steps[sample_indices[0]] == step_index
+        ]
+        extrema = [
+            _find_force_extrema(sample_times, force, intervals_of_step)._replace(
+                other_forces=force[sample_steps == step_index]
+            )
+            for force in (fore_force, total_force)
+        ]
+        fore_force_extrema.append(extrema[0])
+        measures_by_step.append(_summarize_forces(np, *extrema))
+    dataset_variables = {
+        measure_name: (
+            "step",
+            np.array([step_measures[measure_name] for step_measures in measures_by_step]),
+            make_measure_attributes(measure_name),
+        )
+        for measure_name in SAMPLED_FORCE_PEAK_MEASURES
+    }
+    extremum_times, extremum_forces, is_maximum, *_ = map(
+        np.concatenate, zip(*fore_force_extrema, strict=True)
+    )
+    step_index_by_extremum = np.repeat(
+        step_indices, [len(extrema.times) for extrema in fore_force_extrema]
+    )
+    dataset_variables |= {
+        "force": ("extremum", extremum_forces, make_measure_attributes("lambda_2")),
+        "force_time": ("extremum", extremum_times, make_measure_attributes("time")),
+        "force_step": ("extremum", step_index_by_extremum, make_measure_attributes("step")),
+        "is_maximum": ("extremum", is_maximum, {"long_name": "whether a maximum"}),
+    }
+    return xr.Dataset(dataset_variables, {"step": step_indices}, dict(walk.attrs))
+
+
+def _find_force_extrema(
+    sample_times: np.ndarray,
+    sampled_forces: np.ndarray,
+    sample_indices_by_interval: list[np.ndarray],
+) -> _ForceExtrema:
+    """Return the extrema of a force within the intervals between the events of one step.
+
+    - `interval_indices`: indices of the samples in each interval between two events.
+    """
+    from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
+
+    extrema_by_interval = [(np.zeros(0), np.zeros(0), np.zeros(0, bool))]
+    rate_maxima_by_interval = [(np.zeros(0), np.zeros(0))]
+
+    def find_interior_roots(polynomial: Any) -> np.ndarray:
+        roots = PPoly.from_spline(polynomial).roots()
+        return roots[(roots > 0.0) & (roots < 1.0)]
+
+    min_extremum_height = MIN_EXTREMUM_HEIGHT_FRACTION * np.max(np.abs(sampled_forces))
+    for sample_indices in sample_indices_by_interval:
+        if np.ptp(sampled_forces[sample_indices]) < min_extremum_height:
+            continue
+        interval_sample_times = sample_times[sample_indices]
+        interval_start, interval_duration = interval_sample_times[0], np.ptp(interval_sample_times)
+        time_fractions = (interval_sample_times - interval_start) / interval_duration
+        force_spline = make_interp_spline(
+            time_fractions, sampled_forces[sample_indices], SPLINE_DEGREE
+        )
+        extremum_fractions = find_interior_roots(force_spline.derivative(1))
+        forces_at_extrema_and_ends = force_spline(
+            np.concatenate([[0.0], extremum_fractions, [1.0]])
+        )
+        force_changes = np.abs(np.diff(forces_at_extrema_and_ends))
+        extremum_fractions = extremum_fractions[
+            np.minimum(force_changes[:-1], force_changes[1:]) > min_extremum_height
+        ]
+        extrema_by_interval.append(
+            (
+                interval_start + interval_duration * extremum_fractions,
+                force_spline(extremum_fractions),
+                force_spline(extremum_fractions, 2) < 0.0,
+            )
+        )
+        rate_maximum_fractions = find_interior_roots(force_spline.derivative(2))
+        rate_maximum_fractions = rate_maximum_fractions[
+            force_spline(rate_maximum_fractions, 3) < 0.0
+        ]
+        rate_maxima_by_interval.append(
+            (
+                interval_start + interval_duration * rate_maximum_fractions,
+                force_spline(rate_maximum_fractions, 1) / interval_duration,
+            )
+        )
+    times, forces, is_maximum = map(np.concatenate, zip(*extrema_by_interval, strict=True))
+    rate_times, rate_maxima = map(np.concatenate, zip(*rate_maxima_by_interval, strict=True))
+    return _ForceExtrema(
+        times, forces, is_maximum, ~is_maximum, rate_times, rate_maxima, rate_times > 0.0, ()
+    )
