@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+import numpy as np
 import pytest
 
 import vrw_jax as vrw
@@ -37,6 +38,40 @@ def test_a_new_model_has_gaits():
     cycle = vrw.limit_cycle(PARAMS, model=PointFeetWheel())
     reference = vrw.limit_cycle(PARAMS, model=vrw.RigidWheel())
     assert float(cycle.period) == float(reference.period)
+
+
+START = np.array([np.pi / 8, 2.0, 0.0])
+GRID = {"theta_touchdown": np.pi / 8, "dtheta_touchdown": [1.0, 2.0], "dL1_touchdown": 0.0}
+BOX = GRID | {"dtheta_touchdown": (0.5, 2.0)}
+CALLS = {
+    "walk": lambda model: vrw.walk(PARAMS, START, 3, model=model).steps.section_state,
+    "step_batch": lambda model: vrw.step_batch(PARAMS, START[None], 3, model=model).section_state,
+    "simulate": lambda model: vrw.simulate(PARAMS, START, 2, model=model, n_samples=9).theta,
+    "basin": lambda model: vrw.basin(PARAMS, GRID, model=model).steps,
+}
+SLOW_CALLS = {
+    "limit_cycles": lambda model: (
+        vrw.limit_cycles(vrw.WheelParams(slope=np.array([0.15, 0.2])), model=model).period
+    ),
+    "sensitivities": lambda model: (
+        vrw.sensitivities(PARAMS, measures=["period", "speed"], model=model).derivative
+    ),
+    "basin_share": lambda model: vrw.basin_share(PARAMS, BOX, model=model, n_starts=32).share,
+    "gait_sensitivity": lambda model: vrw.gait_sensitivity(PARAMS, "period", model=model).norm,
+}
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        *CALLS.values(),
+        *(pytest.param(call, marks=pytest.mark.slow) for call in SLOW_CALLS.values()),
+    ],
+    ids=[*CALLS, *SLOW_CALLS],
+)
+def test_functions_take_a_new_model_without_further_edits(call):
+    """The reference is the rigid wheel, whose motion the model has."""
+    np.testing.assert_array_equal(call(PointFeetWheel()), call(vrw.RigidWheel()))
 
 
 @pytest.mark.slow

@@ -239,7 +239,7 @@ class AbstractGaitFinder(eqx.Module):
             else self.refine_cycle_guess(parameter_values, cycle_guess)
         )
         return compute_gait_measures(
-            self.find_gait(parameter_values, start_state), type(self).read_measure, measure_names
+            self.find_gait(parameter_values, start_state), self.measure_reader, measure_names
         )
 
     def compute_slope_response(
@@ -372,11 +372,10 @@ class MeasureReader:
     read_measure: GaitMeasureReader
     measure_names: tuple[Any, ...]
 
-    def __call__(self, cycle: AbstractCycle, step: AbstractStep) -> dict[str, Array]:
+    def __call__(self, cycle: Any, step: Any) -> dict[str, Array]:
         # One search locates all force peaks.
-        force_peaks = cycle.measures(
-            name for name in self.measure_names if name in FORCE_PEAK_MEASURES
-        )
+        peak_names = [name for name in self.measure_names if name in FORCE_PEAK_MEASURES]
+        force_peaks = cycle.measures(peak_names) if peak_names else {}
         return {
             getattr(measure_name, "name", measure_name): force_peaks[measure_name]
             if measure_name in force_peaks

@@ -23,7 +23,6 @@ from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
     Gait,
     GaitBranchPoint,
-    GaitMeasures,
     ParameterValues,
     compute_value_and_tangents,
     move_derivative_axis_first,
@@ -135,15 +134,6 @@ class WalkerFinder(AbstractGaitFinder):
 
     def take_gait_step(self, params: Any, section_state: Array) -> Any:
         return compile_step(self.model.walker)(params, section_state, self.step_options)
-
-    def measure_gait(
-        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
-    ) -> GaitMeasures:
-        guess = self.make_initial_guess(parameter_values) if cycle_guess is None else cycle_guess
-        gait = self.find_gait(parameter_values, guess)
-        read = self.measure_reader
-        stack = lambda gait: jnp.stack([read(name, gait) for name in measure_names], -1)
-        return GaitMeasures(stack(gait.cycle), stack(gait.cycle_derivatives).T, gait.cycle.outcome)
 
     @property
     def measure_reader(self) -> "WalkerMeasureReader":  # type: ignore[override]
