@@ -133,3 +133,64 @@ def test_sensitivities_name_the_parameters_of_the_law():
     derivative = table.derivative.sel(measure="period", parameter="leg.c2")
     np.testing.assert_allclose(derivative, jax.grad(measure_period)(60.0), rtol=1e-9)
     assert str(table.parameter_unit.sel(parameter="leg.c2").values) == "N s^2/m^2"
+
+
+@pytest.fixture(scope="module")
+def unilateral_gait():
+    model = vrw.UnilateralWheel(friction=np.inf, leg_force=QuadraticDamper())
+    return vrw.limit_cycle(PARAMS, model=model)
+
+
+def test_the_unilateral_gait_is_that_of_the_papers_model_where_no_foot_leaves_early(
+    unilateral_gait,
+):
+    assert abs(unilateral_gait.period - DAMPER_PERIOD_S) < 1e-9
+    assert abs(unilateral_gait.dls_fraction - DAMPER_DLS_FRACTION) < 1e-9
+    expected = find_gait(QuadraticDamper())
+    assert abs(unilateral_gait.speed - expected.speed) < 1e-11
+    np.testing.assert_allclose(
+        vrw.sensitivities(PARAMS, measures=["period"], model=unilateral_gait.model).derivative.sel(
+            parameter="leg.c2"
+        ),
+        jax.grad(measure_period)(60.0),
+        rtol=1e-6,
+    )
+
+
+def test_a_gait_with_unilateral_contact_loses_the_energy_of_descent_and_motor():
+    """The reference is the work of the weight and of the torque."""
+    torque = -3.0  # N m; the rear foot slides, so that friction takes energy too
+    model = vrw.UnilateralWheel(friction=5.0, leg_force=QuadraticDamper(), hub_torque=torque)
+    cycle = vrw.limit_cycle(PARAMS, model=model)
+    step = vrw.step(PARAMS, cycle.section_state, model=model, options=vrw.StepOptions.tight())
+    s = PARAMS.symbols()
+    descent = s.Mt * s.g * s.sin_phi * step.step_length
+    lost = step.energy_impacts + step.energy_damping + step.energy_friction
+    assert abs(lost - descent - torque * PARAMS.leg_angle) < 1e-8 * lost
+
+
+def test_two_laws_in_turn_give_a_gait_of_two_steps_with_unilateral_contact():
+    laws = vrw.AlternatingLegs(vrw.SpringDamper(damping=150.0), vrw.SpringDamper(damping=170.0))
+    expected, cycle = (
+        vrw.limit_cycle(vrw.WheelParams(), model=model, period_n=2)
+        for model in (
+            vrw.ViscoelasticWheel(leg_force=laws),
+            vrw.UnilateralWheel(friction=np.inf, leg_force=laws),
+        )
+    )
+    durations = np.sort(cycle.durations.sum(axis=1))
+    np.testing.assert_allclose(durations, np.sort(expected.durations.sum(axis=1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("friction", [50.0, 0.7])
+def test_the_ladder_gives_the_law_to_both_models(friction):
+    law = QuadraticDamper()
+    ladder = vrw.LadderWheel(friction=friction, leg_force=law)
+    cycle = vrw.limit_cycle(PARAMS, model=ladder)
+    expected_model = (
+        vrw.ViscoelasticWheel(leg_force=law)
+        if friction == 50.0
+        else vrw.UnilateralWheel(friction=friction, leg_force=law)
+    )
+    assert type(cycle.model) is type(expected_model)
+    assert cycle.period == vrw.limit_cycle(PARAMS, model=expected_model).period

@@ -9,7 +9,7 @@ the starting step.
 """
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.integrate import DOP853
@@ -50,6 +50,8 @@ class ComplementarityWheel(NamedTuple):
     one_sided: bool = False
     restitution: float = 0.0  # of the feet
     tilt: float = 0.0  # by which the ground ahead of the foot that landed is steeper, rad
+    leg_force: Any = None  # function of all lengths and rates, instead of spring and damper, N
+    hub_torque: Any = None  # function of the rate of theta, N m
 
     @property
     def mass(self) -> float:
@@ -121,7 +123,12 @@ def _mass_and_force(w, q, v):
     mass[1, 1] += w.m_hub
     force = w.m * flat.T @ (gravity - extra_values).ravel()
     force[:2] += w.m_hub * gravity
-    force[3:] += w.k * (w.Ls - q[3:]) - w.c * v[3:]
+    if w.leg_force is None:
+        force[3:] += w.k * (w.Ls - q[3:]) - w.c * v[3:]
+    else:
+        force[3:] += w.leg_force(q[3:], v[3:])
+    if w.hub_torque is not None:
+        force[2] += w.hub_torque(v[2])
     return mass, force
 
 

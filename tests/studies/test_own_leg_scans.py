@@ -40,6 +40,21 @@ def test_samples_are_gaits_of_their_laws(scan):
     assert scan["leg.c2"].attrs["units"] == "N s^2/m^2"
 
 
+@pytest.mark.parametrize("model_class", [vrw.UnilateralWheel, vrw.LadderWheel])
+def test_samples_with_unilateral_contact_are_those_of_the_papers_model(model_class, scan):
+    """No foot leaves the ground early in these gaits, and none slides."""
+    friction = np.inf if model_class is vrw.UnilateralWheel else 50.0
+    model = model_class(friction=friction, leg_force=QuadraticDamper())
+    contact_scan = vrw.scan(DESIGN, ["period"], base=PARAMS, model=model)
+    np.testing.assert_allclose(contact_scan.period, scan.period, atol=1e-9)
+
+
+def test_a_scan_to_a_tolerance_refuses_a_law():
+    model = vrw.UnilateralWheel(leg_force=QuadraticDamper())
+    with pytest.raises(ValueError, match="a tolerance refers to unilateral contact with no"):
+        vrw.scan(DESIGN, ["period"], base=PARAMS, model=model, tol=1e-3)
+
+
 def test_a_scan_resumes_with_the_same_code_only(scan, store):
     resumed = vrw.scan(DESIGN, ["period"], base=PARAMS, model=MODEL, store=store)
     np.testing.assert_array_equal(resumed.period, scan.period)

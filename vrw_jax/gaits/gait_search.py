@@ -294,12 +294,12 @@ def resolve_model_with_reason(
         or params.damping.ndim
     ):
         return model, None
-    paper_cycle = limit_cycle(params)
+    paper_cycle = limit_cycle(params, model=selected_model.viscoelastic_model)
     if not bool(paper_cycle.found):
         return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.ending}"
     section_state = selected_model.complete_section_state(params, paper_cycle.section_state)
     model_choice = selected_model.choose_model(params, section_state, StepOptions())[0]
-    return model_choice.model, model_choice.why
+    return model_choice.model.with_laws(selected_model.laws), model_choice.why
 
 
 def parse_gait_choice(which: GaitChoice) -> int:

@@ -162,13 +162,18 @@ def find_return_map_cycle(
     section_units = jnp.stack(
         model.collect_section_units(compute_wheel_units(params.symbols()), params.n_legs)
     )
-    return_map = lambda section_state: (
-        evaluate_step(params, section_state * section_units, options).section_state / section_units
-    )
+
+    def return_map(section_state: Array) -> Array:
+        for k in range(model.leg_period):
+            step_params = model.select_params(params, k)
+            step = evaluate_step(step_params, section_state * section_units, options)
+            section_state = step.section_state / section_units
+        return section_state
+
     fixed_point = find_fixed_point(
         return_map,
         section_state / section_units,
-        period_n=period_n,
+        period_n=period_n // model.leg_period,
         tolerance=compute_newton_tolerance(options),
         units=1.0,
     )
@@ -178,8 +183,9 @@ def find_return_map_cycle(
     )
     section_state = fixed_point.x
     step_results = []
-    for _ in range(period_n):
-        step_results.append(model.take_step(params, section_state, options))
+    for k in range(period_n):
+        step_params = model.select_params(params, k)
+        step_results.append(model.take_step(step_params, section_state, options))
         section_state = step_results[-1].section_state
     return make_return_map_cycle(
         params,

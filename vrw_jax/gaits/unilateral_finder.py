@@ -258,9 +258,12 @@ class PeriodMap(NamedTuple):
             ]
         )
         input_indices = np.flatnonzero(is_input_differentiated).tolist()
-        for _ in range(self.period_n):
+        input_columns = self.parameter_values.T.copy()
+        for k in range(self.period_n):
+            if k > 0:
+                self.model.exchange_legs(input_columns)
             step_result, step_result_jacobians = step_batch_with_jacobian(
-                self.parameter_values.T,
+                input_columns,
                 section_states,
                 self.model,
                 step_options,

@@ -9,7 +9,6 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.models.walk_batch import (
-    START_INPUT_NAME,
     StepBatchResult,
     StepwiseParameter,
     WalkBatch,
@@ -19,7 +18,6 @@ from vrw_jax.models.walk_batch import (
 )
 from vrw_jax.wheel.params import PARAMETER_NAMES
 
-CONTACT_PARAMETER_NAMES = (*PARAMETER_NAMES, "friction")
 SLOPES_PARAMETER_NAMES = ("previous_friction", "tilt")
 HEIGHTS_PARAMETER_NAMES = ("previous_friction", "rise", "next_rise")
 """Names of the additional parameters of a gait step on uneven ground.
@@ -27,10 +25,7 @@ HEIGHTS_PARAMETER_NAMES = ("previous_friction", "rise", "next_rise")
 The parameters are the friction of the feet that landed earlier, and the increase of the slope from
 this line of the ground to the next one, rad, or two rises (see `models.select_stance_line`), m.
 """
-CONTACT_SLOPE_INDEX = CONTACT_PARAMETER_NAMES.index("slope")
-CONTACT_FRICTION_INDEX = CONTACT_PARAMETER_NAMES.index("friction")
-CONTACT_STEP_INPUT_NAMES = (START_INPUT_NAME, *CONTACT_PARAMETER_NAMES)
-"""Names of the inputs with respect to which a gait step with unilateral contact has derivatives."""
+SLOPE_INDEX = PARAMETER_NAMES.index("slope")
 
 
 def step_batch_with_contact(
@@ -63,20 +58,21 @@ def step_batch_with_contact(
             "for all elements: call vrw.step_batch for each restitution."
         )
     stepwise_ground = _StepwiseGround.repeat_over_steps(
-        values_by_parameter[CONTACT_SLOPE_INDEX],
+        values_by_parameter[SLOPE_INDEX],
         element_friction,
         len(section_states),
         n_steps,
         element_heights,
     )
     first_step_values = [*values_by_parameter, stepwise_ground.friction_by_step[0]]
-    first_step_values[CONTACT_SLOPE_INDEX] = stepwise_ground.slopes_by_step[0]
+    first_step_values[SLOPE_INDEX] = stepwise_ground.slopes_by_step[0]
     parameter_matrix = np.stack(
         [np.broadcast_to(x, len(section_states)) for x in first_step_values]
     )
     section_states = embed_section_states(parameter_matrix, section_states, n_legs)
     solver_indices = np.zeros(len(section_states), np.int32)
-    if not derivative_names and not is_ground_uneven:
+    has_equal_steps = not is_ground_uneven and model.leg_period == 1
+    if not derivative_names and has_equal_steps:
         x, phase_durations, step_outcomes, n_stepped, n_solver_steps, _ = map(
             np.asarray,
             walk_batch(parameter_matrix, section_states, n_steps, model, options, n_legs),
@@ -91,14 +87,14 @@ def step_batch_with_contact(
             "lanes",
             (options.solver,),
         )
-    parameter_names = CONTACT_PARAMETER_NAMES
+    parameter_names = model.parameter_names
     stepwise_parameters: dict[str, StepwiseParameter] = {}
     if is_ground_uneven:
         ground_names = (
             SLOPES_PARAMETER_NAMES if element_heights is None else HEIGHTS_PARAMETER_NAMES
         )
-        parameter_names = (*CONTACT_PARAMETER_NAMES, *ground_names)
-        stepwise_parameters = stepwise_ground.make_stepwise_parameters()
+        parameter_names = (*model.parameter_names, *ground_names)
+        stepwise_parameters = stepwise_ground.make_stepwise_parameters(len(model.parameter_names))
     active_walks = WalkBatch(
         section_states.T.copy(), derivative_names, parameter_names, stepwise_parameters
     )
@@ -107,8 +103,12 @@ def step_batch_with_contact(
         active_lanes = active_walks.find_walking_lanes()
         if not len(active_lanes):
             break
+        if k > 0:
+            model.exchange_legs(parameter_matrix)
         if is_ground_uneven:
-            parameter_matrix = stepwise_ground.make_parameters_of_step(k, parameter_matrix)
+            parameter_matrix = stepwise_ground.make_parameters_of_step(
+                k, parameter_matrix[: len(model.parameter_names)]
+            )
         parameters_of_lanes = parameter_matrix[:, active_lanes]
         start_states = active_walks.section_state[:, active_lanes].T
         step_outputs: tuple[Any, ...]
@@ -178,11 +178,13 @@ class _StepwiseGround(NamedTuple):
     def make_parameters_of_step(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
         """Return the parameters of gait step `k`, shape (parameters, elements).
 
+        - `parameter_matrix`: parameters of wheels and laws, and friction.
+
         The last parameters are `SLOPES_PARAMETER_NAMES` or `HEIGHTS_PARAMETER_NAMES`.
         """
-        parameter_matrix = parameter_matrix[: len(CONTACT_PARAMETER_NAMES)].copy()
-        parameter_matrix[CONTACT_SLOPE_INDEX] = self.slopes_by_step[k]
-        parameter_matrix[CONTACT_FRICTION_INDEX] = self.friction_by_step[k]
+        parameter_matrix = parameter_matrix.copy()
+        parameter_matrix[SLOPE_INDEX] = self.slopes_by_step[k]
+        parameter_matrix[-1] = self.friction_by_step[k]
         previous_friction = self.friction_by_step[max(k - 1, 0)]
         if self.element_heights is not None:
             rises = compute_rises_over_steps(self.element_heights, len(self.friction_by_step))
@@ -190,17 +192,17 @@ class _StepwiseGround(NamedTuple):
         tilt = self.slopes_by_step[k + 1] - self.slopes_by_step[k]
         return np.vstack([parameter_matrix, previous_friction, tilt])
 
-    def make_stepwise_parameters(self) -> dict[str, StepwiseParameter]:
+    def make_stepwise_parameters(self, n_parameters: int) -> dict[str, StepwiseParameter]:
         """Return a mapping from parameter names to the terms by which the parameters enter the
         chain rule.
 
         The mapping contains "friction" and, if they vary over gait steps, "slope" or "heights".
         """
-        previous_friction_input_index = len(CONTACT_PARAMETER_NAMES)
+        previous_friction_input_index = n_parameters
         last_slope_index = (self.n_stepwise_slopes or 1) - 1
         last_friction_index = (self.n_stepwise_frictions or 1) - 1
         stepwise_friction = StepwiseParameter(
-            (CONTACT_FRICTION_INDEX, previous_friction_input_index),
+            (n_parameters - 1, previous_friction_input_index),
             self.n_stepwise_frictions,
             lambda k: (
                 (0, min(k, last_friction_index), 1.0),
@@ -217,7 +219,7 @@ class _StepwiseGround(NamedTuple):
         if self.n_stepwise_slopes is None:
             return {"friction": stepwise_friction}
         stepwise_slope = StepwiseParameter(
-            (CONTACT_SLOPE_INDEX, previous_friction_input_index + 1),
+            (SLOPE_INDEX, previous_friction_input_index + 1),
             self.n_stepwise_slopes,
             lambda k: ((0, k, 1.0), (1, k, -1.0), (1, min(k + 1, last_slope_index), 1.0)),
         )

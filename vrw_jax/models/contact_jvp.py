@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from vrw_jax.base.types import Elementwise
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.contact_mechanics import (
     ContactInverseInertia,
@@ -34,6 +35,7 @@ from vrw_jax.models.contact_mechanics import (
     sum_over_legs,
 )
 from vrw_jax.models.contact_modes import replace_infinite_friction, solve_combination
+from vrw_jax.wheel.laws import evaluate_hub_torque, evaluate_leg_force, number_legs
 from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols
 
@@ -120,6 +122,7 @@ class _EquationTangents(NamedTuple):
     transverse_leg_motion: LegArray
     hub_motion: tuple[Array, Array]
     spring_force: LegArray | float  # N
+    hub_torque: Array | float  # N m; 0.0 without a motor, and in impacts
     foot_transverse_motion: SlotArray
     foot_radial_motion: SlotArray
 
@@ -339,6 +342,9 @@ def _compute_free_motion_tangent(
         sum_over_legs(force_z_by_leg) + (-ds.Mt * hub_motion_z - s.Mt * hub_motion_tangent_z),
         sum_over_legs(torque_by_leg),
     )
+    if s.hub_torque is not None:
+        force_x, force_z, torque = hub_residual
+        hub_residual = force_x, force_z, torque + equation_tangents.hub_torque
     hub_motion_tangent = multiply_by_inverse_inertia(inverse_inertia.inverse_inertia, hub_residual)
     slot_length_tangents = contact_slots.gather_from_legs(length_tangent)
     free_motion_tangent = FreeMotion(
@@ -366,10 +372,22 @@ def _compute_motion_equation_tangents(
     squared_angular_rate, doubled_angular_rate = motion.dtheta * motion.dtheta, 2.0 * motion.dtheta
     squared_angular_rate_tangent = doubled_angular_rate * motion_tangent.dtheta
     doubled_angular_rate_tangent = 2.0 * motion_tangent.dtheta
-    spring_force_tangent = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
-    spring_force_tangent = (
-        spring_force_tangent + s.k * (ds.Ls - motion_tangent.L) - s.c * motion_tangent.dL
-    )
+    hub_torque_tangent: Array | float = 0.0
+    if s.leg_force is None:
+        spring_force_tangent = ds.k * (s.Ls - motion.L) - ds.c * motion.dL
+        spring_force_tangent = (
+            spring_force_tangent + s.k * (ds.Ls - motion_tangent.L) - s.c * motion_tangent.dL
+        )
+    else:
+        spring_force_tangent = _push_through_law(
+            lambda s, L, dL: evaluate_leg_force(s, L, dL, number_legs(L)),
+            (s, motion.L, motion.dL),
+            (ds, motion_tangent.L, motion_tangent.dL),
+        )
+    if s.hub_torque is not None:
+        hub_torque_tangent = _push_through_law(
+            evaluate_hub_torque, (s, motion.dtheta), (ds, motion_tangent.dtheta)
+        )
     constant_motion_terms = _ConstantMotionTerms(
         radial_leg_motion=force_solution.length_motion - b * squared_angular_rate,
         transverse_leg_motion=doubled_angular_rate * motion.dL + b * ddtheta,
@@ -400,9 +418,17 @@ def _compute_motion_equation_tangents(
         + ddtheta * db,
         hub_motion=(-ds.g * s.sin_phi - s.g * ds.sin_phi, ds.g * s.cos_phi + s.g * ds.cos_phi),
         spring_force=spring_force_tangent,
+        hub_torque=hub_torque_tangent,
         foot_transverse_motion=foot_transverse,
         foot_radial_motion=foot_radial,
     )
+
+
+def _push_through_law(law: Callable, primals: tuple, tangents: tuple) -> Elementwise:
+    """Return the tangent of a function of symbols and a motion, with respect to all floats."""
+    floats, constants = eqx.partition(primals, eqx.is_inexact_array)
+    evaluate = lambda floats: law(*eqx.combine(floats, constants))
+    return jax.jvp(evaluate, (floats,), (eqx.filter(tangents, eqx.is_inexact_array),))[1]
 
 
 def _compute_impact_equation_tangents(
@@ -433,6 +459,7 @@ def _compute_impact_equation_tangents(
         - b * motion_tangent.dtheta,
         hub_motion=(-motion_tangent.vx, -motion_tangent.vz),
         spring_force=0.0,
+        hub_torque=0.0,
         foot_transverse_motion=-dtheta_after * slot_length_tangents
         - slot_length_rates * motion_tangent.theta,
         foot_radial_motion=inverse_inertia.L * dtheta_after * motion_tangent.theta,

@@ -12,6 +12,7 @@ diffrax integrates a single element (`integrate_by_diffrax`).
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -74,16 +75,16 @@ from vrw_jax.models.contact_state import (
 from vrw_jax.models.phase_sequence import find_stance_slope
 from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.params import (
+    NO_LAWS,
     PARAMETER_NAMES,
     Symbols,
+    add_laws,
     compute_symbols,
     make_wheel_from_parameters,
     stack_parameters,
 )
 
 SLOPE_INDEX = PARAMETER_NAMES.index("slope")
-N_PARAMETERS = len(PARAMETER_NAMES)
-"""Number of wheel parameters, the first input columns. The friction coefficient follows."""
 N_HEIGHT_COLUMNS = 3
 """Number of further input columns if the heights of the footholds are given.
 
@@ -179,6 +180,12 @@ class BatchWalkSettings(NamedTuple):
     engine_name: str = "lanes"  # name of the engine in the results
     # whether the extrema of normal forces are located; only if details are requested
     measures_force_peaks: bool = False
+    law_structure: Any = NO_LAWS  # structure of the laws as a pytree
+
+    @property
+    def friction_index(self) -> int:
+        """Return the index of friction in the input columns, after those of wheel and laws."""
+        return len(PARAMETER_NAMES) + self.law_structure.num_leaves
 
     def make_lane_contact_dynamics(
         self, input_columns: Array, contact_state: ContactState
@@ -200,12 +207,16 @@ class BatchWalkSettings(NamedTuple):
         On uneven ground, the second result is a pair: friction of the foot that landed last, and of
         the feet that landed earlier.
         """
-        s = compute_symbols(self.n_legs, *input_columns[:N_PARAMETERS])
-        friction = apply_friction_rule(input_columns[N_PARAMETERS], self.uses_paper_rule)
+        n_wheel_columns = len(PARAMETER_NAMES)
+        laws: Any = jax.tree.unflatten(
+            self.law_structure, list(input_columns[n_wheel_columns : self.friction_index])
+        )
+        s = add_laws(compute_symbols(self.n_legs, *input_columns[:n_wheel_columns]), laws)
+        friction = apply_friction_rule(input_columns[self.friction_index], self.uses_paper_rule)
         if not self.n_ground_columns:
             return s, friction
         previous_friction = apply_friction_rule(
-            input_columns[N_PARAMETERS + 1], self.uses_paper_rule
+            input_columns[self.friction_index + 1], self.uses_paper_rule
         )
         return s, (friction, previous_friction)
 
@@ -213,7 +224,7 @@ class BatchWalkSettings(NamedTuple):
         """Return the ground ahead for columns that `resolve_heights` returned, or None on flat
         ground.
         """
-        first, end = N_PARAMETERS + 2, N_PARAMETERS + 1 + self.n_ground_columns
+        first, end = self.friction_index + 2, self.friction_index + 1 + self.n_ground_columns
         return GroundAhead(*input_columns[first:end]) if self.n_ground_columns else None
 
     def resolve_heights(self, input_columns: Array, section_state: Array) -> Array:
@@ -224,13 +235,13 @@ class BatchWalkSettings(NamedTuple):
         """
         if self.n_ground_columns != N_HEIGHT_COLUMNS:
             return input_columns
-        columns = list(input_columns)
-        mean_slope, rise = columns[SLOPE_INDEX], columns[N_PARAMETERS + 2]
+        columns, rise_index = list(input_columns), self.friction_index + 2
+        mean_slope, rise = columns[SLOPE_INDEX], columns[rise_index]
         foot_distance = compute_section_foot_distance(
             self.unpack_input_columns(input_columns)[0], section_state
         )
         columns[SLOPE_INDEX] = find_stance_slope(mean_slope, rise, foot_distance)
-        columns[N_PARAMETERS + 2] = mean_slope - columns[SLOPE_INDEX]
+        columns[rise_index] = mean_slope - columns[SLOPE_INDEX]
         return jnp.stack(columns)
 
     def begin_walk(self, input_columns: Array, section_state: Array) -> LaneState:
@@ -477,15 +488,19 @@ class BatchWalkSettings(NamedTuple):
     ) -> tuple[Array, Array, Array]:
         """Return inputs and section states with invalid elements replaced, and validity flags."""
         is_valid, params, friction, section_state = replace_invalid_start(
-            make_wheel_from_parameters(input_columns[:N_PARAMETERS], self.n_legs),
-            input_columns[N_PARAMETERS],
+            make_wheel_from_parameters(
+                input_columns[: self.friction_index],
+                self.n_legs,
+                law_structure=self.law_structure,
+            ),
+            input_columns[self.friction_index],
             section_state,
             self.extract_ground_ahead(input_columns),
         )
         column_rows = [*stack_parameters(params), friction]
         if self.n_ground_columns:
             previous_friction, *ground_values = input_columns[
-                N_PARAMETERS + 1 : N_PARAMETERS + 1 + self.n_ground_columns
+                self.friction_index + 1 : self.friction_index + 1 + self.n_ground_columns
             ]
             column_rows += [
                 jnp.where(is_valid, previous_friction, 1.0),

@@ -25,6 +25,12 @@ from jaxtyping import Array, Bool, Float, Shaped
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Scalar
 from vrw_jax.wheel.ground import GroundAhead
+from vrw_jax.wheel.laws import (
+    compute_leg_potential,
+    evaluate_hub_torque,
+    evaluate_leg_force,
+    number_legs,
+)
 from vrw_jax.wheel.params import Symbols
 
 LegArray = Float[Array, "n_legs ..."]
@@ -285,7 +291,7 @@ def compute_free_leg_acceleration(
     """
     gravity_x, gravity_z = s.g * s.sin_phi, -s.g * s.cos_phi
     centrifugal_acceleration = (motion.L - s.a) * motion.dtheta * motion.dtheta
-    spring_force = s.k * (s.Ls - motion.L) - s.c * motion.dL
+    spring_force = evaluate_leg_force(s, motion.L, motion.dL, number_legs(motion.L))
     return (
         centrifugal_acceleration
         - (leg_directions.sin * gravity_x + leg_directions.cos * gravity_z)
@@ -299,7 +305,7 @@ def compute_free_acceleration(
     contact_slots: ContactSlots,
     inverse_inertia: ContactInverseInertia,
 ) -> FreeMotion:
-    """Return the accelerations due to gravity, springs, dampers and rotation alone.
+    """Return the accelerations due to gravity, springs, dampers, motor and rotation alone.
 
     The computation assumes that feet and stoppers of the legs in `contact_slots` exert no force.
     """
@@ -321,6 +327,8 @@ def compute_free_acceleration(
     hub_torque = -s.m * sum_over_legs(
         b * (coriolis_acceleration + cos * gravity_x - sin * gravity_z)
     )
+    if s.hub_torque is not None:
+        hub_torque = hub_torque + evaluate_hub_torque(s, dtheta)
     hub_acceleration = multiply_by_inverse_inertia(
         inverse_inertia.inverse_inertia, (hub_force_x, hub_force_z, hub_torque)
     )
@@ -456,5 +464,8 @@ def compute_potential_energy(s: Symbols, motion: WheelMotion) -> tuple[Elementwi
     leg_directions = compute_leg_directions(s, motion.theta)
     x = s.Mt * motion.x - s.m * sum_over_legs((motion.L - s.a) * leg_directions.sin)
     z = s.Mt * motion.z - s.m * sum_over_legs((motion.L - s.a) * leg_directions.cos)
-    elastic_energy = 0.5 * s.k * sum_over_legs((motion.L - s.Ls) ** 2)
+    if s.leg_force is None:
+        elastic_energy = 0.5 * s.k * sum_over_legs((motion.L - s.Ls) ** 2)
+    else:
+        elastic_energy = sum_over_legs(compute_leg_potential(s, motion.L, number_legs(motion.L)))
     return s.g * (z * s.cos_phi - x * s.sin_phi), elastic_energy

@@ -41,6 +41,12 @@ from vrw_jax.models.contact_mechanics import (
 )
 from vrw_jax.models.contact_modes import replace_infinite_friction
 from vrw_jax.wheel.ground import GroundAhead
+from vrw_jax.wheel.laws import (
+    compute_motor_work,
+    evaluate_damping_power,
+    evaluate_hub_torque,
+    number_legs,
+)
 from vrw_jax.wheel.outcomes import ContactMode, are_coordinates_at_rest, are_rates_negligible
 from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
@@ -204,9 +210,17 @@ def compute_accumulator_rates(
     slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
     slip_speeds = slip_signs * contact_forces.slot_foot_velocities.along_slope
     friction_forces = -contact_forces.force_solution.tangential_forces * slip_signs
+    s, L, dL = contact_mode_dynamics.s, motion.L, motion.dL
+    if s.leg_force is None:
+        damping_power = s.c * sum_over_legs(dL * dL)
+    else:
+        damping_power = sum_over_legs(evaluate_damping_power(s, L, dL, number_legs(L)))
+    if s.hub_torque is not None:
+        motor_power = evaluate_hub_torque(s, motion.dtheta) * motion.dtheta
+        damping_power = damping_power + compute_motor_work(s, motion.dtheta) - motor_power
     return EnergyLossAccumulators(
         time_since_event=jnp.ones_like(motion.x),
-        damping_loss=contact_mode_dynamics.s.c * sum_over_legs(motion.dL * motion.dL),
+        damping_loss=damping_power,
         friction_loss=jnp.sum(friction_forces * slip_speeds, axis=0),
         slip_length=jnp.sum(slip_speeds, axis=0),
     )

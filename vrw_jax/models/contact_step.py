@@ -86,6 +86,7 @@ def prepare_walk(
         wheel.restitution is not None,
         engine,
         measures_force_peaks,
+        jax.tree.structure(params.laws),
     )
     return walk_settings, input_columns, x
 

@@ -30,6 +30,7 @@ from vrw_jax.models.contact_integrator import (
     evaluate_dynamics,
     evaluate_guards_of_coordinates,
     iterate_until_stopped,
+    unpack_motion,
 )
 from vrw_jax.models.contact_kernel import (
     N_HEIGHT_COLUMNS,
@@ -41,6 +42,7 @@ from vrw_jax.models.contact_kernel import (
     init_lane_states,
 )
 from vrw_jax.models.contact_state import compute_guard_scales
+from vrw_jax.wheel.laws import compute_damping_coefficient
 from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import compute_wheel_units
 
@@ -292,20 +294,25 @@ def _integrate_with_tangents(
         axis=0,
     )
     stable_step_factor = stability_safety_factor * compute_real_stability_limit(tableau)
-    max_stable_step_size = jnp.where(
-        has_swing_leg,
-        stable_step_factor * contact_mode_dynamics.s.m / contact_mode_dynamics.s.c,
-        jnp.inf,
+    s = contact_mode_dynamics.s
+    limit_step_size = lambda damping: jnp.where(
+        has_swing_leg, stable_step_factor * s.m / damping, jnp.inf
     )
+    stable_step_size = limit_step_size(s.c)
 
     def try_solver_step(
         state: tuple[ContactIntervalState, Array],
     ) -> tuple[ContactIntervalState, Array]:
         contact_interval_state, tangent_rows = state
+        max_step_size = stable_step_size
+        if s.leg_force is not None:
+            motion = unpack_motion(contact_interval_state.contact_interval_point)
+            damping = jnp.max(compute_damping_coefficient(s, motion.L, motion.dL), axis=0)
+            max_step_size = limit_step_size(jnp.maximum(damping, 0.0))
         h = jnp.where(
             contact_interval_state.event_bracket.is_event_search_active,
             contact_interval_state.h,
-            jnp.minimum(contact_interval_state.h, max_stable_step_size),
+            jnp.minimum(contact_interval_state.h, max_step_size),
         )
         contact_interval_state = contact_interval_state._replace(h=h)
         stage_rows, stage_row_tangents = _evaluate_solver_stages(

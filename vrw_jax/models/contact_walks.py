@@ -17,7 +17,7 @@ from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
 from vrw_jax.models.contact_impacts import project_motion
 from vrw_jax.models.contact_integrator import pack_coordinates
-from vrw_jax.models.contact_kernel import N_PARAMETERS, BatchWalkSettings, run_walks
+from vrw_jax.models.contact_kernel import BatchWalkSettings, run_walks
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.contact_section import (
     LOCKED_CODE_OFFSET,
@@ -50,8 +50,8 @@ def walk_batch(
     walking steps, numbers of solver steps, lengths of the last step, m). The first axis of each
     array contains the wheels.
 
-    - `input_columns`: wheel parameters and friction, shape (10, wheels). On uneven ground, the walk
-      has one step, and more columns follow: see `N_HEIGHT_COLUMNS`;
+    - `input_columns`: parameters of wheels and laws, and friction, shape (inputs, wheels). On
+      uneven ground, the walk has one step, and more columns follow: see `N_HEIGHT_COLUMNS`;
     - `section_states`: full section states, shape (wheels, 4 + 3 n).
     """
     static_walk_settings = _make_static_walk_settings(
@@ -262,7 +262,7 @@ def _project_start_rates(
     start_rates_by_unit = np.tile(np.eye(3 + n_legs), (len(section_states), 1))
     repeated_states[:, 1:4] = start_rates_by_unit[:, :3]
     repeated_states[:, 4 + n_legs : 4 + 2 * n_legs] = start_rates_by_unit[:, 3:]
-    repeated_columns = np.repeat(input_columns[:N_PARAMETERS], 3 + n_legs, 1)
+    repeated_columns = np.repeat(input_columns[: len(PARAMETER_NAMES)], 3 + n_legs, 1)
     compiled_function = _compile_section_function(_compute_projected_rates, n_legs)
     rates = compiled_function.run(repeated_columns, repeated_states.T)
     rates = rates.T.reshape(len(section_states), 3 + n_legs, 3 + n_legs)
@@ -304,8 +304,9 @@ def _make_static_walk_settings(
         has_tangents,
         eqx.filter(options, eqx.is_array, inverse=True),
         None,
-        n_columns - N_PARAMETERS - 1,
+        n_columns - len(model.parameter_names),
         model.restitution is not None,
+        law_structure=jax.tree.structure(model.laws),
     )
 
 
@@ -342,7 +343,7 @@ def embed_section_states(
     if section_states.shape[1] != 3:
         return section_states
     compiled_function = _compile_section_function(embed_section_state, n_legs)
-    return compiled_function.run(input_columns[:N_PARAMETERS], section_states.T).T
+    return compiled_function.run(input_columns[: len(PARAMETER_NAMES)], section_states.T).T
 
 
 @functools.cache

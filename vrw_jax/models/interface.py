@@ -19,10 +19,13 @@ from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_results import SectionState
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import (
+    LAW_NAMES,
     PARAMETER_DOMAINS,
     PARAMETER_NAMES,
+    WheelLaws,
     WheelParams,
     WheelUnits,
+    list_law_parameters,
     make_wheel_from_parameters,
 )
 
@@ -77,7 +80,8 @@ class AbstractWheel(AbstractWalker, eqx.Module):
             if law_name in settings and law_name not in cls.__dataclass_fields__:
                 raise TypeError(
                     f"{law_name} is given, but a {cls.__name__} has no law of its own for the "
-                    f"{place}: give vrw.ViscoelasticWheel({law_name}=...)."
+                    f"{place}: give vrw.ViscoelasticWheel({law_name}=...), or another model with "
+                    "compliant legs."
                 )
         return super().__new__(cls)
 
@@ -117,14 +121,32 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         )
 
     @property
+    def laws(self) -> WheelLaws | None:
+        """Return the laws that a user gives, or None for the paper's."""
+        leg, hub = (getattr(self, law_name, None) for law_name in LAW_NAMES)
+        return None if leg is None and hub is None else WheelLaws(leg, hub)
+
+    def with_laws(self, laws: WheelLaws | None) -> Any:
+        """Return the model with other laws, such as those that `attach_laws` has added."""
+        if laws is self.laws:
+            return self
+        laws = laws or WheelLaws()
+        return eqx.tree_at(
+            lambda model: [getattr(model, law_name) for law_name in LAW_NAMES],
+            self,
+            [laws.leg, laws.hub],
+            is_leaf=lambda x: x is None,
+        )
+
+    @property
     def own_parameters(self) -> Any:
-        """Return the part of the model whose leaves are its own parameters."""
-        return None
+        """Return the values that are the model's own parameters, as a pytree."""
+        return self.laws
 
     @property
     def own_parameter_domains(self) -> dict[str, ParameterDomain]:
-        """Return the domains of these parameters by name: friction, or those of laws."""
-        return {}
+        """Return the domains of these parameters by name: those of laws, and then friction."""
+        return {x.name: x.domain for x in list_law_parameters(self.laws)}
 
     @property
     def parameter_domains(self) -> dict[str, ParameterDomain]:
@@ -149,7 +171,14 @@ class AbstractWheel(AbstractWalker, eqx.Module):
 
     def attach_laws(self, params: WheelParams) -> WheelParams:
         """Return the parameters with the laws of this model, unless they have laws already."""
-        return params
+        if params.laws is not None or self.laws is None:
+            return params
+        if self.leg_period == 2 and params.n_legs % 2:
+            raise ValueError(
+                f"n_legs is {params.n_legs}, but legs alternate only if their number is even: give "
+                "an even number, or one law for all legs."
+            )
+        return params.attach_laws(self.laws)
 
     def list_parameter_values(self, params: WheelParams) -> list[Any]:
         """Return the value of each parameter in `parameter_names`, for one wheel or a batch."""
@@ -157,8 +186,9 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         return [*wheel_values, *self._list_own_values(params)]
 
     def _list_own_values(self, params: WheelParams) -> list[Any]:
-        """Return the values of the own parameters, which are those of attached laws."""
-        return jax.tree.leaves(self.own_parameters if params.laws is None else params.laws)
+        """Return the values of the own parameters, with those of attached laws."""
+        model = self if params.laws is None else self.with_laws(params.laws)
+        return jax.tree.leaves(model.own_parameters)
 
     def get_parameter(self, params: WheelParams, parameter_name: str) -> Any:
         """Return the value of one parameter of `parameter_names`."""
@@ -186,14 +216,11 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         return model, make_wheel_from_parameters(parameter_values[:n], n_legs)
 
     def _replace_own_parameters(self, values: Any) -> "AbstractWheel":
-        if self.own_parameters is None:
-            return self
-        own_parameters = jax.tree.unflatten(jax.tree.structure(self.own_parameters), list(values))
-        return eqx.tree_at(lambda model: model.own_parameters, self, own_parameters)
+        return self.with_laws(jax.tree.unflatten(jax.tree.structure(self.laws), list(values)))
 
     def without_values(self) -> "AbstractWheel":
         """Return the model with 1 as the value of each parameter of its laws."""
-        return self
+        return self.with_laws(jax.tree.map(jnp.ones_like, self.laws))
 
     def with_parameter(
         self, params: WheelParams, parameter_name: str, parameter_value: Elementwise
@@ -207,7 +234,7 @@ class AbstractWheel(AbstractWalker, eqx.Module):
             own_values[list(self.own_parameter_domains).index(parameter_name)] = parameter_value
             model = self._replace_own_parameters(own_values)
             if params.laws is not None:
-                params = params.attach_laws(model.own_parameters)
+                params = params.attach_laws(model.laws)
             return model, params
         return self, eqx.tree_at(
             lambda wheel: getattr(wheel, parameter_name), params, parameter_value
@@ -288,8 +315,9 @@ class AbstractWheel(AbstractWalker, eqx.Module):
 
         During a gait, gravity must supply the energy that impacts and dampers take.
         """
-        slope = float(params.slope)
-        if slope > 0.0:
+        slope, hub_torque = float(params.slope), (self.laws or WheelLaws()).hub
+        has_motor = hub_torque is not None and getattr(hub_torque, "torque", 1.0) > 0.0
+        if slope > 0.0 or has_motor:
             return ""
         return (
             f"No steady gait can exist: the slope is {slope:g} rad, but impacts and dampers take "
@@ -306,8 +334,17 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         """Return the ground of each step if heights are given, or if slope or friction are arrays
         with one entry per step.
 
-        Return None otherwise, and for models that do not support uneven ground.
+        Return None otherwise, and for models that do not support uneven ground. If the legs
+        alternate, the indices of the steps precede the ground.
         """
+        step_ground = self._split_uneven_ground(params, n_steps, heights)
+        if self.leg_period == 1:
+            return step_ground
+        return (jnp.arange(n_steps), *(step_ground or ()))
+
+    def _split_uneven_ground(
+        self, params: WheelParams, n_steps: int, heights: Array | None
+    ) -> StepGroundValues | None:
         if not self.can_walk_on_uneven_ground:
             return None
         if heights is not None:
@@ -322,20 +359,42 @@ class AbstractWheel(AbstractWalker, eqx.Module):
     @property
     def leg_period(self) -> int:
         """Return the number of steps after which the legs have the same parameters again."""
-        return 1
+        return (self.laws or WheelLaws()).leg_period
+
+    def exchange_legs(self, parameter_matrix: np.ndarray) -> None:
+        """Change a matrix of parameters, whose rows have the order of `parameter_names`, to those
+        of the next step, if the legs alternate.
+        """
+        if self.leg_period == 2:
+            turns = parameter_matrix[self.parameter_names.index("leg.turn")]
+            turns[:] = turns < 0.5
 
     def select_params(self, params: WheelParams, step_index: Array | int) -> WheelParams:
         """Return the parameters in a step of a walk, which differ from step to step if the legs
         alternate.
         """
-        return params
+        laws = self.attach_laws(params).laws
+        if laws is None or self.leg_period == 1:
+            return params
+        return params.attach_laws(laws.exchange_legs(step_index % 2))
 
     def with_step_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["AbstractWheel", WheelParams]:
-        """Return the model and the wheel on the ground of one walking step.
+        """Return the model and the wheel on the ground of one walking step, with its legs.
 
-        `step_ground` contains values of the slope that `select_stance_line` separates.
+        `step_ground` contains the values of one step from `split_ground_by_step`.
+        """
+        if self.leg_period > 1:
+            params = self.select_params(params, step_ground[0])
+            step_ground = step_ground[1:]
+        return self._put_on_ground(params, step_ground) if step_ground else (self, params)
+
+    def _put_on_ground(
+        self, params: WheelParams, step_ground: StepGroundValues
+    ) -> tuple["AbstractWheel", WheelParams]:
+        """Return the model and the wheel with values of the slope that `select_stance_line`
+        separates.
         """
         return self, eqx.tree_at(lambda wheel: wheel.slope, params, step_ground[0])
 

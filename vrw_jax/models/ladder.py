@@ -38,6 +38,7 @@ from vrw_jax.models.unilateral_wheel import (
     UnilateralWheel,
 )
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel.laws import convert_hub_torque, convert_leg_force
 from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import WheelParams, convert_friction
 
@@ -223,7 +224,9 @@ class LadderWheel(AbstractContactWheel):
     is computed with the unilateral model and the coefficient `friction`. Section states are those
     of `UnilateralWheel`; section states of the paper, which have three entries, are also accepted.
 
-    - `friction`: friction coefficient of the ground, `inf` for feet that never slide.
+    - `friction`: friction coefficient of the ground, `inf` for feet that never slide;
+    - `leg_force`, `hub_torque`: laws of the legs and of the hub in both models, as in
+      `ViscoelasticWheel`.
 
     Examples:
         >>> wheel = vrw.LadderWheel(friction=50.0)
@@ -238,17 +241,26 @@ class LadderWheel(AbstractContactWheel):
     can_walk_on_uneven_ground = False
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
+    leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
+    hub_torque: Any = eqx.field(converter=convert_hub_torque, default=None)
 
     if TYPE_CHECKING:
 
-        def __init__(self, friction: RealInput = 0.7) -> None: ...
+        def __init__(
+            self, friction: RealInput = 0.7, leg_force: Any = None, hub_torque: Any = None
+        ) -> None: ...
+
+    @property
+    def viscoelastic_model(self) -> ViscoelasticWheel:
+        """Return the viscoelastic model, which is used where it is valid."""
+        return ViscoelasticWheel().with_laws(self.laws)
 
     @property
     def unilateral_model(self) -> UnilateralWheel:
         """Return the unilateral model, which is used if the viscoelastic model is not valid for a
         step.
         """
-        return UnilateralWheel(friction=self.friction)
+        return UnilateralWheel(friction=self.friction).with_laws(self.laws)
 
     @property
     def fallback_model(self) -> UnilateralWheel:
@@ -258,7 +270,7 @@ class LadderWheel(AbstractContactWheel):
         self, params: WheelParams, x: FullState, options: StepOptions
     ) -> tuple[ModelChoice, StepResult]:
         """Return the selected model, and the step computed with the viscoelastic model."""
-        viscoelastic_model = ViscoelasticWheel()
+        viscoelastic_model = self.viscoelastic_model
         ground_friction = self.friction.astype(x.dtype)
         # Leg 1 alone must be loaded and at rest, with all other legs on their stoppers.
         is_leg_1 = jnp.arange(params.n_legs) == 0
@@ -365,6 +377,7 @@ class LadderWheel(AbstractContactWheel):
             model_choice.model_code == ModelCode.VISCOELASTIC, jnp.inf, self.friction
         )
         unilateral_wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
+        unilateral_wheel = unilateral_wheel.with_laws(self.laws)
         trajectory = unilateral_wheel.sample_step(params, x, options, n_samples)
         return dataclasses.replace(
             trajectory, model_selection=model_choice.collect_selection_codes()

@@ -49,7 +49,7 @@ from vrw_jax.models.batch_stiffness import (
     SolverIndex,
     select_cheapest_solver,
 )
-from vrw_jax.models.contact_batch import CONTACT_STEP_INPUT_NAMES, step_batch_with_contact
+from vrw_jax.models.contact_batch import step_batch_with_contact
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.stepping import (
     convert_heights,
@@ -169,6 +169,7 @@ def step_batch(
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
+    params = checked_model.attach_laws(params)
     checked_section_states = convert_section_state(states, "states", check_numpy_reals)
     values_by_parameter = _check_parameter_shapes(
         params, checked_section_states, checked_model, options, n_steps
@@ -188,11 +189,7 @@ def step_batch(
             )
         element_heights = element_heights.astype(dtype, copy=False)
     has_contact_kernel = checked_model.batch_kernel == "legs"
-    known_input_names = (
-        CONTACT_STEP_INPUT_NAMES
-        if has_contact_kernel
-        else (START_INPUT_NAME, *checked_model.parameter_names)
-    )
+    known_input_names = START_INPUT_NAME, *checked_model.parameter_names
     known_input_names += ("heights",) * (element_heights is not None)
     for derivative_name in derivatives:
         if derivative_name not in known_input_names:
@@ -375,9 +372,8 @@ def _step_batch_without_contact(
         active_lanes = walk_batch.find_walking_lanes()
         if is_ground_uneven:
             parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
-        if k > 0 and model.leg_period == 2:
-            turns = parameter_matrix[model.parameter_names.index("leg.turn")]
-            turns[:] = turns < 0.5
+        if k > 0:
+            model.exchange_legs(parameter_matrix)
         for solver_index, (_, take_lane_steps) in engine_by_solver.items():
             lane_indices = active_lanes[solver_indices[active_lanes] == solver_index]
             if not len(lane_indices):
@@ -465,7 +461,7 @@ def _select_batch_engine(
     ) -> tuple[np.ndarray, ...]:
         compiled_step = _compile_lane_step(
             model.stop_at_lift_off,
-            find_law_structure(model, n_legs),
+            jax.tree.structure(model.laws),
             n_legs,
             input_indices,
             len(ground_inputs),
@@ -606,11 +602,6 @@ def _step_lanes_by_diffrax(
     )
 
 
-def find_law_structure(model: AbstractWheel, n_legs: int) -> Any:
-    """Return the structure of a model's laws, whose values follow the parameters of the wheel."""
-    return jax.tree.structure(model.attach_laws(WheelParams(n_legs=n_legs)).laws)
-
-
 @eqx.filter_jit
 def _step_elements_by_vmap(
     model: AbstractWheel,
@@ -627,7 +618,7 @@ def _step_elements_by_vmap(
     - `step_input_matrix`: inputs of the step, shape (elements, inputs);
     - `input_indices`: indices of the inputs with respect to which the Jacobian is computed.
     """
-    law_structure: Any = find_law_structure(model, n_legs)
+    law_structure: Any = jax.tree.structure(model.laws)
     n_parameters = len(PARAMETER_NAMES) + law_structure.num_leaves
 
     def step_one_element(step_inputs: Array) -> tuple[Array, ...]:

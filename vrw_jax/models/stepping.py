@@ -44,7 +44,7 @@ from vrw_jax.models.registry import describe_accepted_models
 from vrw_jax.models.step_results import SectionState, StepResult
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel.params import WheelLaws, WheelParams, list_law_parameters
+from vrw_jax.wheel.params import WheelParams, list_law_parameters
 
 SectionStateLike = Array | np.ndarray | Sequence[float]
 """Section state in any form that users may pass.
@@ -102,8 +102,7 @@ def convert_model_argument(
             "number, or vary it in a design of vrw.scan; vrw.step_batch takes one for each "
             "element, vrw.walk one for each of its steps."
         )
-    laws = model.own_parameters if isinstance(model.own_parameters, WheelLaws) else None
-    for law_parameter in list_law_parameters(laws):
+    for law_parameter in list_law_parameters(model.laws):
         if jnp.ndim(law_parameter.value) and not allows_friction_arrays:
             raise ValueError(
                 f"{law_parameter.name} has shape {jnp.shape(law_parameter.value)}, but this call "

@@ -419,6 +419,7 @@ def _compute_contact_columns(
 
     The samples have the shape (phase, sample) or (phase, sample, leg).
     """
+    params = model.attach_laws(params)
     s, trajectory = params.symbols(), model.sample_step(params, x, options, n_samples)
 
     def compute_state_quantities(y: PackedState) -> dict[str, Array]:

@@ -42,6 +42,7 @@ from vrw_jax.models.interface import (
 )
 from vrw_jax.models.step_results import PAPER_START_STATE
 from vrw_jax.models.viscoelastic import can_use_batch_kernel
+from vrw_jax.wheel.laws import convert_hub_torque, convert_leg_force
 from vrw_jax.wheel.params import (
     FRICTION_DOMAIN,
     FRICTION_NAME,
@@ -112,11 +113,16 @@ class AbstractContactWheel(AbstractWheel):
 
     @property
     def own_parameters(self) -> Any:
-        return self.friction
+        return self.laws, self.friction
 
     @property
     def own_parameter_domains(self) -> dict[str, ParameterDomain]:
-        return {FRICTION_NAME: FRICTION_DOMAIN}
+        return super().own_parameter_domains | {FRICTION_NAME: FRICTION_DOMAIN}
+
+    def _replace_own_parameters(self, values: Any) -> "AbstractContactWheel":
+        *law_values, friction = values
+        model = super()._replace_own_parameters(law_values)
+        return eqx.tree_at(lambda model: model.friction, model, friction)
 
     def explain_impossible_gait(self, params: WheelParams) -> str:
         """Return a sentence that states why one wheel can't have a gait, or "" if it may have one.
@@ -181,6 +187,7 @@ class UnilateralWheel(AbstractContactWheel):
     - `infinite_friction_rule`: meaning of infinite friction. "limit" is the limit of large
       friction. "paper" is the rule (A1) to (A4) of the paper, extended to cases that the rule does
       not cover;
+    - `leg_force`, `hub_torque`: laws of the legs and of the hub, as in `ViscoelasticWheel`;
     - `uneven`: differences between footholds on uneven ground. `vrw.walk` sets this field from the
       slopes or heights and the friction coefficients of the steps.
 
@@ -193,7 +200,14 @@ class UnilateralWheel(AbstractContactWheel):
 
     model_name: ClassVar[str] = "unilateral"
     commands = frozenset({"scan", "tune", "branch", "explore"})
-    fixed_fields_of_tolerance = ("restitution", "infinite_friction_rule", "uneven", "max_events")  # type: ignore[assignment]
+    fixed_fields_of_tolerance = (  # type: ignore[assignment]
+        "restitution",
+        "infinite_friction_rule",
+        "uneven",
+        "max_events",
+        "leg_force",
+        "hub_torque",
+    )
     batch_kernel: ClassVar[str] = "legs"
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
@@ -203,6 +217,8 @@ class UnilateralWheel(AbstractContactWheel):
     stoppers: str = eqx.field(static=True, default=STOPPERS_BILATERAL)
     restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
     infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
+    leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
+    hub_torque: Any = eqx.field(converter=convert_hub_torque, default=None)
     uneven: UnevenGround | None = None
 
     if TYPE_CHECKING:
@@ -214,6 +230,8 @@ class UnilateralWheel(AbstractContactWheel):
             stoppers: Literal["bilateral", "one-sided"] = "bilateral",
             restitution: RealInput | None = None,
             infinite_friction_rule: Literal["limit", "paper"] = "limit",
+            leg_force: Any = None,
+            hub_torque: Any = None,
             uneven: UnevenGround | None = None,
         ) -> None: ...
 
@@ -237,8 +255,8 @@ class UnilateralWheel(AbstractContactWheel):
         """Return whether infinite friction means the rule (A1)-(A4) of the paper."""
         return self.infinite_friction_rule == FRICTION_PAPER_RULE
 
-    def split_ground_by_step(
-        self, params: WheelParams, n_steps: int, heights: Array | None = None
+    def _split_uneven_ground(
+        self, params: WheelParams, n_steps: int, heights: Array | None
     ) -> StepGroundValues | None:
         """Return the ground under each step, or None on flat ground with one friction coefficient.
 
@@ -264,7 +282,7 @@ class UnilateralWheel(AbstractContactWheel):
             return line_slopes[:-1], friction, previous_friction, rises[:-1], rises[1:]
         return line_slopes[:-1], friction, previous_friction, line_slopes[1:] - line_slopes[:-1]
 
-    def with_step_ground(
+    def _put_on_ground(
         self, params: WheelParams, step_ground: StepGroundValues
     ) -> tuple["UnilateralWheel", WheelParams]:
         slope, friction, previous_friction, *ground = step_ground
@@ -301,18 +319,20 @@ class UnilateralWheel(AbstractContactWheel):
         """Return the results of one step, and the name of the engine that computed them."""
         engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
         take_step = _compile_step(is_detailed, engine, measures_force_peaks)
-        return take_step(self._with_friction_of_type(x), params, x, options), engine
+        return take_step(self._without_laws(x), self.attach_laws(params), x, options), engine
 
-    def _with_friction_of_type(self, x: FullState) -> "UnilateralWheel":
+    def _without_laws(self, x: FullState) -> "UnilateralWheel":
+        """Return the model for a program, which takes the laws as part of the parameters."""
         # `dataclasses.replace` would validate friction again, which may be traced.
-        return eqx.tree_at(lambda wheel: wheel.friction, self, self.friction.astype(x.dtype))
+        friction = self.friction.astype(x.dtype)
+        return eqx.tree_at(lambda wheel: wheel.friction, self.with_laws(None), friction)
 
     def sample_step(
         self, params: WheelParams, x: FullState, options: StepOptions, n_samples: int
     ) -> UnilateralTrajectory:
         sample_step = build_contact_step_sampler(not can_use_batch_kernel(options), n_samples)
         contact_interval_log, step_summary, outcome, states, tangential_forces, normal_forces = (
-            sample_step(self._with_friction_of_type(x), params, x, options)
+            sample_step(self._without_laws(x), self.attach_laws(params), x, options)
         )
         durations = contact_interval_log.durations
         start_times = jnp.concatenate([jnp.zeros((1,)), jnp.cumsum(durations)[:-1]])

@@ -23,7 +23,6 @@ from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
@@ -41,7 +40,7 @@ from vrw_jax.flow.tableaus import (
     load_explicit_tableau,
 )
 from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
-from vrw_jax.models.interface import AbstractWheel, StepGroundValues
+from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_sequence import (
     PhaseResult,
     PhaseRunner,
@@ -63,10 +62,8 @@ from vrw_jax.wheel.dynamics import Motion
 from vrw_jax.wheel.laws import convert_hub_torque, convert_leg_force
 from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
-    WheelLaws,
     WheelParams,
     compute_wheel_units,
-    list_law_parameters,
     require_known_friction,
 )
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant
@@ -115,75 +112,6 @@ class ViscoelasticWheel(AbstractWheel):
     )
     leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
     hub_torque: Any = eqx.field(converter=convert_hub_torque, default=None)
-
-    @property
-    def own_parameters(self) -> WheelLaws | None:
-        has_laws = self.leg_force is not None or self.hub_torque is not None
-        return WheelLaws(self.leg_force, self.hub_torque) if has_laws else None
-
-    @property
-    def own_parameter_domains(self) -> dict[str, ParameterDomain]:
-        return {x.name: x.domain for x in list_law_parameters(self.own_parameters)}
-
-    def explain_impossible_gait(self, params: WheelParams) -> str:
-        torque = getattr(self.hub_torque, "torque", None)
-        has_motor = self.hub_torque is not None and not (torque is not None and torque <= 0.0)
-        return "" if has_motor else super().explain_impossible_gait(params)
-
-    def attach_laws(self, params: WheelParams) -> WheelParams:
-        if params.laws is not None or self.own_parameters is None:
-            return params
-        if self.own_parameters.leg_period == 2 and params.n_legs % 2:
-            raise ValueError(
-                f"n_legs is {params.n_legs}, but legs alternate only if their number is even: give "
-                "an even number, or one law for all legs."
-            )
-        return params.attach_laws(self.own_parameters)
-
-    @property
-    def leg_period(self) -> int:
-        return WheelLaws(self.leg_force).leg_period
-
-    def select_params(self, params: WheelParams, step_index: Array | int) -> WheelParams:
-        laws = self.attach_laws(params).laws
-        if laws is None or self.leg_period == 1:
-            return params
-        return params.attach_laws(laws.exchange_legs(step_index % 2))
-
-    def split_ground_by_step(
-        self, params: WheelParams, n_steps: int, heights: Array | None = None
-    ) -> StepGroundValues | None:
-        step_ground = super().split_ground_by_step(params, n_steps, heights)
-        if self.leg_period == 1:
-            return step_ground
-        return (jnp.arange(n_steps), *(step_ground or ()))
-
-    def with_step_ground(
-        self, params: WheelParams, step_ground: StepGroundValues
-    ) -> tuple[AbstractWheel, WheelParams]:
-        if self.leg_period == 1:
-            return super().with_step_ground(params, step_ground)
-        step_index, *ground = step_ground
-        params = self.select_params(params, step_index)
-        return super().with_step_ground(params, tuple(ground)) if ground else (self, params)
-
-    def _replace_own_parameters(self, values: Any) -> "ViscoelasticWheel":
-        return self.with_laws(
-            jax.tree.unflatten(jax.tree.structure(self.own_parameters), list(values))
-        )
-
-    def without_values(self) -> "ViscoelasticWheel":
-        return self.with_laws(jax.tree.map(jnp.ones_like, self.own_parameters))
-
-    def with_laws(self, laws: WheelLaws | None) -> "ViscoelasticWheel":
-        """Return the model with other laws, such as those that `attach_laws` has added."""
-        laws = laws or WheelLaws()
-        return eqx.tree_at(
-            lambda model: (model.leg_force, model.hub_torque),
-            self,
-            (laws.leg, laws.hub),
-            is_leaf=lambda x: x is None,
-        )
 
     def compute_default_start(self, params: WheelParams) -> SectionState:
         """Return a section state near the gait of Table 1 of the paper, inside its basin of
@@ -288,7 +216,7 @@ def _compute_step(
     options: StepOptions,
     records_margins: bool,
 ) -> Any:
-    if model.own_parameters is not None:
+    if model.laws is not None:
         # Programs take the numbers of the laws as part of the parameters.
         params = model.attach_laws(params)
         model = model.with_laws(None)

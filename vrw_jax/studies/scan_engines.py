@@ -37,7 +37,6 @@ from vrw_jax.lanes.batching import (
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.ladder import ModelCode, find_selection_reason
 from vrw_jax.models.measures import PASSAGE_MEASURES, SELECTION_MARGIN_NAMES
-from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.studies.first_passage import first_passage
 from vrw_jax.studies.lower_fidelity import ModelIndex
 from vrw_jax.studies.measure_catalog import (
@@ -157,6 +156,7 @@ class ModelSelectionScanEngine:
 
     def __init__(self, evaluation_request: EvaluationRequest, n_threads: int) -> None:
         self._measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
+        self._paper_model = self._wheel_model.viscoelastic_model
         paper_measure_names = (
             paper_measure
             for measure_name in self._measure_names
@@ -167,7 +167,7 @@ class ModelSelectionScanEngine:
         self._paper_engine = CollocationScanEngine(
             evaluation_request._replace(
                 measure_names=tuple(dict.fromkeys(paper_measure_names)),
-                wheel_model=ViscoelasticWheel(),
+                wheel_model=self._paper_model,
             ),
             n_threads,
         )
@@ -221,7 +221,7 @@ class ModelSelectionScanEngine:
             _find_selection_reason,
             (batch_sizes.GAIT_READ_BATCH_SIZE,),
             {name: paper_results[name] for name in (*SELECTION_MARGIN_NAMES, "outcome")},
-            friction - ViscoelasticWheel().friction,
+            friction - self._paper_model.friction,
         )
         return reasons.astype(np.int8)
 

@@ -24,9 +24,9 @@ from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel.laws import (
     compute_leg_potential,
+    evaluate_damping_power,
     evaluate_hub_torque,
     evaluate_leg_force,
-    evaluate_stopper_preload,
 )
 from vrw_jax.wheel.params import Symbols
 
@@ -523,7 +523,10 @@ def compute_stopper_force(
     law at rest. The weight and the acceleration of the leg's mass reduce the force.
     """
     legs = np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.L1))
-    spring_force = s.k * (s.Ls - s.L0) if s.leg_force is None else evaluate_stopper_preload(s, legs)
+    if s.leg_force is None:
+        spring_force = s.k * (s.Ls - s.L0)
+    else:
+        spring_force = evaluate_leg_force(s, s.L0, 0.0 * s.L0, legs)
     leg_angles = s.alpha * (legs - 1)
     fore_leg = rotate_to_vertical(s, motion.sin_theta, motion.cos_theta)
     # Gravity is subtracted from the acceleration of the hub, in the frame of Leg 1.
@@ -591,8 +594,5 @@ def compute_damping_power(s: Symbols, motion: Motion) -> Elementwise:
     """
     if s.leg_force is None:
         return s.c * (motion.dL1 * motion.dL1 + motion.dL2 * motion.dL2)
-    force_1, force_2 = compute_leg_forces(s, motion)
-    rest_force_1, rest_force_2 = compute_leg_forces(
-        s, motion._replace(dL1=0.0 * motion.dL1, dL2=0.0 * motion.dL2)
-    )
-    return (rest_force_1 - force_1) * motion.dL1 + (rest_force_2 - force_2) * motion.dL2
+    power_1 = evaluate_damping_power(s, motion.L1, motion.dL1)
+    return power_1 + evaluate_damping_power(s, motion.L2, motion.dL2, 2)

@@ -173,20 +173,41 @@ def _exchange_legs(leg_force: Any) -> Any:
     return leg_force.exchange() if hasattr(leg_force, "exchange") else leg_force
 
 
-def evaluate_leg_force(
-    s: Symbols, L: Elementwise, dL: Elementwise, leg_number: int = 1
+def _apply_to_legs(
+    s: Symbols, evaluate: Callable[[Any], Elementwise], leg_numbers: int | np.ndarray
 ) -> Elementwise:
-    """Return the force of a user's law along a leg, N; positive pushes the hub off the foot."""
-    leg_force = s.leg_force if leg_number % 2 else _exchange_legs(s.leg_force)
-    return leg_force(L, dL, _collect_law_parameters(s))
+    """Return a function of the law of each leg, whose even legs may have another law."""
+    has_odd_number = leg_numbers % 2 == 1
+    other_law = _exchange_legs(s.leg_force)
+    if other_law is s.leg_force or np.all(has_odd_number):
+        return evaluate(s.leg_force)
+    if not np.any(has_odd_number):
+        return evaluate(other_law)
+    return jnp.where(has_odd_number, evaluate(s.leg_force), evaluate(other_law))
 
 
-def evaluate_stopper_preload(s: Symbols, leg_numbers: np.ndarray) -> Elementwise:
-    """Return the force of a user's law along legs at rest on their stoppers, N."""
-    odd_force, even_force = (evaluate_leg_force(s, s.L0, 0.0 * s.L0, i) for i in (1, 2))
-    if _exchange_legs(s.leg_force) is s.leg_force:
-        return odd_force
-    return jnp.where(leg_numbers % 2 == 1, odd_force, even_force)
+def evaluate_leg_force(
+    s: Symbols, L: Elementwise, dL: Elementwise, leg_numbers: int | np.ndarray = 1
+) -> Elementwise:
+    """Return the force along legs, N; positive pushes the hub off the foot.
+
+    It is the force of spring and damper (eq. 3 of the paper), or that of a user's law.
+    """
+    if s.leg_force is None:
+        return s.k * (s.Ls - L) - s.c * dL
+    params = _collect_law_parameters(s)
+    return _apply_to_legs(s, lambda law: law(L, dL, params), leg_numbers)
+
+
+def compute_damping_coefficient(s: Symbols, L: Elementwise, dL: Elementwise) -> Elementwise:
+    """Return minus the derivative of a user's force along each leg by its rate, N s/m."""
+    evaluate = lambda dL: evaluate_leg_force(s, L, dL, number_legs(L))
+    return -jax.jvp(evaluate, (dL,), (jnp.ones_like(dL),))[1]
+
+
+def number_legs(leg_template: Elementwise) -> np.ndarray:
+    """Return the number of each leg, whose axis is the first, with further axes of length 1."""
+    return np.arange(1, len(leg_template) + 1).reshape(-1, *(1,) * (jnp.ndim(leg_template) - 1))
 
 
 def evaluate_hub_torque(s: Symbols, dtheta: Elementwise) -> Elementwise:
@@ -206,22 +227,32 @@ _POTENTIAL_NODES, _POTENTIAL_WEIGHTS = np.polynomial.legendre.leggauss(16)
 """Gauss's rule for the potential of a law, which is exact to round-off for smooth forces."""
 
 
-def compute_leg_potential(s: Symbols, L: Elementwise, leg_number: int = 1) -> Elementwise:
-    """Return the elastic energy of a leg with a user's law, J.
+def compute_leg_potential(
+    s: Symbols, L: Elementwise, leg_numbers: int | np.ndarray = 1
+) -> Elementwise:
+    """Return the elastic energy of legs with a user's law, J.
 
     If the law has no method `potential(L, params)`, the energy is the work that compresses the leg
     slowly from its locked length: the integral of the force at rest.
     """
-    leg_force = s.leg_force if leg_number % 2 else _exchange_legs(s.leg_force)
-    if hasattr(leg_force, "potential"):
-        return leg_force.potential(L, _collect_law_parameters(s))
+    if hasattr(s.leg_force, "potential"):
+        params = _collect_law_parameters(s)
+        return _apply_to_legs(s, lambda law: law.potential(L, params), leg_numbers)
     half_compression = 0.5 * (s.L0 - L)
     zero_rate = 0.0 * L
     energy = zero_rate
     for node, weight in zip(_POTENTIAL_NODES.tolist(), _POTENTIAL_WEIGHTS.tolist(), strict=True):
         length = L + half_compression * (1.0 + node)
-        energy = energy + weight * evaluate_leg_force(s, length, zero_rate, leg_number)
+        energy = energy + weight * evaluate_leg_force(s, length, zero_rate, leg_numbers)
     return half_compression * energy
+
+
+def evaluate_damping_power(
+    s: Symbols, L: Elementwise, dL: Elementwise, leg_numbers: int | np.ndarray = 1
+) -> Elementwise:
+    """Return the power of a user's force at rest minus that of the force along each leg, W."""
+    rest_force, force = (evaluate_leg_force(s, L, x, leg_numbers) for x in (0.0 * dL, dL))
+    return (rest_force - force) * dL
 
 
 def convert_leg_force(leg_force: Any) -> Any:

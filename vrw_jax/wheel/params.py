@@ -394,10 +394,7 @@ class WheelParams(AbstractPrintable):
         """Return the parameters by their symbols in the paper, and quantities that several formulas
         share.
         """
-        laws = self.laws or WheelLaws()
-        return compute_symbols(self.n_legs, **self._parameters)._replace(
-            leg_force=laws.leg, hub_torque=laws.hub
-        )
+        return add_laws(compute_symbols(self.n_legs, **self._parameters), self.laws)
 
 
 def _square_relative_parameters(
@@ -452,6 +449,12 @@ def compute_symbols(
         cos_alpha=math.cos(alpha),
         alpha=alpha,
     )
+
+
+def add_laws(s: Symbols, laws: WheelLaws | None) -> Symbols:
+    """Return symbols whose forces are those of a user's laws, or the paper's for None."""
+    laws = laws or WheelLaws()
+    return s._replace(leg_force=laws.leg, hub_torque=laws.hub)
 
 
 PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETER_DOMAINS)
