@@ -17,6 +17,7 @@ import xarray as xr
 from support.walkers import BALL_PARAMS, BALL_SYSTEM, GRAVITY, SIMPLEST_WALKER, JuggledBall
 
 import vrw_jax as vrw
+from vrw_jax.hybrid import Guard, Mode
 
 
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
@@ -234,3 +235,55 @@ def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels
 def test_what_is_missing_is_said_in_one_sentence(call, message):
     with pytest.raises((TypeError, ValueError), match=message):
         call()
+
+
+RISING_BALL = vrw.HybridSystem(
+    modes={
+        "flight": Mode(
+            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
+            {
+                "impact": Guard(
+                    lambda y, p: y[0] - p["rise"],
+                    lambda y, p: jnp.stack([0.0 * y[0], -0.9 * y[1]]),
+                    armed=lambda y, p: -y[1],
+                )
+            },
+        )
+    },
+    section="impact",
+    state=("height", "velocity"),
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
+    ground={"height": "rise"},
+)
+"""A ball that bounces on stairs, whose velocity after a bounce is 0.9 sqrt(v^2 - 2 g rise)."""
+
+
+def test_heights_of_footholds_are_rises_in_walks_trajectories_and_batches():
+    """The reference is the closed form of a fall between two heights."""
+    heights = np.array([[0.3, 0.1, 0.2, -0.4], [0.0, 0.0, 0.05, 0.0]])
+    expected = np.full((2, 1), 3.0)
+    for rise in np.diff(heights).T:
+        expected = 0.9 * np.sqrt(expected**2 - 2.0 * GRAVITY * rise[:, None])
+    batch = vrw.step_batch(
+        {"rise": 0.0}, np.full((2, 1), 3.0), 3, model=RISING_BALL, heights=heights
+    )
+    np.testing.assert_allclose(batch.section_state, expected, rtol=1e-9)
+    rises = {"rise": np.diff(heights)}
+    stepwise = vrw.step_batch(rises, np.full((2, 1), 3.0), 3, model=RISING_BALL)
+    np.testing.assert_array_equal(stepwise.section_state, batch.section_state)
+    walk = vrw.walk({"rise": 0.0}, [3.0], 3, model=RISING_BALL, heights=heights[0])
+    np.testing.assert_allclose(walk.steps.section_state[-1], expected[0], rtol=1e-9)
+    trajectory = vrw.simulate({"rise": 0.0}, [3.0], 3, model=RISING_BALL, heights=heights[0])
+    # The last sample is just before the last bounce.
+    np.testing.assert_allclose(trajectory.velocity[-1], -expected[0] / 0.9, rtol=1e-9)
+
+
+def test_heights_that_fit_no_walk_are_refused():
+    walk = lambda model, heights: vrw.walk({"rise": 0.0}, [3.0], 3, model=model, heights=heights)
+    with pytest.raises(ValueError, match="give 4 heights"):
+        walk(RISING_BALL, [0.0, 0.1, 0.2])
+    with pytest.raises(ValueError, match="does not declare what they change"):
+        walk(dataclasses.replace(RISING_BALL, ground={}), np.zeros(4))
+    with pytest.raises(ValueError, match="property of the ground"):
+        dataclasses.replace(RISING_BALL, ground={"hight": "rise"})

@@ -15,6 +15,7 @@ from vrw_jax.base.checks import check_reals, check_type
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import replace_tree_parameter
 
 
 class AdvanceResult(eqx.Module):
@@ -61,7 +62,9 @@ class AbstractWalker(abc.ABC):
     - `starts`: method that returns section coordinates from which the search for a gait begins, as
       rows with the best first, for given parameters;
     - `invariants`: functions of section coordinates and parameters that a step conserves;
-    - `measures`: measures of a gait, see `vrw.measure`.
+    - `measures`: measures of a gait, see `vrw.measure`;
+    - `ground`: `{"height": name}` names the parameter that is the rise from the foothold of a step
+      to the next one, so that walks and batches take `heights`.
 
     Parameters are a tree of numbers, such as a dictionary or an `equinox.Module`.
 
@@ -82,6 +85,7 @@ class AbstractWalker(abc.ABC):
     starts: Callable[..., Any] | None = None
     invariants: Sequence[Callable[..., Any]] = ()
     measures: Sequence[Measure] = ()
+    ground: Mapping[str, str] = {}
 
     @abc.abstractmethod
     def advance(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
@@ -97,6 +101,24 @@ class AbstractWalker(abc.ABC):
         - `step_parameters`: those that differ from step to step; the others are in `params`.
         """
         return self, eqx.combine(step_parameters, params)
+
+    def put_on_heights(self, params: Any, heights: Any, n_steps: int) -> Any:
+        """Return the parameters with the rises between footholds, one for each step of a walk.
+
+        - `heights`: heights of the footholds on the last axis, from that at the start of the walk.
+        """
+        if "height" not in self.ground:
+            raise ValueError(
+                "heights are given, but the walker does not declare what they change: give it "
+                'ground={"height": "rise"}, with the name of its parameter.'
+            )
+        heights = check_reals("heights", heights, "give one height for each foothold, in m")
+        if heights.ndim == 0 or heights.shape[-1] != n_steps + 1:
+            raise ValueError(
+                f"heights have shape {heights.shape}, but a walk of {n_steps} steps begins and "
+                f"ends on a foothold: give {n_steps + 1} heights."
+            )
+        return replace_tree_parameter(params, self.ground["height"], jnp.diff(heights))
 
     def evaluate_invariants(self, params: Any, x: Array) -> Array:
         """Return the quantities that a step conserves."""

@@ -132,6 +132,8 @@ class HybridSystem(AbstractWalker):
     - `starts`: function of the parameters that returns section coordinates, one row for each start,
       from which the search for a gait begins if no guess is given;
     - `measures`: measures of its gaits, see `vrw.measure`;
+    - `ground`: `{"height": name}` names the parameter that is the rise from the foothold of a step
+      to the next one;
     - `max_events`: largest number of events in one step.
 
     Examples:
@@ -159,6 +161,7 @@ class HybridSystem(AbstractWalker):
     coordinates: Mapping[str, str] = dataclasses.field(default_factory=dict)
     starts: Callable[[Any], Any] | None = None
     measures: Sequence[Measure] = ()
+    ground: Mapping[str, str] = dataclasses.field(default_factory=dict)
     max_events: int = MAX_EVENTS_PER_STEP
 
     def __post_init__(self) -> None:
@@ -188,6 +191,8 @@ class HybridSystem(AbstractWalker):
                 if guard.target_mode is not None:
                     require_known_name(guard.target_mode, tuple(self.modes), "mode")
         require_known_name(self.section, tuple(self.guard_names), "guard")
+        for name in self.ground:
+            require_known_name(name, ("height",), "property of the ground")
         for measure in self.measures:
             check_type("a measure", measure, Measure, "decorate its function with vrw.measure")
             if measure.phase:

@@ -126,7 +126,8 @@ def step_batch(
     respect to such an array have the axis over gait steps last.
 
     For a walker of yours, `params` are its parameters, and `states` are section coordinates. The
-    only engine is "lanes", without derivatives.
+    only engine is "lanes", without derivatives. A parameter of shape (elements, n_steps) has a
+    value for each step. With `ground`, the walker takes `heights` of shape (elements, n_steps + 1).
 
     Args:
         params: parameters of the wheels. Each field is a scalar or has the shape (elements,); the
@@ -160,11 +161,13 @@ def step_batch(
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps, options = check_int("n_steps", n_steps), convert_step_options(options)
     if is_own_walker(model):
-        if heights is not None or derivatives or engine == "diffrax":
+        if derivatives or engine == "diffrax":
             raise ValueError(
-                "heights, derivatives and engine are for models of the wheel only: differentiate "
+                "derivatives and engine are for models of the wheel only: differentiate "
                 "vrw.step of your walker, and map it with jax.vmap."
             )
+        if heights is not None:
+            params = model.put_on_heights(check_parameters(params), heights, n_steps)
         return _step_batch_of_own_walker(model, params, states, n_steps, options)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
@@ -225,15 +228,22 @@ def _step_batch_of_own_walker(
             "arrays have one common length: give states of shape (batch, n)."
         )
     (n_elements,) = lengths
+    for leaf in jax.tree.leaves(params):
+        if leaf.ndim > 1 and leaf.shape[1:] != (n_steps,):
+            raise ValueError(
+                f"a parameter has shape {leaf.shape}, but there are {n_elements} elements and "
+                f"{n_steps} steps: give one number, {n_elements}, or one for each step of each."
+            )
     x = np.array(np.broadcast_to(states, (n_elements, states.shape[-1])))
     outcome, n_stepped, solver_steps = (np.zeros(n_elements, np.int32) for _ in range(3))
     durations = np.zeros((n_elements, 0))
     arrays, numbers = eqx.partition(params, lambda leaf: leaf.ndim > 0)
-    for _ in range(n_steps):
+    for k in range(n_steps):
         walking = np.flatnonzero(outcome == Outcome.STEPPED)
         if not walking.size:
             break
-        rows = eqx.combine(select_tree_rows(arrays, walking), numbers)
+        of_step = jax.tree.map(lambda leaf, k=k: leaf[:, k] if leaf.ndim > 1 else leaf, arrays)
+        rows = eqx.combine(select_tree_rows(of_step, walking), numbers)
         step = step_batch_of_walker(walker, rows, x[walking], options)
         if not durations.size:
             durations = np.zeros((n_elements, step.durations.shape[-1]))

@@ -529,12 +529,9 @@ def convert_own_walk_arguments(
 
     The ground of the steps consists of the parameters that are arrays.
     """
-    if heights is not None:
-        raise ValueError(
-            "heights are given, but only models of the wheel know what they change: give a "
-            "parameter of the walker as an array with one value for each step."
-        )
     params = check_parameters(params)
+    if heights is not None:
+        params = model.put_on_heights(params, heights, n_steps)
     for leaf in jax.tree.leaves(params):
         if leaf.shape not in ((), (n_steps,)):
             raise ValueError(
