@@ -68,11 +68,12 @@ def measure_page(page: str) -> list[float]:
 
 
 def draw_page(page: str) -> None:
-    """Run a page and save its figure."""
+    """Run a page in the style of the library's figures, and save its figure."""
     names: dict = {}
-    for block in list_blocks(page):
-        exec(block, names)
-    names["figure"].savefig(FIGURES / f"gallery_{page}.png", dpi=110)
+    with vrw.plot.figure_style():
+        for block in list_blocks(page):
+            exec(block, names)
+        names["figure"].savefig(FIGURES / f"gallery_{page}.png", dpi=110)
 
 
 def count_lines(code: str) -> int:
