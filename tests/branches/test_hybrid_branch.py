@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slow_variants import mark_slow
 from support.walkers import SIMPLEST_WALKER
 
 import vrw_jax as vrw
@@ -179,7 +180,7 @@ def make_oscillator(has_stop):
     )
 
 
-@pytest.mark.parametrize("has_stop", [False, True])
+@pytest.mark.parametrize("has_stop", [*mark_slow(False), True])
 @pytest.mark.parametrize("rate", [0.7, 1.6])
 def test_an_oscillator_touches_its_stop_at_the_amplitude_of_the_linear_equation(has_stop, rate):
     """Without the stop the branch goes on; with it, no step passes the touch, however short."""

@@ -81,6 +81,7 @@ def test_equal_legs_have_the_gait_of_the_wheel():
     assert int(cycle.minimal_period) == 1
 
 
+@pytest.mark.slow
 def test_derivatives_and_branches_by_a_parameter_of_one_leg_are_those_of_gaits():
     def measure_period(damping):
         model = make_wheel({"damping": damping})
@@ -96,6 +97,7 @@ def test_derivatives_and_branches_by_a_parameter_of_one_leg_are_those_of_gaits()
     np.testing.assert_allclose(periods, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_force_peaks_and_stoppers_see_both_legs(cycle):
     walk = vrw.simulate(PARAMS, cycle.section_state, 2, model=make_wheel(), n_samples=2001)
     assert abs(float(cycle.measure("peak_force")) - float(walk.lambda_2.max())) < 1e-2

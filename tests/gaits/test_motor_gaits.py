@@ -56,12 +56,14 @@ def test_derivatives_of_gaits_by_the_torque_are_differences():
     assert cycles.found.tolist() == [True, False]
 
 
+@pytest.mark.slow
 def test_without_slope_and_torque_no_gait_can_exist():
     for torque in (0.0, -1.0):
         assert "No steady gait can exist: the slope is 0 rad" in find_gait(torque).why
     assert "No steady gait can exist" not in find_gait(1.0).why
 
 
+@pytest.mark.slow
 def test_a_branch_and_a_scan_along_the_torque_have_gaits_of_their_torques():
     model = vrw.ViscoelasticWheel(hub_torque=TORQUE)
     branch = vrw.continue_branch(LEVEL, "hub.torque", (44.0, 50.0), model=model)

@@ -116,6 +116,7 @@ def test_a_gait_far_from_the_papers_law_is_found_by_homotopy():
     np.testing.assert_allclose(cycle.period, vrw.limit_cycle(PARAMS).period, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_force_peaks_and_margins_are_those_of_a_sampled_walk():
     cycle = find_gait(SPRING, vrw.WheelParams(damping=120.0))
     walk = vrw.simulate(

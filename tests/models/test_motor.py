@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from reference_code import five_coordinates
 from support.machine_code import CodeRegistrySpy
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 
@@ -33,7 +34,7 @@ def advance(torque, params=PARAMS):
     return vrw.return_map(params, START, model=make_wheel(torque))
 
 
-@pytest.mark.parametrize("engine", ["lanes", "diffrax"])
+@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
 @pytest.mark.parametrize("torque", [20.0, DirectCurrentMotor()], ids=["constant", "rate"])
 def test_a_step_agrees_with_five_coordinates(torque, engine):
     step = vrw.step(

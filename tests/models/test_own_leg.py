@@ -28,7 +28,7 @@ def advance(law, params=PARAMS, **options):
     return vrw.return_map(params, START, model=make_wheel(law), **options)
 
 
-@pytest.mark.parametrize("engine", ["lanes", "diffrax"])
+@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
 def test_the_papers_law_as_a_law_gives_the_papers_step(engine):
     expected = vrw.step(PARAMS, START, engine=engine)
     step = vrw.step(PARAMS, START, model=make_wheel(PaperLeg()), engine=engine)
