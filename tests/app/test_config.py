@@ -117,8 +117,10 @@ def test_a_config_drives_the_hub_by_a_torque_and_sweeps_it() -> None:
     config = parse_config(text)
     assert float(config.make_model().hub_torque.torque) == 47.23
     assert config.design.swept_parameters == ("hub.torque",)
+    contact_config = parse_config('[model]\nname = "unilateral"\nhub_torque = 1.0\n')
+    assert float(contact_config.make_model().hub_torque.torque) == 1.0
     with pytest.raises(ValueError, match="has the unknown key 'hub_torque'"):
-        parse_config('[model]\nname = "unilateral"\nhub_torque = 1.0\n')
+        parse_config('[model]\nname = "rigid"\nhub_torque = 1.0\n')
 
 
 @pytest.mark.parametrize(

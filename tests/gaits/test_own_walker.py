@@ -283,6 +283,10 @@ def test_heights_that_fit_no_walk_are_refused():
     walk = lambda model, heights: vrw.walk({"rise": 0.0}, [3.0], 3, model=model, heights=heights)
     with pytest.raises(ValueError, match="give 4 heights"):
         walk(RISING_BALL, [0.0, 0.1, 0.2])
+    with pytest.raises(ValueError, match="give 4 heights for each state"):
+        vrw.step_batch(
+            {"rise": 0.0}, np.full((3, 1), 3.0), 3, model=RISING_BALL, heights=np.zeros(4)
+        )
     with pytest.raises(ValueError, match="does not declare what they change"):
         walk(dataclasses.replace(RISING_BALL, ground={}), np.zeros(4))
     with pytest.raises(ValueError, match="property of the ground"):

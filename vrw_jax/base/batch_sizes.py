@@ -28,17 +28,9 @@ CONTACT_GAIT_BATCH_SIZES = (1, 8, 64, 512)
 few iterations, but their steps are expensive.
 """
 
-BRANCH_BATCH_SIZE = 8
-"""Number of branches that are continued together, chosen because they fill one group of lanes in
-machine code.
-"""
 LOCATION_BATCH_SIZES = (1, 8)
 """Numbers of special points that one call locates. Only one size is compiled if compilation is
 expensive.
-"""
-POINT_BATCH_SIZE = 32
-"""Number of points on branches that one call measures, chosen because fewer points take the same
-time.
 """
 CURVE_BATCH_SIZE = 8
 """Number of curves of special points that are traced together, fixed so that one shape is

@@ -62,11 +62,11 @@ class PhaseEnd(NamedTuple):
     is_unfinished: Array
     solver_steps: Array  # number of tried solver steps, accepted or not
     next_solver_dt: Array  # next step length that the controller proposes, s
-    margin_minima: Any  # minima of the margins, (margins, batch); None if there are none
+    margin_minima: Any  # minima of the margins, (margins, batch) or (margins,)
 
     @property
     def has_integration_failed(self) -> Array:
-        """Return whether an active phase has ended without event or time limit."""
+        """Return whether a phase ended without event or time limit, if it was active."""
         return (self.end_guard_index < 0) & ~self.is_timed_out
 
 
@@ -490,10 +490,10 @@ def _classify_solver_step(
     """Return the status of each batch element after a solver step, and whether it accepts the step.
 
     The returned state has a new status, the new elapsed time, and the length of the next solver
-    step. If a guard crosses zero within the solver step, the length
-    is instead that of the step just taken. A step that would end after the time limit is shortened
-    to end there. An element fails if its next step is too short for the time to advance, or if the
-    number of its solver steps reaches the limit.
+    step. If a guard crosses zero within the solver step, the length is instead that of the step
+    just taken. A step that would end after the time limit is shortened to end there. An element
+    fails if its next step is too short for the time to advance, or if the number of its solver
+    steps reaches the limit.
     """
     is_running = integrator_state.is_running
     is_valid_step = is_running & ~is_step_rejected

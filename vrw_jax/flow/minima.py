@@ -260,8 +260,7 @@ def refine_margin_minima(
     `start_margin_values` are the margins at the start of the phase, (margins, batch). Each
     iteration takes a solver step from the start of the solver step that contains the minimum. At
     most `max_margin_search_iterations` iterations are made per margin, and at least
-    `min_iterations`. Each iteration makes more digits of the derivatives of the minimum's time
-    right.
+    `min_iterations`. Each iteration adds correct digits to the derivatives of the minimum's time.
     """
 
     def refine_one_margin_minimum(

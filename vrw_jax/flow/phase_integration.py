@@ -1,10 +1,10 @@
 """Integrate one phase of any vector field from its start to its earliest event, for one element.
 
-The search is that of `integrate`. The equations are of first order, so a state has no positions,
-and its rates are the whole state. Solver steps are those of an explicit method, for JAX and for
-machine code, or of any method of diffrax. Events are located to round-off. Derivatives of the
-event's state and time follow from the implicit function theorem, so they are accurate to the order
-of the solver.
+The solver loop is that of `flow/integrate`, the search for events that of `flow/event_location`.
+The equations are of first order, so a state has no positions `q`, and its only rate `v[0]` is the
+whole state. Solver steps are those of an explicit method, for JAX and for machine code, or of any
+method of diffrax. Events are located to round-off. Derivatives of the event's state and time follow
+from the implicit function theorem, so they are accurate to the order of the solver.
 """
 
 from __future__ import annotations
@@ -120,6 +120,12 @@ def integrate_phase(
     is_guard_met, is_guard_falling = guards_and_margins.find_guards_met_at_start(
         *lax.stop_gradient((start_values[:n_guards], start_rates[:n_guards]))
     )
+    n_margins = len(start_values) - n_guards
+    if len(guards_and_margins.includes_phase_start) != n_margins:
+        raise ValueError(
+            f"includes_phase_start has {len(guards_and_margins.includes_phase_start)} flags, but "
+            f"there are {n_margins} margins: give one flag for each."
+        )
     phase, tableau = _make_phase(vector_field, options, state_units)
     phase = phase._replace(
         evaluate_guards=lambda state: tuple(evaluate(state.v[0])[:n_guards]),

@@ -272,7 +272,7 @@ def _set_roundoff_to_zero(x: np.ndarray) -> np.ndarray:
 class StageAccelerations(NamedTuple):
     """Accelerations at one state, and sine and cosine of the wheel's angle theta.
 
-    Of a state without positions, it contains the time derivatives of the rates only.
+    For a state without positions, `acceleration` is its time derivative, and the others are empty.
     """
 
     sin: Any  # sine of theta

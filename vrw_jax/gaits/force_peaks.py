@@ -161,7 +161,7 @@ class _ForceExtrema(NamedTuple):
     rate_times: Any  # of extrema of the rate, s
     rates: Any  # N/s
     is_rate_maximum: Any
-    other_forces: Any  # at the ends of phases, or of all samples, N
+    other_forces: Any  # at the ends of phases, or at all samples, N
 
 
 def _join_phases(
@@ -359,7 +359,7 @@ def _find_force_extrema(
 ) -> _ForceExtrema:
     """Return the extrema of a force within the intervals between the events of one step.
 
-    - `interval_indices`: indices of the samples in each interval between two events.
+    - `sample_indices_by_interval`: indices of the samples in each interval between two events.
     """
     from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
 

@@ -61,7 +61,7 @@ class LaneProgram:
 
     @functools.cached_property
     def machine_code(self) -> MachineCode:
-        """Machine code of the function. It raises an error of a function that has none."""
+        """Return the machine code of the function, or raise an error if it can have none."""
         with _jax_tracing_lock, _pause_garbage_collection():
             machine_code = self.compile_code()
         self.compile_code = lambda: machine_code  # releases the trace
@@ -75,10 +75,10 @@ def get_lane_program(
     lanes_per_group: int,
     max_unrolled_entries: int,
 ) -> LaneProgram:
-    """Return machine code for a function of arrays with lanes on the last axis.
+    """Return the program of a function of arrays with lanes on the last axis.
 
-    The code is taken from this process or from the disk cache. If neither contains it, the function
-    is traced, and compiled in the background.
+    Its results have known types. Its code comes from this process or the disk cache, or is compiled
+    in the background when it is first needed.
 
     - `argument_shapes`: shapes and dtypes of the arguments;
     - `function_key`: key of the function, see `keys.make_key`; None if it has none, so that it is
@@ -159,10 +159,10 @@ def _trace_lane_program(
         trace = _recent_traces.get(trace_name) or trace_for_machine_code(
             lane_function, *argument_shapes
         )
-    if trace_name is not None:
-        _recent_traces[trace_name] = trace
-        if len(_recent_traces) > MAX_RECENT_TRACES:
-            _recent_traces.popitem(last=False)
+        if trace_name is not None:
+            _recent_traces[trace_name] = trace
+            if len(_recent_traces) > MAX_RECENT_TRACES:
+                _recent_traces.popitem(last=False)
     closed_jaxpr, result_structure = trace
     encoded_result_types = json.dumps(
         [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]

@@ -128,9 +128,10 @@ class CompiledBatchFunction:
     def _get_program(
         self, structure: Any, argument_types: ArgumentTypes, lanes_per_group: int
     ) -> LaneProgram:
-        """Return the machine code for arguments of a structure, and for groups of lanes.
+        """Return the program for arguments of a structure, and for groups of lanes.
 
-        Raise a `_NoMachineCodeError` if XLA has to compute the function.
+        Raise a `_NoMachineCodeError` if XLA has to compute the function. The code of one lane is
+        compiled later, so its errors appear in `LaneCall.lower`.
         """
         environment = disk_cache.describe_trace_environment()
         signature = structure, argument_types, lanes_per_group, environment

@@ -128,7 +128,7 @@ class AbstractWheel(AbstractWalker, eqx.Module):
 
     def with_laws(self, laws: WheelLaws | None) -> Any:
         """Return the model with other laws, such as those that `attach_laws` has added."""
-        if laws is self.laws:
+        if laws is None and self.laws is None:
             return self
         laws = laws or WheelLaws()
         return eqx.tree_at(

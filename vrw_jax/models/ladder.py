@@ -128,7 +128,7 @@ class ModelChoice(AbstractPrintable):
 
     @property
     def model(self) -> AbstractWheel:
-        """Return the selected model. The choice must be for one wheel."""
+        """Return the selected model, with the paper's laws. The choice must be for one wheel."""
         if int(self.model_code) == ModelCode.VISCOELASTIC:
             return ViscoelasticWheel(friction=float(self.friction))
         return UnilateralWheel(friction=self.friction)

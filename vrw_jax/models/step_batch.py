@@ -161,12 +161,17 @@ def step_batch(
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps, options = check_int("n_steps", n_steps), convert_step_options(options)
     if is_own_walker(model):
-        if derivatives or engine == "diffrax":
+        if derivatives or "diffrax" in (engine, options.engine):
             raise ValueError(
-                "derivatives and engine are for models of the wheel only: differentiate "
+                'derivatives and engine="diffrax" are for models of the wheel only: differentiate '
                 "vrw.step of your walker, and map it with jax.vmap."
             )
         if heights is not None:
+            if np.ndim(heights) != 2 or (np.ndim(states) == 2 and len(heights) != len(states)):
+                raise ValueError(
+                    f"heights have shape {np.shape(heights)}, but there are {len(states)} states "
+                    f"and {n_steps} steps: give {n_steps + 1} heights for each state."
+                )
             params = model.put_on_heights(check_parameters(params), heights, n_steps)
         return _step_batch_of_own_walker(model, params, states, n_steps, options)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")

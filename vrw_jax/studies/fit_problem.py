@@ -563,9 +563,3 @@ def solve_fits(problem: FitProblem, targets: FitTarget, starts: np.ndarray) -> F
         functools.partial(_fit_batch, problem), FIT_BATCH_SIZES, targets, problem.invert(starts)
     )
     return jax.tree.map(np.asarray, solution)
-
-
-@eqx.filter_jit
-def predict_batch(problem: FitProblem, unknowns: Array) -> Prediction:
-    """Return the predictions for each row of unknowns."""
-    return jax.vmap(problem.predict)(unknowns)

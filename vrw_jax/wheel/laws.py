@@ -176,7 +176,7 @@ def _exchange_legs(leg_force: Any) -> Any:
 def _apply_to_legs(
     s: Symbols, evaluate: Callable[[Any], Elementwise], leg_numbers: int | np.ndarray
 ) -> Elementwise:
-    """Return a function of the law of each leg, whose even legs may have another law."""
+    """Return `evaluate(law)` for the law of each leg. Even legs may have another law."""
     has_odd_number = leg_numbers % 2 == 1
     other_law = _exchange_legs(s.leg_force)
     if other_law is s.leg_force or np.all(has_odd_number):
@@ -200,7 +200,7 @@ def evaluate_leg_force(
 
 
 def compute_damping_coefficient(s: Symbols, L: Elementwise, dL: Elementwise) -> Elementwise:
-    """Return minus the derivative of a user's force along each leg by its rate, N s/m."""
+    """Return minus the derivative of the force of each leg by its rate, N s/m."""
     evaluate = lambda dL: evaluate_leg_force(s, L, dL, number_legs(L))
     return -jax.jvp(evaluate, (dL,), (jnp.ones_like(dL),))[1]
 
@@ -250,7 +250,7 @@ def compute_leg_potential(
 def evaluate_damping_power(
     s: Symbols, L: Elementwise, dL: Elementwise, leg_numbers: int | np.ndarray = 1
 ) -> Elementwise:
-    """Return the power of a user's force at rest minus that of the force along each leg, W."""
+    """Return the power that a user's law dissipates along each leg, W."""
     rest_force, force = (evaluate_leg_force(s, L, x, leg_numbers) for x in (0.0 * dL, dL))
     return (rest_force - force) * dL
 
