@@ -43,7 +43,6 @@ class MachineCode(NamedTuple):
     """Machine code of a function over lanes, which may still be compiled in the background."""
 
     ffi_target_name: str  # digest of the text that LLVM compiles; JAX programs call the code by it
-    result_shapes_and_dtypes: ResultShapesAndDtypes
     object_code_future: Future[bytes]
 
 
@@ -178,7 +177,6 @@ def _trace_lane_program(
 
     compile_code = lambda: _compile_trace(
         closed_jaxpr,
-        encoded_result_types,
         save_index if index_name else None,
         lanes_per_group,
         max_unrolled_entries,
@@ -198,7 +196,6 @@ def _trace_lane_program(
 
 def _compile_trace(
     closed_jaxpr: ClosedJaxpr,
-    encoded_result_types: str,
     save_index: Callable[[str], None] | None,
     lanes_per_group: int,
     max_unrolled_entries: int,
@@ -208,14 +205,13 @@ def _compile_trace(
     - `save_index`: function that saves the name of the code; None if nothing is saved.
     """
     llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, max_unrolled_entries)
-    digested_text = f"{encoded_result_types}{describe_compiler_settings()}{llvm_text}"
+    digested_text = f"{describe_compiler_settings()}{llvm_text}"
     code_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
 
     def compile_and_save_code() -> bytes:
         object_code = compile_llvm_for_processor(llvm_text)
         if save_index:
-            encoded_machine_code = encoded_result_types.encode() + b"\n" + object_code
-            disk_cache.save_cache_record(code_name, encoded_machine_code)
+            disk_cache.save_cache_record(code_name, object_code)
             save_index(code_name)
         return object_code
 
@@ -225,9 +221,7 @@ def _compile_trace(
     )
     if machine_code is None:
         machine_code = _machine_code_by_name[code_name] = MachineCode(
-            code_name,
-            _parse_result_shapes_and_dtypes(encoded_result_types),
-            _llvm_compiler_pool.submit(compile_and_save_code),
+            code_name, _llvm_compiler_pool.submit(compile_and_save_code)
         )
     elif save_index:
         save_index(code_name)
@@ -240,17 +234,12 @@ def load_machine_code(code_name: str) -> MachineCode | None:
     Return None if neither contains the code.
     """
     if code_name not in _machine_code_by_name:
-        cache_record_content = disk_cache.load_cache_record(code_name)
-        if cache_record_content is None:
+        object_code = disk_cache.load_cache_record(code_name)
+        if object_code is None:
             return None
-        encoded_result_types, _, object_code = cache_record_content.partition(b"\n")
         try:
-            result_shapes_and_dtypes = _parse_result_shapes_and_dtypes(encoded_result_types)
             require_object_file(object_code, LANE_KERNEL_NAME)
-        except (
-            ValueError,
-            TypeError,
-        ) as damage_error:  # LLVM would end the process on such a file.
+        except ValueError as damage_error:  # LLVM would end the process on such a file.
             warnings.warn(
                 f"{code_name} holds no machine code ({damage_error}): compiled again.",
                 stacklevel=2,
@@ -258,9 +247,7 @@ def load_machine_code(code_name: str) -> MachineCode | None:
             return None
         object_code_future: Future[bytes] = Future()
         object_code_future.set_result(object_code)
-        _machine_code_by_name[code_name] = MachineCode(
-            code_name, result_shapes_and_dtypes, object_code_future
-        )
+        _machine_code_by_name[code_name] = MachineCode(code_name, object_code_future)
     return _machine_code_by_name[code_name]
 
 
@@ -300,7 +287,7 @@ One thread suffices, because LLVM's lock lets only one thread compile.
 
 
 def _parse_result_shapes_and_dtypes(encoded_result_types: str | bytes) -> ResultShapesAndDtypes:
-    """Return `MachineCode.result_shapes_and_dtypes`, parsed from JSON."""
+    """Return `LaneProgram.result_shapes_and_dtypes`, parsed from JSON."""
     return tuple(
         (tuple(axis_lengths), np.dtype(dtype_name))
         for axis_lengths, dtype_name in json.loads(encoded_result_types)

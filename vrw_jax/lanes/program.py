@@ -183,7 +183,7 @@ def run_machine_code(get_program: GetProgram, argument_leaves: Sequence[np.ndarr
     ]
     padded_results = [
         np.empty((*shape_without_lanes, n_padded_lanes), result_dtype)
-        for shape_without_lanes, result_dtype in machine_code.result_shapes_and_dtypes
+        for shape_without_lanes, result_dtype in lane_program.result_shapes_and_dtypes
     ]
     run_lane_kernel = _load_lane_kernel(machine_code.ffi_target_name, machine_code)
     input_pointer_table = _make_pointer_table(padded_arguments)
