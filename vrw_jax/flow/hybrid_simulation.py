@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
-from vrw_jax.base.elementwise import make_opaque_loop_condition
+from vrw_jax.base.elementwise import make_opaque_loop_condition, select_entry_by_mask
 from vrw_jax.base.forward_only import forbid_reverse_mode
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import StatusCode, describe_step_ending
@@ -31,7 +31,6 @@ from vrw_jax.flow.phase_integration import (
     StateArray,
     VectorField,
     integrate_phase,
-    select_entry_by_mask,
 )
 from vrw_jax.lanes.saved_traces import call_compiled_program
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base.elementwise import select_trees_by_condition
+from vrw_jax.base.elementwise import select_entry_by_mask, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
@@ -272,7 +272,7 @@ def refine_margin_minima(
         )
 
         evaluate_selected_margin = lambda state: (
-            _select_margin(jnp.stack(phase.evaluate_margins(state)), margin_index),
+            select_entry_by_mask(margin_index, jnp.stack(phase.evaluate_margins(state))),
         )
 
         def improve_margin_minimum_search(
@@ -348,13 +348,6 @@ def _spread_over_batch(flags_of_margins: Any, margins: Array) -> Array:
     return jnp.asarray(flags_of_margins).reshape(-1, *(1,) * (margins.ndim - 1))
 
 
-def _select_margin(margins: Array, margin_index: Array, axis: int = 0) -> Array:
-    """Return the margin with the given index along an axis."""
-    is_selected = jnp.arange(margins.shape[axis]) == margin_index
-    is_selected = is_selected.reshape(-1, *(1,) * (margins.ndim - 1 - axis))
-    return jnp.sum(jnp.where(is_selected, margins, 0.0), axis)
-
-
 def compute_margin_minima_jvp(
     solver_step_function: SolverStepFunction,
     tableau: ButcherTableau,
@@ -386,8 +379,8 @@ def compute_margin_minima_jvp(
         state_tangents = phase_tangents.propagate_to_step_end(
             tableau, stage_states, margin_minimum_state.step_start_tangents, step_length
         )
-        return None, _select_margin(
-            compute_margin_tangents(stage_states[-1], state_tangents), margin_index, 1
+        return None, select_entry_by_mask(
+            margin_index, compute_margin_tangents(stage_states[-1], state_tangents), 1
         )
 
     margin_indices = jnp.arange(len(margin_minima_result.phase_margin_minima), dtype=jnp.int32)

@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from vrw_jax import lanes
+from vrw_jax.base.elementwise import select_entry_by_mask
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS
@@ -206,20 +207,6 @@ def _attach_event_derivatives(
         (last_time, last_state),
         lambda _, located_event: located_event,
         solve_tangent_equations,
-    )
-
-
-def select_entry_by_mask(entry_index: Int[Array, ""], stacked_entries: Array) -> Array:
-    """Return the entry of `stacked_entries` at `entry_index` on the first axis, using a masked sum.
-
-    In a batch, the masked sum is cheaper than a gather.
-    """
-    is_selected = jnp.arange(stacked_entries.shape[0]) == entry_index
-    return jnp.sum(
-        jnp.where(
-            is_selected.reshape(-1, *(1,) * (stacked_entries.ndim - 1)), stacked_entries, 0.0
-        ),
-        axis=0,
     )
 
 
