@@ -290,4 +290,4 @@ def test_heights_that_fit_no_walk_are_refused():
     with pytest.raises(ValueError, match="does not declare what they change"):
         walk(dataclasses.replace(RISING_BALL, ground={}), np.zeros(4))
     with pytest.raises(ValueError, match="property of the ground"):
-        dataclasses.replace(RISING_BALL, ground={"hight": "rise"})
+        dataclasses.replace(RISING_BALL, ground={"depth": "rise"})
