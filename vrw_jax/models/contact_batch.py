@@ -1,7 +1,7 @@
 """Gait steps of batches with unilateral contact, by machine code."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -10,22 +10,12 @@ from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.models.walk_batch import (
     StepBatchResult,
-    StepwiseParameter,
+    StepInput,
     WalkBatch,
-    complete_slopes_over_steps,
-    compute_rises_over_steps,
-    make_height_terms,
+    list_rises,
+    select_step_values,
 )
-from vrw_jax.wheel.params import PARAMETER_NAMES
-
-SLOPES_PARAMETER_NAMES = ("previous_friction", "tilt")
-HEIGHTS_PARAMETER_NAMES = ("previous_friction", "rise", "next_rise")
-"""Names of the additional parameters of a gait step on uneven ground.
-
-The parameters are the friction of the feet that landed earlier, and the increase of the slope from
-this line of the ground to the next one, rad, or two rises (see `models.select_stance_line`), m.
-"""
-SLOPE_INDEX = PARAMETER_NAMES.index("slope")
+from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES
 
 
 def step_batch_with_contact(
@@ -41,12 +31,11 @@ def step_batch_with_contact(
 ) -> StepBatchResult:
     """Return the result of `step_batch` for a model with unilateral contact.
 
-    Without derivatives on flat ground, one call of the kernel computes all gait steps.
+    Without derivatives on flat ground, one call of the kernel computes all gait steps. On uneven
+    ground, further inputs are the friction of the feet that landed earlier, and the increase of the
+    slope to the next line of the ground, rad, or two rises (see `models.select_stance_line`), m.
     """
-    element_friction = np.asarray(model.friction, section_states.dtype)
-    is_ground_uneven = element_heights is not None or any(
-        np.ndim(x) == 2 for x in (*values_by_parameter, element_friction)
-    )
+    friction = np.asarray(model.friction, section_states.dtype)
     if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
         raise ValueError(
             f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
@@ -57,170 +46,56 @@ def step_batch_with_contact(
             f"restitution has shape {np.shape(model.restitution)}, but a batch needs one number "
             "for all elements: call vrw.step_batch for each restitution."
         )
-    stepwise_ground = _StepwiseGround.repeat_over_steps(
-        values_by_parameter[SLOPE_INDEX],
-        element_friction,
-        len(section_states),
-        n_steps,
-        element_heights,
+    slopes = values_by_parameter[PARAMETER_NAMES.index("slope")]
+    make_input = lambda name, values, *offset: select_step_values(
+        name, values, n_steps, len(section_states), *offset
     )
-    first_step_values = [*values_by_parameter, stepwise_ground.friction_by_step[0]]
-    first_step_values[SLOPE_INDEX] = stepwise_ground.slopes_by_step[0]
-    parameter_matrix = np.stack(
-        [np.broadcast_to(x, len(section_states)) for x in first_step_values]
-    )
-    section_states = embed_section_states(parameter_matrix, section_states, n_legs)
-    solver_indices = np.zeros(len(section_states), np.int32)
-    has_equal_steps = not is_ground_uneven and model.leg_period == 1
-    if not derivative_names and has_equal_steps:
-        x, phase_durations, step_outcomes, n_stepped, n_solver_steps, _ = map(
-            np.asarray,
-            walk_batch(parameter_matrix, section_states, n_steps, model, options, n_legs),
+    inputs = [*map(make_input, model.parameter_names, [*values_by_parameter, friction])]
+    first_values = np.stack([x.select_values(0) for x in inputs])
+    section_states = embed_section_states(first_values, section_states, n_legs)
+    is_ground_uneven = element_heights is not None or slopes.ndim == 2 or friction.ndim == 2
+    if not (derivative_names or is_ground_uneven or model.leg_period > 1):
+        x, durations, outcome, n_stepped, solver_steps, _ = map(
+            np.asarray, walk_batch(first_values, section_states, n_steps, model, options, n_legs)
         )
+        solver_index = np.zeros_like(n_stepped)
         return StepBatchResult(
-            x,
-            phase_durations,
-            step_outcomes,
-            n_stepped,
-            n_solver_steps,
-            solver_indices,
-            "lanes",
-            (options.solver,),
+            x, durations, outcome, n_stepped, solver_steps, solver_index, "lanes", (options.solver,)
         )
-    parameter_names = model.parameter_names
-    stepwise_parameters: dict[str, StepwiseParameter] = {}
     if is_ground_uneven:
-        ground_names = (
-            SLOPES_PARAMETER_NAMES if element_heights is None else HEIGHTS_PARAMETER_NAMES
-        )
-        parameter_names = (*model.parameter_names, *ground_names)
-        stepwise_parameters = stepwise_ground.make_stepwise_parameters(len(model.parameter_names))
-    active_walks = WalkBatch(
-        section_states.T.copy(), derivative_names, parameter_names, stepwise_parameters
-    )
-    input_indices = list(active_walks.input_indices)
-    for k in range(n_steps):
-        active_lanes = active_walks.find_walking_lanes()
-        if not len(active_lanes):
-            break
-        if k > 0:
-            model.exchange_legs(parameter_matrix)
-        if is_ground_uneven:
-            parameter_matrix = stepwise_ground.make_parameters_of_step(
-                k, parameter_matrix[: len(model.parameter_names)]
-            )
-        parameters_of_lanes = parameter_matrix[:, active_lanes]
-        start_states = active_walks.section_state[:, active_lanes].T
-        step_outputs: tuple[Any, ...]
-        if derivative_names:
-            step_result, step_jacobian = step_batch_with_jacobian(
-                parameters_of_lanes, start_states, model, options, n_legs, input_indices
-            )
-            output_jacobian = np.concatenate(
-                [step_jacobian.section_state, step_jacobian.durations], 1
-            )
-            step_outputs = (
-                step_result.section_state,
-                step_result.durations,
-                step_result.outcome,
-                step_result.solver_steps,
-                output_jacobian[:, :, input_indices],
-            )
+        inputs.append(make_input(FRICTION_NAME, friction, -1))
+        if element_heights is not None:
+            inputs += list_rises(element_heights, n_steps)
         else:
-            x, phase_durations, step_outcomes, _, n_solver_steps, _ = walk_batch(
-                parameters_of_lanes, start_states, 1, model, options, n_legs
+            inputs.append(_make_tilt(inputs[PARAMETER_NAMES.index("slope")], slopes, n_steps))
+    batch = WalkBatch(section_states.T.copy(), inputs, derivative_names)
+    input_indices = list(batch.input_indices)
+
+    def step_lanes(_: Any, inputs: np.ndarray, x: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
+        if not derivative_names:
+            x, durations, outcome, _, solver_steps, _ = walk_batch(
+                inputs, x.T, 1, model, options, n_legs
             )
-            step_outputs = x, phase_durations, step_outcomes, n_solver_steps
-        active_walks.store_lane_steps(active_lanes, tuple(np.asarray(x).T for x in step_outputs))
-    return active_walks.make_batch_result(
-        np.arange(len(section_states)), solver_indices, "lanes", (options.solver,)
+            outputs: tuple[Any, ...] = x, durations, outcome, solver_steps
+        else:
+            step, jacobian = step_batch_with_jacobian(
+                inputs, x.T, model, options, n_legs, input_indices
+            )
+            columns = np.concatenate([jacobian.section_state, jacobian.durations], 1)
+            outputs = step.section_state, step.durations, step.outcome, step.solver_steps
+            outputs += (columns[:, :, input_indices],)
+        return tuple(np.asarray(x).T for x in outputs)
+
+    batch.take_steps(n_steps, step_lanes, model)
+    return batch.make_batch_result("lanes", (options.solver,))
+
+
+def _make_tilt(slope: StepInput, slopes: np.ndarray, n_steps: int) -> StepInput:
+    """Return the increase of the slope from the line of each step to the next one, rad."""
+    if slopes.ndim < 2:
+        return StepInput("", np.zeros_like(slope.values))
+    next_slope = select_step_values("slope", slopes, n_steps, slopes.shape[0], 1)
+    return next_slope._replace(
+        values=next_slope.values - slope.values,
+        list_terms=lambda k: [(k, -1.0), *next_slope.list_terms(k)],
     )
-
-
-class _StepwiseGround(NamedTuple):
-    """Slope or rises, and friction of the ground in each gait step of each element."""
-
-    slopes_by_step: np.ndarray  # (n_steps + 1, elements), rad
-    friction_by_step: np.ndarray  # (n_steps, elements)
-    n_stepwise_slopes: int | None  # per element; None if slopes do not vary over steps
-    n_stepwise_frictions: int | None
-    element_heights: np.ndarray | None  # see `step_batch`, m
-
-    @classmethod
-    def repeat_over_steps(
-        cls,
-        element_slopes: np.ndarray,
-        element_friction: np.ndarray,
-        n_elements: int,
-        n_steps: int,
-        element_heights: np.ndarray | None,
-    ) -> "_StepwiseGround":
-        """Return slope and friction for all gait steps, repeated over steps and over the batch
-        where the argument has no such axis.
-        """
-        n_stepwise_slopes, n_stepwise_frictions = (
-            x.shape[1] if x.ndim == 2 else None for x in (element_slopes, element_friction)
-        )
-        repeat_parameter_over_steps = lambda x, n_repetitions: (
-            x if x.ndim == 2 else np.broadcast_to(x, (n_repetitions, n_elements)).T
-        )
-        slopes_by_step = complete_slopes_over_steps(
-            repeat_parameter_over_steps(element_slopes, n_steps + 1), n_steps
-        )
-        return cls(
-            slopes_by_step,
-            repeat_parameter_over_steps(element_friction, n_steps).T[:n_steps],
-            n_stepwise_slopes,
-            n_stepwise_frictions,
-            element_heights,
-        )
-
-    def make_parameters_of_step(self, k: int, parameter_matrix: np.ndarray) -> np.ndarray:
-        """Return the parameters of gait step `k`, shape (parameters, elements).
-
-        - `parameter_matrix`: parameters of wheels and laws, and friction.
-
-        The last parameters are `SLOPES_PARAMETER_NAMES` or `HEIGHTS_PARAMETER_NAMES`.
-        """
-        parameter_matrix = parameter_matrix.copy()
-        parameter_matrix[SLOPE_INDEX] = self.slopes_by_step[k]
-        parameter_matrix[-1] = self.friction_by_step[k]
-        previous_friction = self.friction_by_step[max(k - 1, 0)]
-        if self.element_heights is not None:
-            rises = compute_rises_over_steps(self.element_heights, len(self.friction_by_step))
-            return np.vstack([parameter_matrix, previous_friction, *rises[k : k + 2]])
-        tilt = self.slopes_by_step[k + 1] - self.slopes_by_step[k]
-        return np.vstack([parameter_matrix, previous_friction, tilt])
-
-    def make_stepwise_parameters(self, n_parameters: int) -> dict[str, StepwiseParameter]:
-        """Return a mapping from parameter names to the terms by which the parameters enter the
-        chain rule.
-
-        The mapping contains "friction" and, if they vary over gait steps, "slope" or "heights".
-        """
-        previous_friction_input_index = n_parameters
-        last_slope_index = (self.n_stepwise_slopes or 1) - 1
-        last_friction_index = (self.n_stepwise_frictions or 1) - 1
-        stepwise_friction = StepwiseParameter(
-            (n_parameters - 1, previous_friction_input_index),
-            self.n_stepwise_frictions,
-            lambda k: (
-                (0, min(k, last_friction_index), 1.0),
-                (1, max(min(k, last_friction_index) - 1, 0), 1.0),
-            ),
-        )
-        if self.element_heights is not None:
-            stepwise_heights = make_height_terms(
-                (previous_friction_input_index + 1, previous_friction_input_index + 2),
-                self.element_heights.shape[1],
-                len(self.friction_by_step),
-            )
-            return {"heights": stepwise_heights, "friction": stepwise_friction}
-        if self.n_stepwise_slopes is None:
-            return {"friction": stepwise_friction}
-        stepwise_slope = StepwiseParameter(
-            (SLOPE_INDEX, previous_friction_input_index + 1),
-            self.n_stepwise_slopes,
-            lambda k: ((0, k, 1.0), (1, k, -1.0), (1, min(k + 1, last_slope_index), 1.0)),
-        )
-        return {"slope": stepwise_slope, "friction": stepwise_friction}

@@ -62,12 +62,10 @@ from vrw_jax.models.viscoelastic import N_STEP_INPUTS, advance_gait_step
 from vrw_jax.models.walk_batch import (
     START_INPUT_NAME,
     StepBatchResult,
-    StepwiseParameter,
     WalkBatch,
-    complete_slopes_over_steps,
-    compute_rises_over_steps,
-    make_height_terms,
+    list_rises,
     select_lanes,
+    select_step_values,
 )
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
@@ -239,33 +237,20 @@ def _step_batch_of_own_walker(
                 f"a parameter has shape {leaf.shape}, but there are {n_elements} elements and "
                 f"{n_steps} steps: give one number, {n_elements}, or one for each step of each."
             )
-    x = np.array(np.broadcast_to(states, (n_elements, states.shape[-1])))
-    outcome, n_stepped, solver_steps = (np.zeros(n_elements, np.int32) for _ in range(3))
-    durations = np.zeros((n_elements, 0))
+    batch = WalkBatch(np.array(np.broadcast_to(states, (n_elements, states.shape[-1]))).T)
     arrays, numbers = eqx.partition(params, lambda leaf: leaf.ndim > 0)
-    for k in range(n_steps):
-        walking = np.flatnonzero(outcome == Outcome.STEPPED)
-        if not walking.size:
-            break
-        of_step = jax.tree.map(lambda leaf, k=k: leaf[:, k] if leaf.ndim > 1 else leaf, arrays)
+
+    def step_lanes(walking: np.ndarray, _: None, x: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
+        of_step = jax.tree.map(lambda leaf: leaf[:, k] if leaf.ndim > 1 else leaf, arrays)
         rows = eqx.combine(select_tree_rows(of_step, walking), numbers)
-        step = step_batch_of_walker(walker, rows, x[walking], options)
-        if not durations.size:
-            durations = np.zeros((n_elements, step.durations.shape[-1]))
-        x[walking], durations[walking] = step.section_state, step.durations
-        outcome[walking] = step.outcome
-        n_stepped[walking] += step.outcome == Outcome.STEPPED
-        solver_steps[walking] += step.solver_steps
-    return StepBatchResult(
-        np.where((outcome == Outcome.STEPPED)[:, None], x, 0.0),
-        durations,
-        outcome,
-        n_stepped,
-        solver_steps,
-        np.zeros(n_elements, np.int32),
-        "lanes",
-        (options.solver,),
-    )
+        step = step_batch_of_walker(walker, rows, x.T, options)
+        section_state = np.where(
+            (step.outcome == Outcome.STEPPED)[:, None], step.section_state, 0.0
+        )
+        return section_state.T, step.durations.T, step.outcome, step.solver_steps
+
+    batch.take_steps(n_steps, step_lanes)
+    return batch.make_batch_result("lanes", (options.solver,))
 
 
 def _check_parameter_shapes(
@@ -329,41 +314,26 @@ def _step_batch_without_contact(
     element_heights: np.ndarray | None,
 ) -> StepBatchResult:
     n_wheels = len(section_states)
-    element_slopes = values_by_parameter[SLOPE_INPUT_INDEX]
-    ground_slopes: Any = [element_slopes]
-    rises = None
-    stepwise_parameters = {}
-    ground_input_index = len(values_by_parameter) + 3
-    is_ground_uneven = element_slopes.ndim == 2
-    if element_heights is not None:
-        rises = compute_rises_over_steps(element_heights, n_steps)
-        stepwise_parameters["heights"] = make_height_terms(
-            (ground_input_index, ground_input_index + 1), element_heights.shape[1], n_steps
-        )
-    if is_ground_uneven:
-        ground_slopes = complete_slopes_over_steps(element_slopes, n_steps)
-        n_slopes = element_slopes.shape[1]
-        stepwise_parameters["slope"] = StepwiseParameter(
-            (SLOPE_INPUT_INDEX, ground_input_index),
-            n_slopes,
-            lambda k: ((0, k, 1.0), (1, min(k + 1, n_slopes - 1), 1.0)),
-        )
-    values_by_parameter[SLOPE_INPUT_INDEX] = ground_slopes[0]
+    slopes = values_by_parameter[SLOPE_INPUT_INDEX]
+    values_by_parameter[SLOPE_INPUT_INDEX] = slopes.T[0] if slopes.ndim == 2 else slopes
     wheel_order = order_wheels_by_work(values_by_parameter, section_states)
-    parameter_matrix = np.stack(
-        [np.broadcast_to(x, n_wheels)[wheel_order] for x in values_by_parameter]
+    values_by_parameter[SLOPE_INPUT_INDEX] = slopes
+    make_input = lambda name, values, *offset: select_step_values(
+        name, values[wheel_order] if values.ndim else values, n_steps, n_wheels, *offset
     )
-    if is_ground_uneven:
-        ground_slopes = ground_slopes.take(wheel_order, -1)
-    if rises is not None:
-        rises = rises.take(wheel_order, -1)
-    walk_batch = WalkBatch(
-        section_states.T.take(wheel_order, -1),
-        derivative_names,
-        model.parameter_names[: len(values_by_parameter)],
-        stepwise_parameters,
+    inputs = [*map(make_input, model.parameter_names, values_by_parameter)]
+    n_parameters = len(inputs)
+    if element_heights is not None:
+        inputs += list_rises(element_heights[wheel_order], n_steps)
+    elif slopes.ndim == 2:
+        inputs += [make_input("slope", slopes, 1)]
+    batch = WalkBatch(section_states.T.take(wheel_order, -1), inputs, derivative_names)
+    # The kernels take parameters, section states, and then values of the ground.
+    kernel_order = [*range(n_parameters), *range(n_parameters + 3, len(inputs) + 3)]
+    kernel_order += range(n_parameters, n_parameters + 3)
+    select_engine = functools.partial(
+        _select_batch_engine, model, n_legs, tuple(kernel_order[i] for i in batch.input_indices)
     )
-    select_engine = functools.partial(_select_batch_engine, model, n_legs, walk_batch.input_indices)
     engine_by_solver = {SolverIndex.REQUESTED_SOLVER: select_engine(requested_engine, options)}
     solver_indices = np.full(n_wheels, SolverIndex.REQUESTED_SOLVER, np.int32)
     solver_names: tuple[str, ...] = (options.solver,)
@@ -371,7 +341,8 @@ def _step_batch_without_contact(
     if requested_engine == "auto" and engine_name == "lanes":
         solver_names = (options.solver, STABLE_SOLVER_NAME, IMPLICIT_SOLVER_NAME)
         solver_indices = select_cheapest_solver(
-            parameter_matrix, options.with_derivative_tolerances() if derivative_names else options
+            batch.input_matrix,
+            options.with_derivative_tolerances() if derivative_names else options,
         )
         if np.any(solver_indices != SolverIndex.REQUESTED_SOLVER):
             engine_by_solver[SolverIndex.STABLE_SOLVER] = select_engine(
@@ -383,33 +354,32 @@ def _step_batch_without_contact(
             engine_by_solver[SolverIndex.IMPLICIT_SOLVER] = select_engine(
                 "diffrax", dataclasses.replace(options, solver=IMPLICIT_SOLVER_NAME)
             )
-    for k in range(n_steps):
-        active_lanes = walk_batch.find_walking_lanes()
-        if is_ground_uneven:
-            parameter_matrix[SLOPE_INPUT_INDEX] = ground_slopes[k]
-        if k > 0:
-            model.exchange_legs(parameter_matrix)
-        for solver_index, (_, take_lane_steps) in engine_by_solver.items():
-            lane_indices = active_lanes[solver_indices[active_lanes] == solver_index]
-            if not len(lane_indices):
+
+    def step_lanes(walking: np.ndarray, inputs: np.ndarray, x: np.ndarray, k: int) -> tuple:
+        positions, outputs = [], []
+        for solver_index, (_name, take_lane_steps) in engine_by_solver.items():
+            chosen = np.flatnonzero(solver_indices[walking] == solver_index)
+            if not len(chosen):
                 continue
-            lanes = select_lanes(lane_indices, walk_batch)
-            lane_inputs = parameter_matrix[:, lanes], walk_batch.section_state[:, lanes]
-            ground_inputs: tuple[np.ndarray, ...] = ()
-            if is_ground_uneven:
-                ground_inputs = (ground_slopes[k + 1][lanes],)
-            elif rises is not None:
-                ground_inputs = rises[k][lanes], rises[k + 1][lanes]
-            step_outputs = take_lane_steps(*lane_inputs, *ground_inputs)
+            lanes = select_lanes(chosen, len(walking))
+            parameters, ground = np.split(inputs[:, lanes], [n_parameters])
+            step_outputs = take_lane_steps(parameters, x[:, lanes], *ground)
             if solver_index == SolverIndex.STABLE_SOLVER:
                 # A phase may last longer than `select_cheapest_solver` assumes. The implicit
                 # solver, which is next, then repeats the step.
-                has_solver_failed = step_outputs[2] == Outcome.SOLVER_FAILED
-                solver_indices[lane_indices[has_solver_failed]] = SolverIndex.IMPLICIT_SOLVER
-                lane_indices = lane_indices[~has_solver_failed]
-                step_outputs = tuple(x[..., ~has_solver_failed] for x in step_outputs)
-            walk_batch.store_lane_steps(lane_indices, step_outputs)
-    return walk_batch.make_batch_result(wheel_order, solver_indices, engine_name, solver_names)
+                has_failed = step_outputs[2] == Outcome.SOLVER_FAILED
+                solver_indices[walking[chosen[has_failed]]] = SolverIndex.IMPLICIT_SOLVER
+                chosen = chosen[~has_failed]
+                step_outputs = tuple(x[..., ~has_failed] for x in step_outputs)
+            positions.append(chosen)
+            outputs.append(step_outputs)
+        if len(outputs) == 1:
+            return outputs[0]
+        order = np.argsort(np.concatenate(positions))
+        return tuple(np.concatenate(x, -1)[..., order] for x in zip(*outputs, strict=True))
+
+    batch.take_steps(n_steps, step_lanes, model)
+    return batch.make_batch_result(engine_name, solver_names, wheel_order, solver_indices)
 
 
 def order_wheels_by_work(

@@ -1,6 +1,7 @@
-"""Results of batches of walks, and derivatives with respect to their starts and parameters."""
+"""Walks of batches of walkers, and derivatives with respect to their starts and parameters."""
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -89,63 +90,55 @@ class StepBatchResult(AbstractPrintable):
 START_INPUT_NAME = "section_state"
 
 
-class StepwiseParameter(NamedTuple):
-    """Terms by which a parameter enters the chain rule over the gait steps of a walk.
+class StepInput(NamedTuple):
+    """One input of each step of a batch, and its derivatives by the argument that determines it."""
 
-    The parameter may determine several inputs of a gait step, and may vary from step to step.
+    argument: str
+    values: np.ndarray  # (lanes,), or (n_steps, lanes) if they differ from step to step
+    list_terms: Callable[[int], list[tuple[int, float]]] = lambda k: [(0, 1.0)]
+    """Function that maps the index of a step to pairs of the index of a value of the argument, and
+    the derivative by this value.
     """
+    n_argument_values: int | None = None  # for each lane; None for a single number
 
-    input_indices: tuple[int, ...]  # among the inputs of a step
-    n_stepwise_values: int | None  # per lane; None for a single number
-    list_chain_rule_terms: Callable[[int], tuple[tuple[int, int, float], ...]]
-    """Function that maps the index of a gait step to the terms of the chain rule.
+    def select_values(self, k: int) -> np.ndarray:
+        """Return the values in step `k`, one for each lane."""
+        return self.values[k] if self.values.ndim > 1 else self.values
 
-    A term is (position of the input in `input_indices`, index of the parameter's value, derivative
-    of the input with respect to the value).
+
+def select_step_values(
+    argument: str, values: np.ndarray, n_steps: int, n_lanes: int, offset: int = 0
+) -> StepInput:
+    """Return the input that is the value of an argument in each step, or in one `offset` steps
+    later.
+
+    `values` is a number, or has the shape (lanes,) or (lanes, values). The first and the last value
+    continue beyond the walk.
     """
+    if values.ndim < 2:
+        return StepInput(argument, np.broadcast_to(values, n_lanes))
+    n_values = values.shape[1]
+    index = np.clip(np.arange(n_steps) + offset, 0, n_values - 1)
+    return StepInput(argument, values.T[index], lambda k: [(index[k], 1.0)], n_values)
 
 
-def complete_slopes_over_steps(known_slopes_by_step: np.ndarray, n_steps: int) -> np.ndarray:
-    """Return the slopes of the ground for `n_steps` gait steps, shape (n_steps + 1, lanes), rad.
+def list_rises(heights: np.ndarray, n_steps: int) -> list[StepInput]:
+    """Return the two rises of each step from foothold to foothold, m; see `models.compute_rises`.
 
-    If `known_slopes_by_step` has only `n_steps` slopes per lane, the last slope is repeated.
+    - `heights`: n_steps + 1 or n_steps + 2 heights of footholds for each lane, m.
     """
-    return (
-        known_slopes_by_step.T
-        if known_slopes_by_step.shape[1] > n_steps
-        else np.concatenate([known_slopes_by_step.T, known_slopes_by_step.T[-1:]])
-    )
-
-
-def make_height_terms(
-    input_indices: tuple[int, int], n_given: int, n_steps: int
-) -> StepwiseParameter:
-    """Return the terms by which heights of footholds enter the two rises of each gait step.
-
-    - `n_given`: number of given heights, n_steps + 1 or n_steps + 2.
-    """
+    n_given = heights.shape[1]
     first_foothold = n_steps + 1 - n_given
-    rise_terms = ((0, 0, 1.0), (0, -1, -1.0), (1, 1, 1.0), (1, 0, -1.0))
-    return StepwiseParameter(
-        input_indices,
-        n_given,
-        lambda k: tuple(
-            (input_position, k + offset - first_foothold, derivative)
-            for input_position, offset, derivative in rise_terms
-            if k + offset >= first_foothold
-        ),
-    )
+    rises = np.diff(heights.T, axis=0, prepend=0.0)[-(n_steps + 1) :]
 
+    def list_terms(offset: int, k: int) -> list[tuple[int, float]]:
+        index = k + offset - first_foothold
+        return [(index, 1.0), (index - 1, -1.0)][: index + 1]
 
-def compute_rises_over_steps(heights: np.ndarray, n_steps: int) -> np.ndarray:
-    """Return the height of each foothold minus that of the foothold before, shape (n_steps + 1,
-    lanes), m; see `models.compute_rises`.
-    """
-    return np.diff(heights.T, axis=0, prepend=0.0)[-(n_steps + 1) :]
-
-
-LANE_ARRAY_NAMES = ("section_state", "durations", "outcome", "n_stepped", "solver_steps")
-"""Names of the arrays that a `WalkBatch` has in common with its `StepBatchResult`."""
+    return [
+        StepInput("heights", rises[i:][:n_steps], functools.partial(list_terms, i), n_given)
+        for i in (0, 1)
+    ]
 
 
 class WalkBatch:
@@ -154,162 +147,159 @@ class WalkBatch:
     def __init__(
         self,
         section_states: np.ndarray,
-        derivative_names: Sequence[str],
-        step_parameter_names: tuple[str, ...],
-        stepwise_parameters: Mapping[str, StepwiseParameter],
+        inputs: Sequence[StepInput] = (),
+        derivative_names: Sequence[str] = (),
     ) -> None:
         """Start the walks from section states of shape (components, lanes).
 
-        - `derivative_names`: names of the requested derivatives, from `START_INPUT_NAME` and
-          `step_parameter_names`;
-        - `step_parameter_names`: names of the inputs of a gait step that precede the section state;
-        - `stepwise_parameters`: parameters that are not one equal input of every gait step, by
-          name.
+        - `inputs`: inputs of a step besides the section state;
+        - `derivative_names`: names of the requested derivatives, which are `START_INPUT_NAME` and
+          arguments of the inputs.
         """
-        section_state_size, n_lanes = section_states.shape
-        self.section_state = section_states
-        self.durations = np.zeros((3, n_lanes), section_states.dtype)
+        n_components, n_lanes = section_states.shape
+        self.section_state, self.inputs = section_states, inputs
+        if inputs:
+            self.input_matrix = np.stack([x.select_values(0) for x in inputs])
+        self.durations = np.zeros((0, n_lanes))
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
         self.derivative_names = derivative_names
-        self.differentiated_parameters = {
-            input_name: stepwise_parameters.get(input_name)
-            or StepwiseParameter(
-                (step_parameter_names.index(input_name),), None, lambda _: ((0, 0, 1.0),)
-            )
-            for input_name in derivative_names
-            if input_name != START_INPUT_NAME
+        self.differentiated_inputs = {
+            name: [i for i, x in enumerate(inputs) if x.argument == name]
+            for name in derivative_names
+            if name != START_INPUT_NAME
         }
-        parameter_input_indices = [
-            i
-            for stepwise_parameter in self.differentiated_parameters.values()
-            for i in stepwise_parameter.input_indices
-        ]
-        state_input_indices = len(step_parameter_names) + np.arange(section_state_size)
-        self.input_indices: tuple[int, ...] = (
-            (*parameter_input_indices, *state_input_indices.tolist()) if derivative_names else ()
-        )
-        n_jacobian_rows_by_parameter = [
-            stepwise_parameter.n_stepwise_values or 1
-            for stepwise_parameter in self.differentiated_parameters.values()
-        ]
-        # The first index of each parameter on axis 0 of the Jacobian, and then that of the start.
-        self.first_jacobian_rows = np.cumsum([0, *n_jacobian_rows_by_parameter])
-        n_jacobian_rows = (
-            self.first_jacobian_rows[-1] + section_state_size if derivative_names else 0
-        )
-        self.walk_jacobian = np.zeros(
-            (n_jacobian_rows, section_state_size + 3, n_lanes), section_states.dtype
-        )
+        self.n_values_by_argument = {
+            name: inputs[indices[-1]].n_argument_values
+            for name, indices in self.differentiated_inputs.items()
+        }
+        # Inputs of the Jacobian of a step: those above, and then the section state.
+        self.input_indices: tuple[int, ...] = ()
+        if derivative_names:
+            self.input_indices = (
+                *(i for indices in self.differentiated_inputs.values() for i in indices),
+                *range(len(inputs), len(inputs) + n_components),
+            )
+        # The first index of each argument on axis 0 of the walk's Jacobian, and then of the start.
+        self.first_rows = np.cumsum([0, *(n or 1 for n in self.n_values_by_argument.values())])
 
-    def find_walking_lanes(self) -> np.ndarray:
-        """Return the indices of the lanes whose walks have not ended."""
-        return np.flatnonzero(self.outcome == Outcome.STEPPED)
+    def take_steps(
+        self,
+        n_steps: int,
+        step_lanes: Callable[..., tuple[np.ndarray, ...]],
+        model: Any = None,
+    ) -> None:
+        """Compute up to `n_steps` steps of each walk.
+
+        - `step_lanes`: function of the indices of the walking lanes, their inputs and section
+          states, and the index of the step. It returns section states, durations, outcomes, numbers
+          of solver steps and, if derivatives are requested, Jacobians;
+        - `model`: model of the wheel, whose legs may alternate.
+        """
+        for k in range(n_steps):
+            walking = np.flatnonzero(self.outcome == Outcome.STEPPED)
+            if not len(walking):
+                break
+            lanes = select_lanes(walking, len(self.outcome))
+            inputs = None
+            if self.inputs:
+                for row, step_input in zip(self.input_matrix, self.inputs, strict=True):
+                    if step_input.values.ndim > 1:
+                        row[:] = step_input.select_values(k)
+                if k > 0 and model is not None:
+                    model.exchange_legs(self.input_matrix)
+                inputs = self.input_matrix[:, lanes]
+            section_state, durations, outcome, solver_steps, *jacobian = step_lanes(
+                walking, inputs, self.section_state[:, lanes], k
+            )
+            if k == 0:
+                self.durations = np.zeros((len(durations), len(walking)), durations.dtype)
+                n_rows = self.first_rows[-1] + len(self.section_state)
+                n_outputs = len(self.section_state) + len(durations)
+                self.walk_jacobian = np.zeros(
+                    (n_rows * len(jacobian), n_outputs, len(walking)), durations.dtype
+                )
+            if jacobian:
+                self.walk_jacobian[..., lanes] = self._chain_walk_jacobian(k, lanes, *jacobian)
+            self.section_state[:, lanes] = section_state
+            self.durations[:, lanes] = durations
+            self.outcome[lanes] = outcome
+            self.n_stepped[lanes] += outcome == Outcome.STEPPED
+            self.solver_steps[lanes] += solver_steps
 
     def make_batch_result(
         self,
-        lane_order: np.ndarray,
-        solver_index: np.ndarray,
         engine: str,
         solver_names: tuple[str, ...],
+        lane_order: np.ndarray | None = None,
+        solver_index: np.ndarray | None = None,
     ) -> StepBatchResult:
         """Return the result for the lanes in their original order.
 
-        - `lane_order`: original index of each lane of this batch, which was sorted.
+        - `lane_order`: original index of each lane of this batch, if it was sorted.
         """
-        inverse_lane_order = np.empty_like(lane_order)
-        inverse_lane_order[lane_order] = np.arange(len(lane_order))
-        restore_order = lambda x: x.take(inverse_lane_order, -1).T
-        lane_arrays = {name: restore_order(getattr(self, name)) for name in LANE_ARRAY_NAMES}
+        n_lanes = len(self.outcome)
+        position = slice(None) if lane_order is None else np.argsort(lane_order)
+        restore_order = lambda x: x[..., position].T
+        names = "section_state", "durations", "outcome", "n_stepped", "solver_steps"
         return StepBatchResult(
-            **lane_arrays,
-            solver_index=restore_order(solver_index),
+            **{name: restore_order(getattr(self, name)) for name in names},
+            solver_index=restore_order(
+                np.zeros(n_lanes, np.int32) if solver_index is None else solver_index
+            ),
             engine=engine,
             solver_names=solver_names,
-            derivatives=self.split_jacobian_by_input(inverse_lane_order),
+            derivatives=self._split_jacobian(restore_order),
         )
 
-    def split_jacobian_by_input(self, inverse_lane_order: np.ndarray) -> dict[str, StepSensitivity]:
+    def _split_jacobian(self, restore_order: Callable) -> dict[str, StepSensitivity]:
         """Return the derivatives of the walks by the name of the input, with the value 0 for failed
         walks.
-
-        - `inverse_lane_order`: index in this batch of each lane of the original order.
         """
         if not self.derivative_names:
             return {}
         self.walk_jacobian[..., self.outcome != Outcome.STEPPED] = 0.0
-        jacobian_blocks = np.split(
-            self.walk_jacobian.take(inverse_lane_order, -1).T, self.first_jacobian_rows[1:], -1
-        )
-        jacobian_by_input = dict(
-            zip((*self.differentiated_parameters, START_INPUT_NAME), jacobian_blocks, strict=True)
-        )
-        for input_name, stepwise_parameter in self.differentiated_parameters.items():
-            if stepwise_parameter.n_stepwise_values is None:
-                jacobian_by_input[input_name] = jacobian_by_input[input_name][..., 0]
-        n_components = len(self.section_state)
+        names = *self.differentiated_inputs, START_INPUT_NAME
+        blocks = np.split(restore_order(self.walk_jacobian), self.first_rows[1:], -1)
+        block_by_name = dict(zip(names, blocks, strict=True))
+        for name, n_values in self.n_values_by_argument.items():
+            if n_values is None:
+                block_by_name[name] = block_by_name[name][..., 0]
+        n = len(self.section_state)
         return {
-            input_name: StepSensitivity(
-                jacobian_by_input[input_name][:, :n_components],
-                jacobian_by_input[input_name][:, n_components:],
-            )
-            for input_name in self.derivative_names
+            name: StepSensitivity(block_by_name[name][:, :n], block_by_name[name][:, n:])
+            for name in self.derivative_names
         }
 
-    def store_lane_steps(
-        self, lane_indices: np.ndarray, step_outputs: tuple[np.ndarray, ...]
-    ) -> None:
-        """Store the results of one gait step of the lanes at `lane_indices`.
+    def _chain_walk_jacobian(self, k: int, lanes: Any, step_jacobian: np.ndarray) -> np.ndarray:
+        """Return the Jacobian of the walk after step `k`, shape (inputs, outputs, lanes).
 
-        `step_outputs` contains section states, durations, outcomes, numbers of solver steps and, if
-        derivatives are requested, Jacobians.
-        """
-        section_state, phase_durations, outcome, n_solver_steps, *step_jacobian = step_outputs
-        lanes = select_lanes(lane_indices, self)
-        if step_jacobian:
-            self.walk_jacobian[..., lanes] = self._chain_walk_jacobian(lanes, *step_jacobian)
-        self.section_state[:, lanes] = section_state
-        self.durations[:, lanes] = phase_durations
-        self.outcome[lanes] = outcome
-        self.n_stepped[lanes] += outcome == Outcome.STEPPED
-        self.solver_steps[lanes] += n_solver_steps
-
-    def _chain_walk_jacobian(self, lanes: Any, step_jacobian: np.ndarray) -> np.ndarray:
-        """Return the Jacobian of the walk after the last gait step, shape (inputs, outputs, lanes).
-
-        Axis 0 has one index for each value of a parameter that varies over gait steps. The products
+        Axis 0 has one index for each value of an argument that varies over steps. The products
         are summed one after another, so that a lane's digits do not depend on the batch.
         """
-        n_components = len(self.section_state)
-        state_jacobian = step_jacobian[-n_components:]
-        k = int(np.max(self.n_stepped[lanes], initial=0))
-        walk_jacobian_shape = len(self.walk_jacobian), *step_jacobian.shape[1:]
-        chained_walk_jacobian = np.zeros(walk_jacobian_shape, step_jacobian.dtype)
+        n = len(self.section_state)
+        state_jacobian = step_jacobian[-n:]
+        chained = np.zeros((len(self.walk_jacobian), *step_jacobian.shape[1:]), step_jacobian.dtype)
         if k == 0:
-            chained_walk_jacobian[-n_components:] = state_jacobian
+            chained[-n:] = state_jacobian
         else:
             # The derivatives with respect to values of later steps are still 0.
-            nonzero_rows = np.flatnonzero(self.walk_jacobian.any((1, 2)))
-            previous_jacobian = self.walk_jacobian[nonzero_rows, :n_components][..., lanes]
-            chained_walk_jacobian[nonzero_rows] = sum(
-                state_jacobian[i] * previous_jacobian[:, i, None] for i in range(n_components)
-            )
-        first_input_row = 0
-        for stepwise_parameter, first_jacobian_row in zip(
-            self.differentiated_parameters.values(), self.first_jacobian_rows[:-1], strict=True
+            rows = np.flatnonzero(self.walk_jacobian.any((1, 2)))
+            previous = self.walk_jacobian[rows, :n][..., lanes]
+            chained[rows] = sum(state_jacobian[i] * previous[:, i, None] for i in range(n))
+        columns = iter(step_jacobian)
+        for indices, first_row in zip(
+            self.differentiated_inputs.values(), self.first_rows, strict=False
         ):
-            for input_position, value_index, derivative in stepwise_parameter.list_chain_rule_terms(
-                k
-            ):
-                chained_walk_jacobian[first_jacobian_row + value_index] += (
-                    derivative * step_jacobian[first_input_row + input_position]
-                )
-            first_input_row += len(stepwise_parameter.input_indices)
-        return chained_walk_jacobian
+            for i in indices:
+                column = next(columns)
+                for value_index, derivative in self.inputs[i].list_terms(k):
+                    chained[first_row + value_index] += derivative * column
+        return chained
 
 
-def select_lanes(lane_indices: np.ndarray, walk_batch: WalkBatch) -> Any:
+def select_lanes(lane_indices: np.ndarray, n_lanes: int) -> Any:
     """Return an index that selects the lanes at `lane_indices`.
 
     If these are all lanes, the index is a slice, which copies nothing.
     """
-    return slice(None) if len(lane_indices) == len(walk_batch.outcome) else lane_indices
+    return slice(None) if len(lane_indices) == n_lanes else lane_indices
