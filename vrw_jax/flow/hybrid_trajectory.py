@@ -13,7 +13,8 @@ import numpy as np
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.flow.hybrid_simulation import Termination
+from vrw_jax.flow.hybrid_system import OUTCOME_BY_TERMINATION, HybridSystem
 from vrw_jax.flow.phase_integration import sample_phase
 
 
@@ -29,15 +30,23 @@ def sample_walk_of_system(
     The walk ends at the first step that fails, with the motion until its end.
     """
     mode_names, time, step, outcome = tuple(system.modes), 0.0, 0, Outcome.STEPPED
+    guard_names = [tuple(mode.guards) for mode in system.modes.values()]
     pieces: list[tuple[np.ndarray, np.ndarray, int, int]] = []
     for step, params in enumerate(params_of_steps):
-        result = system.step(params, x, options)
         start = system.embed(jnp.asarray(x), params)
         motion = jax.tree.map(
             np.asarray,
             system.simulate(params, start, events=system.max_events, options=options),
         )
-        outcome, n_events = Outcome(int(result.outcome)), int(result.n_events)
+        n_events = int(motion.n_events)
+        guards = [
+            guard_names[mode][guard]
+            for mode, guard in zip(motion.modes, motion.guards, strict=True)
+        ]
+        ending, outcome = motion.ending, Outcome(int(OUTCOME_BY_TERMINATION[motion.termination]))
+        if system.section in guards[:n_events]:
+            n_events = guards.index(system.section) + 1
+            ending, outcome = Termination.SECTION_REACHED.meaning, Outcome.STEPPED
         end_times, modes = motion.times[:n_events], motion.modes[:n_events]
         if outcome != Outcome.STEPPED:
             end_times, modes = np.append(end_times, motion.time), np.append(modes, motion.mode)
@@ -50,7 +59,8 @@ def sample_walk_of_system(
             pieces.append((time + np.linspace(begin, end, n_samples), states, step, int(mode)))
         if outcome != Outcome.STEPPED:
             break
-        x, time = result.section_state, time + float(result.duration)
+        x = system.project(jnp.asarray(motion.states_after[n_events - 1]), params)
+        time += float(end_times[-1])
     times, states, steps, modes = zip(*pieces, strict=True)
     repeat = lambda values: np.repeat(values, n_samples)
     units = dict(system.state) if isinstance(system.state, Mapping) else {}
@@ -70,7 +80,7 @@ def sample_walk_of_system(
             "title": "Walk of a HybridSystem",
             "n_steps": step + (outcome == Outcome.STEPPED),
             "outcome": outcome.name,
-            "outcome_meaning": str(result.ending),
+            "outcome_meaning": ending,
         },
     )
 
