@@ -25,7 +25,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.arclength import AbstractContinuationProblem, ContinuationPoint, NewtonStep
 from vrw_jax.branches.branch_location import EVENT_ORDER, QuantitiesByName
 from vrw_jax.gaits.collocation_search import CollocationSystem
-from vrw_jax.gaits.force_peaks import compute_force_peaks
+from vrw_jax.gaits.force_peaks import locate_force_peaks
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.return_map_finder import measure_return_map_force_peaks
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
@@ -321,7 +321,7 @@ def _read_collocated_gaits(
             system.make_wheel(parameters).symbols(), phase_points_by_step[0], solution
         )
     if has_force_peaks:
-        quantities |= compute_force_peaks(system, parameters, solution)
+        quantities |= locate_force_peaks(system, parameters, solution)[0]
     return jnp.stack([end_point.q[0], *end_point.v]), quantities
 
 

@@ -193,7 +193,7 @@ def _make_derivative_compiler(
     return compile_function
 
 
-def _make_tangent_function(collocation_system: CollocationSystem) -> Callable:
+def make_tangent_function(collocation_system: CollocationSystem) -> Callable:
     """Return a differentiable function that computes `_compute_collocation_tangents`
     for one wheel.
     """
@@ -281,7 +281,7 @@ def solve_cycle_with_derivatives(
             _search_in_scaled_units, collocation_system, batched_search, starts_only_from_guess
         )
     )
-    compute_tangents = _make_tangent_function(collocation_system)
+    compute_tangents = make_tangent_function(collocation_system)
 
     @jax.custom_jvp
     def solve_with_jvp_rule(
@@ -314,16 +314,24 @@ def attach_monodromy_derivatives(
     """
     compute_parameter_jacobian = make_implicit_jacobian(
         functools.partial(_compute_masked_monodromy, collocation_system),
-        _make_tangent_function(collocation_system),
+        make_tangent_function(collocation_system),
         _make_derivative_compiler(2, collocation_system),
         make_jacobian=functools.partial(_compute_monodromy_tangents, collocation_system),
     )
 
+    return attach_derivatives(
+        compute_parameter_jacobian, monodromy_value, parameters, collocation_state
+    )
+
+
+def attach_derivatives(
+    compute_parameter_jacobian: Callable, value: Any, parameters: Array, gait: Any
+) -> Any:
+    """Return `value` with the derivatives that a function of the parameters and a gait returns."""
+
     @jax.custom_jvp
-    def attach_with_jvp_rule(
-        monodromy_value: Array, parameters: Array, collocation_state: CollocationState
-    ) -> Array:
-        return monodromy_value
+    def attach_with_jvp_rule(value: Any, parameters: Array, gait: Any) -> Any:
+        return value
 
     @attach_with_jvp_rule.defjvp
     @with_default_jax_settings
@@ -332,4 +340,4 @@ def attach_monodromy_derivatives(
             compute_parameter_jacobian(*primals[1:]), tangents[1]
         )
 
-    return attach_with_jvp_rule(monodromy_value, parameters, collocation_state)
+    return attach_with_jvp_rule(value, parameters, gait)

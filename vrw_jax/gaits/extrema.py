@@ -5,9 +5,9 @@ The extrema of R are roots of S. Between two neighboring extrema R is monotone, 
 change of R is one extremum of F.
 
 The roots are first located on a polynomial approximation of F in each mesh interval. The state at a
-root is then computed as the end of an additional interval with Gauss nodes. F, R and S are
-evaluated at that state, and the time of the root is corrected. The extrema are therefore as
-accurate as the cycle.
+root is then computed by one explicit solver step of order 8 from the nearest boundary of a mesh
+interval. F, R and S are evaluated at that state, and the time of the root is corrected. The extrema
+are therefore as accurate as the cycle. Times are in s since the start of the phase.
 """
 
 from collections.abc import Callable
@@ -19,14 +19,12 @@ import numpy as np
 from jax import export, lax
 from jaxtyping import Array, Bool, Float
 
+from vrw_jax.base.elementwise import select_entry_by_mask
 from vrw_jax.base.types import Scalar
+from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.gaits.gauss import (
     DOUBLE_END_WEIGHTS,
-    DOUBLE_INTEGRATION_MATRIX,
     END_WEIGHTS,
-    GAUSS_NODES,
-    INTEGRATION_MATRIX,
-    N_GAUSS_NODES,
     PhaseMesh,
     compute_integration_weights,
 )
@@ -43,40 +41,31 @@ N_BISECTIONS = 24
 """Number of bisections on the polynomials. The value is chosen because the error of a root in a
 phase of 20 mesh intervals is then 1e-6 mesh intervals, less than that of the polynomials.
 """
-N_TIME_CORRECTIONS = 3
+N_TIME_CORRECTIONS = 2
 """Number of corrections of the time of an extremum. The value is chosen because each correction
 reduces the initial error, 1e-4 mesh intervals, at least a hundredfold.
 """
-N_STATE_NEWTON_ITERATIONS = 3
-"""Number of Newton iterations for the state at an extremum. The value is chosen because the initial
-error is 1e-5 and Newton's method converges quadratically.
+SOLVER_NAME = "Dopri8"
+"""Solver of the state at an extremum. Its order is that of the collocation, and its steps are at
+most half as long.
 """
 
 
 class LocatedExtrema(NamedTuple):
     """Extrema of quantities F in one phase, and of their rates R, each in the order of time.
 
-    Nothing here has derivatives. An element that is no extremum has false flags, and its time is
-    meaningless. The last two fields describe additional intervals that end at `times` and then at
-    `rate_times`: the accelerations at their Gauss nodes, and the inverse of the Jacobian by these
-    accelerations of the equations of motion at the nodes.
+    An element that is no extremum has false flags, and its time and value are meaningless.
     """
 
-    times: Float[Array, "quantities extrema"]  # since the start of the phase, s
+    times: Float[Array, "quantities extrema"]
     is_maximum: Bool[Array, "quantities extrema"]
     is_minimum: Bool[Array, "quantities extrema"]
-    rate_times: Float[Array, "quantities rate_extrema"]  # since the start of the phase, s
+    rate_times: Float[Array, "quantities rate_extrema"]
     is_rate_maximum: Bool[Array, "quantities rate_extrema"]
-    node_accelerations: Float[Array, "quantities times unknowns"]
-    inverse_jacobian: Float[Array, "quantities times unknowns unknowns"]
 
 
 class ExtremumValues(NamedTuple):
-    """Values of quantities at their extrema, of their rates R at its extrema, and at both ends.
-
-    They have exact first derivatives, because F and R are stationary in time at their extrema, and
-    because the ends move with the motion.
-    """
+    """Values of quantities at their extrema, of their rates R at its extrema, and at both ends."""
 
     values: Float[Array, "quantities extrema"]
     rates: Float[Array, "quantities rate_extrema"]
@@ -90,352 +79,271 @@ FunctionOfCoordinatesAndRates = Callable[[Array, Array], Array]
 """Function that maps coordinates and rates, each of shape (coordinates,), to an array."""
 
 
-def find_mesh_intervals(interval_boundary_times: Array, times_in_phase: Array) -> Array:
-    """Return for each time the index of the mesh interval that contains it.
+class PhaseMotion(NamedTuple):
+    """States at the boundaries of the mesh intervals of a phase, and the functions of the phase."""
 
-    The times are in s since the start of the phase.
-    """
-    return jnp.clip(
-        jnp.searchsorted(interval_boundary_times, times_in_phase, side="right") - 1,
-        0,
-        len(interval_boundary_times) - 2,
-    )
+    times: Float[Array, " boundaries"]
+    q: Float[Array, "boundaries coordinates"]
+    v: Float[Array, "boundaries coordinates"]
+    coefficients: Float[Array, "intervals powers quantities"]
+    """Coefficients of quantities in powers of the location in an interval, which is in [0, 1]."""
+    compute_acceleration: FunctionOfCoordinatesAndRates
+    compute_quantities: FunctionOfCoordinatesAndRates
 
+    def find_state(self, time: Scalar) -> tuple[Array, Array]:
+        """Return the coordinates and rates at a time.
 
-class CollocatedPhaseMotion(NamedTuple):
-    """Motion during one phase: states at the mesh boundaries and accelerations at the Gauss nodes.
-
-    In each mesh interval the accelerations are a polynomial of time.
-    """
-
-    interval_boundary_times: Float[Array, " boundaries"]  # times of the interval boundaries, s
-    interval_boundary_q: Float[Array, "boundaries coordinates"]
-    interval_boundary_v: Float[Array, "boundaries coordinates"]
-    node_accelerations: Float[Array, "intervals nodes coordinates"]
-
-    @classmethod
-    def from_node_accelerations(
-        cls,
-        phase_mesh: PhaseMesh,
-        start_q: Array,
-        start_v: Array,
-        phase_duration: Scalar,
-        node_accelerations: Array,
-    ) -> "CollocatedPhaseMotion":
-        """Build the motion from its initial state, its duration and its node accelerations.
-
-        `start_q` and `start_v` have the shape (coordinates,). `phase_duration` is in s.
-        `node_accelerations` has the shape (intervals, nodes, coordinates).
+        Their derivatives are those at a fixed distance from the nearest boundary.
         """
-        interval_lengths = (
-            jnp.asarray(phase_mesh.interval_length_fractions, phase_duration.dtype)[:, None]
-            * phase_duration
-        )
-        rate_increments, position_increments = (
-            jnp.einsum("n,ind->id", end_weights, node_accelerations)
-            for end_weights in (END_WEIGHTS, DOUBLE_END_WEIGHTS)
-        )
-        accumulate_increments = lambda initial_boundary_value, interval_increments: jnp.concatenate(
-            [
-                initial_boundary_value[None],
-                initial_boundary_value + jnp.cumsum(interval_increments, axis=0),
-            ]
-        )
-        interval_boundary_v = accumulate_increments(start_v, interval_lengths * rate_increments)
-        interval_boundary_q = accumulate_increments(
-            start_q,
-            interval_lengths * interval_boundary_v[:-1]
-            + interval_lengths * interval_lengths * position_increments,
-        )
-        return cls(
-            accumulate_increments(jnp.zeros(1), interval_lengths)[:, 0],
-            interval_boundary_q,
-            interval_boundary_v,
-            node_accelerations,
-        )
+        tableau: Any = load_explicit_tableau(SOLVER_NAME)
+        dtype = self.q.dtype
+        index = jnp.sum(time >= 0.5 * (self.times[1:] + self.times[:-1]))
+        boundary_time, q, v = (select_entry_by_mask(index, x) for x in (self.times, self.q, self.v))
+        h = lax.stop_gradient(time - boundary_time)
+        rows = [
+            jnp.asarray(x, dtype)
+            for x in (tableau.stage_nodes, tableau.squared_stage_matrix, tableau.stage_matrix)
+        ]
 
-    def evaluate_states_in_intervals(self, location_in_interval: float) -> tuple[Array, Array]:
-        """Return the coordinates and the rates at one relative location in every mesh interval.
+        def find_stage(accelerations: Array, row: Any) -> tuple[Array, Array]:
+            node, position_weights, rate_weights = row
+            weigh = lambda weights: jnp.sum(weights[:, None] * accelerations, 0)
+            return q + h * (node * v + h * weigh(position_weights)), v + h * weigh(rate_weights)
 
-        `location_in_interval` is in [0, 1]. The two arrays have the shape (intervals, coordinates).
+        def add_stage(accelerations: Array, row: Any) -> tuple[Array, None]:
+            index, *row = row
+            acceleration = self.compute_acceleration(*find_stage(accelerations, row))
+            return lax.dynamic_update_index_in_dim(accelerations, acceleration, index, 0), None
+
+        n_stages = len(tableau.stage_nodes) - 1
+        accelerations, _ = lax.scan(
+            add_stage,
+            jnp.zeros((n_stages + 1, *q.shape), dtype),
+            (np.arange(n_stages, dtype=np.int32), *(x[:-1] for x in rows)),
+        )
+        return find_stage(accelerations, [x[-1] for x in rows])
+
+    def evaluate(self, time: Scalar) -> tuple[Array, Array]:
+        """Return all quantities F and their rates R at a time."""
+        q, v = self.find_state(time)
+        return jax.jvp(self.compute_quantities, (q, v), (v, self.compute_acceleration(q, v)))
+
+    def evaluate_polynomial(self, time: Scalar, quantity: Array, order: int) -> Scalar:
+        """Return the first or second time derivative of the polynomial of one quantity.
+
+        `quantity` is 1 for this quantity, and 0 for the others.
         """
-        interval_lengths = jnp.diff(self.interval_boundary_times)[:, None]
-        rate_node_weights, position_node_weights = compute_integration_weights(location_in_interval)
-        rate_increments, position_increments = (
-            jnp.einsum("n,ind->id", node_weights, self.node_accelerations)
-            for node_weights in (rate_node_weights, position_node_weights)
-        )
-        interval_start_v = self.interval_boundary_v[:-1]
-        return self.interval_boundary_q[:-1] + interval_lengths * (
-            location_in_interval * interval_start_v + interval_lengths * position_increments
-        ), interval_start_v + interval_lengths * rate_increments
-
-    def begin_interval(
-        self, time: Scalar, compute_acceleration: FunctionOfCoordinatesAndRates
-    ) -> tuple[Array, Callable, Callable]:
-        """Return an additional interval from the last mesh boundary before a time to this time.
-
-        The result contains a guess of the accelerations at its Gauss nodes, flat, and two functions
-        of these accelerations: the residual of the equations of motion, and the state (q, v) at the
-        end. They are differentiable by the motion, but not by the time, s since the phase's start.
-        """
-        interval_index = find_mesh_intervals(self.interval_boundary_times, time)
-        start_q, start_v = (
-            x[interval_index] for x in (self.interval_boundary_q, self.interval_boundary_v)
-        )
-        h = lax.stop_gradient(time - self.interval_boundary_times[interval_index])
-
-        def compute_residual(flat_accelerations: Array) -> Array:
-            accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
-            q = start_q + h * (
-                GAUSS_NODES[:, None] * start_v + h * (DOUBLE_INTEGRATION_MATRIX @ accelerations)
-            )
-            v = start_v + h * (INTEGRATION_MATRIX @ accelerations)
-            return (accelerations - jax.vmap(compute_acceleration)(q, v)).ravel()
-
-        def compute_end(flat_accelerations: Array) -> tuple[Array, Array]:
-            accelerations = flat_accelerations.reshape(N_GAUSS_NODES, -1)
-            end_q = start_q + h * (start_v + h * (DOUBLE_END_WEIGHTS @ accelerations))
-            return end_q, start_v + h * (END_WEIGHTS @ accelerations)
-
-        guess = lax.stop_gradient(self.node_accelerations[interval_index].ravel())
-        return guess, compute_residual, compute_end
+        index = jnp.sum(time >= self.times[1:-1])
+        start, end = (select_entry_by_mask(index, x) for x in (self.times[:-1], self.times[1:]))
+        length = jnp.where(end > start, end - start, 1.0)
+        coefficients = jnp.sum(select_entry_by_mask(index, self.coefficients) * quantity, 1)
+        location, derivative = (time - start) / length, jnp.zeros_like(time)
+        for power in range(N_SAMPLES_PER_INTERVAL - 1, order - 1, -1):
+            factor = power if order == 1 else power * (power - 1)
+            derivative = derivative * location + factor * coefficients[power]
+        return derivative / length**order
 
 
-class _PiecewiseQuantityPolynomial(NamedTuple):
-    """Quantity in one phase as a polynomial of time in each mesh interval."""
-
-    interval_boundary_times: Float[Array, " boundaries"]
-    interval_coefficients: Float[Array, "intervals powers"]  # in powers of the location in [0, 1]
-
-    def evaluate_polynomial_time_derivative(
-        self, evaluation_times: Array, derivative_order: int
-    ) -> Array:
-        """Return the first or the second time derivative of an interpolated quantity at each time.
-
-        `derivative_order` is 1 or 2. Times are in s since the start of the phase.
-        """
-        interval_indices = find_mesh_intervals(self.interval_boundary_times, evaluation_times)
-        interval_lengths = jnp.diff(self.interval_boundary_times)[interval_indices]
-        interval_lengths = jnp.where(interval_lengths > 0.0, interval_lengths, 1.0)
-        locations_in_intervals = (
-            evaluation_times - self.interval_boundary_times[interval_indices]
-        ) / interval_lengths
-        derivatives_by_location = jnp.zeros_like(evaluation_times)
-        for power in range(self.interval_coefficients.shape[1] - 1, derivative_order - 1, -1):
-            power_factor = power if derivative_order == 1 else power * (power - 1)
-            derivatives_by_location = (
-                derivatives_by_location * locations_in_intervals
-                + power_factor * self.interval_coefficients[interval_indices, power]
-            )
-        return derivatives_by_location / interval_lengths**derivative_order
-
-    @property
-    def sample_times_in_phase(self) -> Array:
-        """Return increasing sample times in s since the start of the phase.
-
-        Each mesh interval contains several sample times. The start and the end of the phase are
-        included.
-        """
-        locations_in_interval = np.linspace(
-            0.0, 1.0, self.interval_coefficients.shape[1], endpoint=False
-        )
-        times_before_phase_end = (
-            self.interval_boundary_times[:-1, None]
-            + jnp.diff(self.interval_boundary_times)[:, None] * locations_in_interval
-        )
-        return jnp.append(times_before_phase_end.ravel(), self.interval_boundary_times[-1])
-
-
-def _sample_quantities(
-    motion: CollocatedPhaseMotion, compute_quantities: FunctionOfCoordinatesAndRates
-) -> Float[Array, "quantities intervals powers"]:
-    """Return the coefficients of the polynomials through samples of quantities in each interval."""
-    angles = np.pi * (np.arange(N_SAMPLES_PER_INTERVAL) + 0.5) / N_SAMPLES_PER_INTERVAL
-    locations = 0.5 - 0.5 * np.cos(angles)
-    states = [motion.evaluate_states_in_intervals(location) for location in locations]
-    q, v = jax.tree.map(lambda *states: jnp.stack(states, 1), *states)
-    samples = jax.vmap(jax.vmap(compute_quantities))(q, v)
-    interpolation = np.linalg.inv(locations[:, None] ** np.arange(N_SAMPLES_PER_INTERVAL))
-    return jnp.einsum("isq,ps->qip", samples, interpolation)
-
-
-def locate_extrema(
-    motion: CollocatedPhaseMotion,
+def reconstruct_motion(
+    mesh: PhaseMesh,
+    start: tuple[Array, Array],
+    duration: Scalar,
+    node_accelerations: Float[Array, "intervals nodes coordinates"],
     compute_acceleration: FunctionOfCoordinatesAndRates,
     compute_quantities: FunctionOfCoordinatesAndRates,
-) -> LocatedExtrema:
-    """Locate the extrema of several quantities inside a phase.
+    has_polynomials: bool,
+) -> PhaseMotion:
+    """Return the motion of a phase from its start (q, v), s and SI units.
 
-    Args:
-        motion: motion during the phase.
-        compute_acceleration: function that maps coordinates and rates to accelerations.
-        compute_quantities: function that maps them to the quantities, shape (quantities,).
+    - `has_polynomials`: whether quantities are sampled for polynomials, else these are zero.
     """
-    phase_duration = motion.interval_boundary_times[-1]
+    angles = np.pi * (np.arange(N_SAMPLES_PER_INTERVAL) + 0.5) / N_SAMPLES_PER_INTERVAL
+    locations, dtype = 0.5 - 0.5 * np.cos(angles), duration.dtype
+    powers = np.arange(N_SAMPLES_PER_INTERVAL)
+    interpolation = np.linalg.inv(locations[:, None] ** powers).astype(dtype)
+    rate_weights, position_weights = np.moveaxis(
+        np.array([compute_integration_weights(x) for x in locations]), 1, 0
+    ).astype(dtype)
+    weigh = lambda weights, accelerations: jnp.sum(weights[:, None] * accelerations, 0)
 
-    def append_time_derivative(function_of_state: Callable) -> Callable:
-        return lambda q, v: jax.jvp(function_of_state, (q, v), (v, compute_acceleration(q, v)))
+    def advance(state: Any, interval: Any) -> tuple[Any, tuple[Any, Any]]:
+        time, q, v = state
+        h, accelerations = interval
 
-    compute_time_derivatives = append_time_derivative(append_time_derivative(compute_quantities))
+        def sample(row: tuple) -> Array:
+            location, rate_row, position_row = row
+            return compute_quantities(
+                q + h * (location * v + h * weigh(position_row, accelerations)),
+                v + h * weigh(rate_row, accelerations),
+            )
 
-    def evaluate_at(time: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the rates R and S of all quantities at a time, and the additional interval."""
-        guess, compute_residual, compute_end = motion.begin_interval(time, compute_acceleration)
+        rows = locations.astype(dtype), rate_weights, position_weights
+        coefficients = interpolation @ lax.map(sample, rows) if has_polynomials else 0.0
+        end_v = v + h * weigh(END_WEIGHTS.astype(dtype), accelerations)
+        end_q = q + h * (v + h * weigh(DOUBLE_END_WEIGHTS.astype(dtype), accelerations))
+        return (time + h, end_q, end_v), (state, coefficients)
 
-        def refine(accelerations: Array, _: None) -> tuple[Array, Array]:
-            inverse_jacobian = jnp.linalg.inv(jax.jacfwd(compute_residual)(accelerations))
-            residual = compute_residual(accelerations)
-            return accelerations - inverse_jacobian @ residual, inverse_jacobian
+    lengths = jnp.asarray(mesh.interval_length_fractions, dtype) * duration
+    end: Any
+    end, (states, coefficients) = lax.scan(
+        advance, (jnp.zeros_like(duration), *start), (lengths, node_accelerations)
+    )
+    times, q, v = (jnp.concatenate([x, y[None]]) for x, y in zip(states, end, strict=True))
+    return PhaseMotion(times, q, v, coefficients, compute_acceleration, compute_quantities)
 
-        accelerations, inverse_jacobians = lax.scan(refine, guess, length=N_STATE_NEWTON_ITERATIONS)
-        (_, rates), (_, second_rates) = compute_time_derivatives(*compute_end(accelerations))
-        return rates, second_rates, accelerations, inverse_jacobians[-1]
 
-    def locate(coefficients: Array, quantity_index: Array) -> LocatedExtrema:
-        """Locate the extrema of one quantity with the given polynomials."""
-        polynomial = _PiecewiseQuantityPolynomial(motion.interval_boundary_times, coefficients)
-        rate_times, slopes = _locate_rate_extrema(polynomial)
+def locate_extrema(motion: PhaseMotion) -> tuple[LocatedExtrema, ExtremumValues]:
+    """Locate the extrema of the quantities inside a phase."""
+    duration = motion.times[-1]
+
+    def evaluate(time: Array, quantity: Array) -> Array:
+        """Return F, R and S of one quantity at a time."""
+        q, v = motion.find_state(time)
+        differentiate = lambda f: (
+            lambda q, v: jax.jvp(f, (q, v), (v, motion.compute_acceleration(q, v)))
+        )
+        (values, rates), (_, second_rates) = differentiate(
+            differentiate(motion.compute_quantities)
+        )(q, v)
+        return jnp.sum(jnp.stack([values, rates, second_rates]) * quantity, 1)
+
+    def locate(quantity: Array) -> tuple[LocatedExtrema, Array, Array]:
+        rate_times, slopes = _locate_rate_extrema(motion, quantity)
         is_rate_extremum = slopes != 0.0
         # The start and the end of the phase bound the extrema of R.
-        starts = jnp.concatenate([jnp.zeros(1), rate_times, phase_duration[None]])
-        inverse_slopes = jnp.pad(jnp.where(is_rate_extremum, 1.0 / slopes, 0.0), 1)
+        starts = jnp.concatenate([jnp.zeros_like(duration)[None], rate_times, duration[None]])
+        inverse_slopes = jnp.where(is_rate_extremum, 1.0 / slopes, 0.0)
+        unbounded = jnp.zeros_like(starts[:1])
+        inverse_slopes = jnp.concatenate([unbounded, inverse_slopes, unbounded])
 
         def locate_next(carry: Any, seeks_extrema: Any) -> tuple[Any, tuple]:
             """Locate the extrema of R, or of F between those of R in `carry`."""
-            times, rates, has_extremum = carry
-            bisected_times = _bisect_zeros(
-                lambda t: polynomial.evaluate_polynomial_time_derivative(t, 1),
-                jnp.stack([times[:-1], times[1:]]),
-                rates[:-1],
-            )
-            times = jnp.where(seeks_extrema, jnp.append(bisected_times, phase_duration), times)
-            has_extremum = (rates[:-1] * rates[1:] < 0.0) & (phase_duration > 0.0)
+            times, rates, _ = carry
+            next_rates = jnp.concatenate([rates[1:], unbounded])
+            has_extremum = (rates * next_rates < 0.0) & (duration > 0.0)
 
-            def correct(times_and_interval: tuple, _: None) -> tuple[tuple, None]:
-                times, (rates, second_rates, *_) = times_and_interval
-                newton_correction = jnp.where(
-                    jnp.append(has_extremum, False),
-                    rates / jnp.where(second_rates == 0.0, 1.0, second_rates),
-                    0.0,
+            def locate_one(candidate: tuple) -> tuple[Array, Array, Array]:
+                start, end, start_rate, inverse_slope, has_extremum = candidate
+                root = _bisect(
+                    lambda t: motion.evaluate_polynomial(t, quantity, 1), start, end, start_rate
                 )
-                correction = jnp.where(
-                    seeks_extrema, newton_correction, second_rates * inverse_slopes
+
+                def correct(state: tuple, _: None) -> tuple[tuple, None]:
+                    time, (_, rate, second_rate) = state
+                    newton_correction = jnp.where(
+                        has_extremum, rate / jnp.where(second_rate == 0.0, 1.0, second_rate), 0.0
+                    )
+                    correction = jnp.where(
+                        seeks_extrema, newton_correction, second_rate * inverse_slope
+                    )
+                    time = jnp.clip(time - correction, 0.0, duration)
+                    return (time, evaluate(time, quantity)), None
+
+                state = jnp.where(seeks_extrema, root, start), jnp.zeros(3, start.dtype)
+                (time, (value, rate, _)), _ = lax.scan(
+                    correct, state, length=1 + N_TIME_CORRECTIONS
                 )
-                times = jnp.clip(times - correction, 0.0, phase_duration)
-                rates, second_rates, *interval = jax.vmap(evaluate_at)(times)
-                quantity_rates = rates[:, quantity_index], second_rates[:, quantity_index]
-                return (times, (*quantity_rates, *interval)), None
+                return time, value, rate
 
-            n_unknowns = motion.node_accelerations[0].size
-            zeros = jnp.zeros_like(times)
-            no_interval = (
-                jnp.zeros((len(times), n_unknowns)),
-                jnp.zeros((len(times), n_unknowns, n_unknowns)),
-            )
-            (times, (rates, _, *interval)), _ = lax.scan(
-                correct, (times, (zeros, zeros, *no_interval)), length=N_TIME_CORRECTIONS
-            )
-            return (times, rates, has_extremum), (times, rates, interval)
+            ends = jnp.concatenate([times[1:], duration[None]])
+            candidates = times, ends, rates, inverse_slopes, has_extremum
+            times, values, rates = lax.map(locate_one, candidates)
+            return (times, rates, has_extremum), (times, values, rates)
 
-        no_extremum = jnp.zeros(len(starts) - 1, bool)
-        (times, _, has_extremum), (all_times, all_rates, intervals) = lax.scan(
+        no_extremum = jnp.zeros_like(starts) > 0.0
+        (_, _, has_extremum), (times, values, rates) = lax.scan(
             locate_next, (starts, jnp.zeros_like(starts), no_extremum), np.array([False, True])
         )
-        is_rising = all_rates[0, :-1] > 0.0
-        join = lambda x: jnp.concatenate([x[1, :-1], x[0, 1:-1]])
-        return LocatedExtrema(
-            times[:-1],
+        is_rising, has_extremum = rates[0, :-1] > 0.0, has_extremum[:-1]
+        extrema = LocatedExtrema(
+            times[1, :-1],
             has_extremum & is_rising,
             has_extremum & ~is_rising,
-            all_times[0, 1:-1],
-            is_rate_extremum & (slopes < 0.0) & (phase_duration > 0.0),
-            *map(join, intervals),
+            times[0, 1:-1],
+            is_rate_extremum & (slopes < 0.0) & (duration > 0.0),
         )
+        return extrema, values[1, :-1], rates[0, 1:-1]
 
-    coefficients = _sample_quantities(motion, compute_quantities)
-    return jax.vmap(locate)(coefficients, jnp.arange(len(coefficients)))
+    n_quantities = motion.coefficients.shape[-1]
+    extrema, values, rates = lax.map(locate, np.eye(n_quantities, dtype=duration.dtype))
+    return extrema, ExtremumValues(values, rates, _evaluate_ends(motion))
 
 
-def _locate_rate_extrema(polynomial: _PiecewiseQuantityPolynomial) -> tuple[Array, Array]:
+def _evaluate_ends(motion: PhaseMotion) -> Float[Array, "quantities 2"]:
+    ends = [motion.compute_quantities(motion.q[i], motion.v[i]) for i in (0, -1)]
+    return jnp.stack(ends, 1)
+
+
+def _locate_rate_extrema(motion: PhaseMotion, quantity: Array) -> tuple[Array, Array]:
     """Return where the second time derivative of the polynomials is zero, and its slope there.
 
     Unused elements lie at the end of the phase, and their slope is zero.
     """
-    times = polynomial.sample_times_in_phase
-    second_rates = polynomial.evaluate_polynomial_time_derivative(times, 2)
-    last = len(times) - 1
-    starts = jnp.nonzero(
-        second_rates[:-1] * second_rates[1:] < 0.0,
-        size=MAX_RATE_EXTREMA_PER_PHASE,
-        fill_value=last,
-    )[0]
-    brackets = jnp.stack([starts, jnp.minimum(starts + 1, last)])
-    is_used = starts < last
-    (first_rates, last_rates), (first_times, last_times) = second_rates[brackets], times[brackets]
-    roots = _bisect_zeros(
-        lambda t: polynomial.evaluate_polynomial_time_derivative(t, 2),
-        times[brackets],
-        first_rates,
+    duration = motion.times[-1]
+    locations = np.linspace(0.0, 1.0, N_SAMPLES_PER_INTERVAL, endpoint=False)
+    evaluate = lambda time: motion.evaluate_polynomial(time, quantity, 2)
+    indices = np.arange(MAX_RATE_EXTREMA_PER_PHASE)
+
+    def compare(state: tuple, sample: tuple) -> tuple[tuple, None]:
+        """Keep the interval before a sample if S changes its sign there."""
+        time, rate, count, brackets = state
+        interval_start, interval_end, location = sample
+        next_time = interval_start + (interval_end - interval_start) * location
+        next_rate = evaluate(next_time)
+        is_change = rate * next_rate < 0.0
+        found = jnp.stack([time, next_time, rate, next_rate])
+        brackets = jnp.where(is_change & (indices[:, None] == count), found, brackets)
+        return (next_time, next_rate, count + jnp.where(is_change, 1.0, 0.0), brackets), None
+
+    # Each sample ends the interval that began at the sample before.
+    n_intervals = len(motion.times) - 1
+    repeat = lambda x: jnp.repeat(x, N_SAMPLES_PER_INTERVAL)
+    zero = jnp.zeros_like(duration)
+    samples = (
+        jnp.append(repeat(motion.times[:-1]), duration),
+        jnp.append(repeat(motion.times[1:]), duration),
+        np.append(np.tile(locations, n_intervals), 0.0),
     )
-    slopes = (last_rates - first_rates) / jnp.where(is_used, last_times - first_times, 1.0)
-    return jnp.where(is_used, roots, times[-1]), jnp.where(is_used, slopes, 0.0)
+    unused = jnp.stack([duration, duration, zero, zero])
+    brackets = jnp.broadcast_to(unused, (MAX_RATE_EXTREMA_PER_PHASE, 4))
+    (_, _, _, brackets), _ = lax.scan(compare, (zero, zero, zero, brackets), samples)
+    start, end, start_rate, end_rate = brackets.T
+    is_used = start < end
+    roots = lax.map(lambda x: _bisect(evaluate, *x), (start, end, start_rate))
+    slopes = (end_rate - start_rate) / jnp.where(is_used, end - start, 1.0)
+    return jnp.where(is_used, roots, duration), jnp.where(is_used, slopes, 0.0)
 
 
-def evaluate_extrema(
-    motion: CollocatedPhaseMotion,
-    compute_acceleration: FunctionOfCoordinatesAndRates,
-    compute_quantities: FunctionOfCoordinatesAndRates,
-    extrema: LocatedExtrema,
-) -> ExtremumValues:
-    """Return the values of several quantities at their located extrema, with derivatives.
+def evaluate_extrema(motion: PhaseMotion, extrema: LocatedExtrema) -> ExtremumValues:
+    """Return the values of the quantities at located extrema, with exact first derivatives.
 
-    The arguments are those of `locate_extrema`. One Newton iteration with the constant Jacobian of
-    `extrema` gives the state at each extremum its derivatives.
+    F and R are stationary in time at their extrema, so that their times need no derivatives.
     """
-
-    def evaluate_at(time: Array, accelerations: Array, inverse_jacobian: Array) -> tuple:
-        _, compute_residual, compute_end = motion.begin_interval(time, compute_acceleration)
-        q, v = compute_end(accelerations - inverse_jacobian @ compute_residual(accelerations))
-        return jax.jvp(compute_quantities, (q, v), (v, compute_acceleration(q, v)))
-
-    times = jnp.concatenate([extrema.times, extrema.rate_times], 1)
-    values, rates = jax.vmap(jax.vmap(evaluate_at))(
-        times, extrema.node_accelerations, extrema.inverse_jacobian
-    )
-    # each quantity at its own times
-    values, rates = (jnp.einsum("qtq->qt", x) for x in (values, rates))
     n_extrema = extrema.times.shape[1]
-    end_indices = np.array([0, -1])
-    ends = jax.vmap(compute_quantities)(
-        motion.interval_boundary_q[end_indices], motion.interval_boundary_v[end_indices]
+    times = jnp.concatenate([extrema.times, extrema.rate_times], 1)
+    values, rates = lax.map(
+        lambda row: lax.map(
+            lambda time: [jnp.sum(x * row[0]) for x in motion.evaluate(time)], row[1]
+        ),
+        (np.eye(len(times), dtype=times.dtype), times),
     )
-    return ExtremumValues(values[:, :n_extrema], rates[:, n_extrema:], ends.T)
+    return ExtremumValues(values[:, :n_extrema], rates[:, n_extrema:], _evaluate_ends(motion))
 
 
-def _bisect_zeros(
-    bracketed_function: Callable[[Array], Array],
-    bracket_end_points: Float[Array, "2 brackets"],
-    bracket_start_values: Float[Array, " brackets"],
-) -> Array:
-    """Return one root of `bracketed_function` in each bracket. The roots carry no derivatives.
+def _bisect(function: Callable[[Array], Array], start: Array, end: Array, value: Array) -> Array:
+    """Return a root of a function between two points.
 
-    `bracket_start_values` contains the values of `bracketed_function` at the first end of each
-    bracket. Without a sign change in a bracket, the result is an arbitrary point of the bracket.
+    `value` is that at the start. Without a change of sign, the result is any point between.
     """
-    start_signs = jnp.sign(bracket_start_values)
 
-    def halve_brackets(bracket_end_points: Array, _: None) -> tuple[Array, None]:
-        starts, ends = bracket_end_points
-        middles = 0.5 * (starts + ends)
-        is_root_later = jnp.sign(bracketed_function(middles)) == start_signs
-        return jnp.stack(
-            [jnp.where(is_root_later, middles, starts), jnp.where(is_root_later, ends, middles)]
+    def halve(bracket: tuple, _: None) -> tuple[tuple, None]:
+        start, end = bracket
+        middle = 0.5 * (start + end)
+        is_root_later = jnp.sign(function(middle)) == jnp.sign(value)
+        return (
+            jnp.where(is_root_later, middle, start),
+            jnp.where(is_root_later, end, middle),
         ), None
 
-    final_end_points, _ = lax.scan(
-        halve_brackets,
-        lax.stop_gradient(bracket_end_points),
-        length=N_BISECTIONS,
-    )
-    return jnp.mean(final_end_points, axis=0)
+    (start, end), _ = lax.scan(halve, (start, end), length=N_BISECTIONS)
+    return 0.5 * (start + end)

@@ -8,6 +8,7 @@ changes of phase are no peaks. The largest force may also occur there.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -20,71 +21,57 @@ from vrw_jax.base.checks import check_type
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
-from vrw_jax.gaits.collocation_search import CollocationSystem
+from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem
+from vrw_jax.gaits.derivatives import attach_derivatives, make_tangent_function
 from vrw_jax.gaits.extrema import (
-    CollocatedPhaseMotion,
     ExtremumValues,
-    FunctionOfCoordinatesAndRates,
     LocatedExtrema,
+    PhaseMotion,
     evaluate_extrema,
     locate_extrema,
+    reconstruct_motion,
 )
-from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.gaits.phase_collocation import CollocationSolution, PhasePoint
+from vrw_jax.lanes.autodiff import make_implicit_jacobian
+from vrw_jax.lanes.batching import BatchFunction, unbatch
+from vrw_jax.lanes.lane_function import compile_batch_function, with_lane_axis
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES, make_measure_attributes
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant, make_paper_phases
 
 
-class PhaseForces(NamedTuple):
-    """Motion in one phase, and functions of coordinates and rates: accelerations and forces.
-
-    The forces are the normal force on the fore foot and, in double support, also the total force.
-    """
-
-    motion: CollocatedPhaseMotion
-    compute_acceleration: FunctionOfCoordinatesAndRates
-    compute_forces: FunctionOfCoordinatesAndRates
-
-
-def _collect_phase_forces(
-    collocation_system: CollocationSystem, parameters: Array, solution: CollocationSolution
-) -> tuple[list[list[PhaseForces]], list[Scalar]]:
-    """Return the forces of each phase in each gait step, and the impulse of the next landing."""
-    forces_by_step, landing_impulses = [], []
-    for step_index, phase_points in enumerate(
-        collocation_system.evaluate_phase_points(parameters, solution)
-    ):
-        symbols = collocation_system.make_wheel(parameters, step_index).symbols()
-        phases = make_paper_phases(
-            symbols, phase_points[0].phase_start_point.held_constants[0], stop_at_lift_off=False
-        )
-        forces_by_step.append(
-            [
-                PhaseForces(
-                    CollocatedPhaseMotion.from_node_accelerations(
-                        mesh,
-                        jnp.stack(points.phase_start_point.q),
-                        jnp.stack(points.phase_start_point.v),
-                        duration,
-                        accelerations[step_index],
-                    ),
-                    functools.partial(_compute_acceleration, phase),
-                    functools.partial(_compute_forces, phase),
-                )
-                for mesh, phase, points, duration, accelerations in zip(
-                    collocation_system.phase_meshes,
-                    phases,
-                    phase_points,
-                    solution.durations[step_index],
-                    solution.accelerations,
-                    strict=True,
-                )
-            ]
-        )
-        end_point = phase_points[-1].phase_end_point
-        landing = transitions.resolve_landing(symbols, end_point.q[0], *end_point.v)
-        landing_impulses.append(landing.fore_impulse.normal)
-    return forces_by_step, landing_impulses
+def _reconstruct_forces(
+    system: CollocationSystem,
+    parameters: Array,
+    solution: CollocationSolution,
+    has_polynomials: bool = False,
+) -> tuple[list[list[PhaseMotion]], list[Scalar]]:
+    """Return the motion and forces of each phase in each gait step, and each landing's impulse."""
+    sequence, constants = system.phase_sequence, system.phase_constants_function(*parameters)
+    section_state, motions_by_step, impulses = tuple(solution.section_state), [], []
+    for step_index in range(system.period_n):
+        step_constants = sequence.select_constants(constants, (step_index % 2,))
+        symbols = system.make_wheel(parameters, step_index).symbols()
+        start = sequence.step_start_map(step_constants, section_state)
+        paper_phases = make_paper_phases(symbols, start.held_constants[0], stop_at_lift_off=False)
+        motions = []
+        for i, phase in enumerate(sequence.phases):
+            motion = reconstruct_motion(
+                system.phase_meshes[i],
+                (jnp.stack(start.q), jnp.stack(start.v)),
+                solution.durations[step_index, i],
+                solution.accelerations[i][step_index],
+                functools.partial(_compute_acceleration, paper_phases[i]),
+                functools.partial(_compute_forces, paper_phases[i]),
+                has_polynomials,
+            )
+            motions.append(motion)
+            end = PhasePoint(start.held_constants, tuple(motion.q[-1]), tuple(motion.v[-1]))
+            start = phase.reset_map(step_constants, end)
+        section_state = start.q
+        motions_by_step.append(motions)
+        impulses.append(transitions.resolve_landing(symbols, end.q[0], *end.v).fore_impulse.normal)
+    return motions_by_step, impulses
 
 
 def _compute_acceleration(phase: AbstractPhase, q: Array, v: Array) -> Array:
@@ -93,6 +80,7 @@ def _compute_acceleration(phase: AbstractPhase, q: Array, v: Array) -> Array:
 
 
 def _compute_forces(phase: AbstractPhase, q: Array, v: Array) -> Array:
+    """Return the normal force on the fore foot and, in double support, also the total force."""
     instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)))
     fore_force = jnp.asarray(instant.fore_force.normal)
     if instant.rear_force is None:
@@ -100,55 +88,87 @@ def _compute_forces(phase: AbstractPhase, q: Array, v: Array) -> Array:
     return jnp.stack([fore_force, fore_force + instant.rear_force.normal])
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def locate_force_extrema(
-    collocation_system: CollocationSystem, parameters: Array, solution: CollocationSolution
-) -> list[list[LocatedExtrema]]:
-    """Return where the forces of each phase in each gait step have extrema.
-
-    The result has no derivatives.
-    """
-    parameters, solution = lax.stop_gradient((parameters, solution))
-    forces_by_step, _ = _collect_phase_forces(collocation_system, parameters, solution)
-    return [[locate_extrema(*forces) for forces in step_forces] for step_forces in forces_by_step]
+ForceExtrema = list[list[LocatedExtrema]]
+"""Extrema of the forces of each phase in each gait step."""
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def evaluate_force_peaks(
-    collocation_system: CollocationSystem,
-    parameters: Array,
-    solution: CollocationSolution,
-    extrema_by_step: list[list[LocatedExtrema]],
+def _summarize_steps(
+    extrema_by_step: ForceExtrema,
+    values_by_step: list[list[ExtremumValues]],
+    durations: Array,
+    landing_impulses: list[Scalar],
 ) -> dict[str, Scalar]:
-    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, from its located extrema.
-
-    Each measure is the largest value over the gait steps of the cycle.
-    """
-    forces_by_step, landing_impulses = _collect_phase_forces(
-        collocation_system, parameters, solution
-    )
+    """Return the `measures.FORCE_PEAK_MEASURES`: the largest value of each over the gait steps."""
     peaks_by_step = []
-    for step_forces, step_extrema, durations, landing_impulse in zip(
-        forces_by_step, extrema_by_step, solution.durations, landing_impulses, strict=True
+    for extrema, values, step_durations, landing_impulse in zip(
+        extrema_by_step, values_by_step, durations, landing_impulses, strict=True
     ):
-        values = [
-            evaluate_extrema(*forces, extrema)
-            for forces, extrema in zip(step_forces, step_extrema, strict=True)
-        ]
-        forces = (_join_phases(step_extrema, values, durations, index) for index in range(2))
-        peaks_by_step.append(
-            {**_summarize_forces(jnp, *forces), "landing_impulse": landing_impulse}
-        )
-    dtype = solution.durations.dtype
-    return jax.tree.map(lambda *values: jnp.nanmax(jnp.stack(values).astype(dtype)), *peaks_by_step)
+        forces = (_join_phases(extrema, values, step_durations, index) for index in range(2))
+        step_peaks = {**_summarize_forces(jnp, *forces), "landing_impulse": landing_impulse}
+        peaks_by_step.append(jax.tree.map(lambda x: x.astype(durations.dtype), step_peaks))
+    return jax.tree.map(lambda *values: functools.reduce(jnp.fmax, values), *peaks_by_step)
 
 
-def compute_force_peaks(
-    collocation_system: CollocationSystem, parameters: Array, solution: CollocationSolution
+def _locate_force_peaks(
+    system: CollocationSystem, parameters: Array, solution: CollocationSolution
+) -> tuple[dict[str, Scalar], ForceExtrema]:
+    """Return the measures of the forces, and the extrema."""
+    motions, impulses = _reconstruct_forces(system, parameters, solution, True)
+    located = [[locate_extrema(motion) for motion in step_motions] for step_motions in motions]
+    extrema = [[x for x, _ in step] for step in located]
+    values = [[x for _, x in step] for step in located]
+    return _summarize_steps(extrema, values, solution.durations, impulses), extrema
+
+
+def _compute_peak_derivatives(
+    system: CollocationSystem, parameters: Array, gait_and_tangents: tuple
+) -> dict[str, Array]:
+    """Return the derivatives of the measures by the parameters, on a leading axis.
+
+    - `gait_and_tangents`: the gait and its extrema, and the gait's derivatives by the parameters.
+    """
+    (state, extrema), (state_tangents, _) = gait_and_tangents
+
+    def evaluate(parameters: Array, solution: CollocationSolution) -> dict[str, Scalar]:
+        motions, impulses = _reconstruct_forces(system, parameters, solution)
+        values = [list(map(evaluate_extrema, *step)) for step in zip(motions, extrema, strict=True)]
+        return _summarize_steps(extrema, values, solution.durations, impulses)
+
+    directions = jnp.eye(len(parameters), dtype=parameters.dtype), state_tangents.solution
+    return lax.map(lambda x: jax.jvp(evaluate, (parameters, state.solution), x)[1], directions)
+
+
+def _compile_for_gaits(function: Callable, system: CollocationSystem, *_: Any) -> BatchFunction:
+    function_of_gait = with_lane_axis(functools.partial(function, system))
+    return compile_batch_function(function_of_gait, system.cycle_options.batch_size)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def locate_force_peaks(
+    system: CollocationSystem, parameters: Array, solution: CollocationSolution
+) -> tuple[dict[str, Scalar], ForceExtrema]:
+    """Return the `measures.FORCE_PEAK_MEASURES` of a gait by name, and the extrema.
+
+    The results have no derivatives.
+    """
+    locate = unbatch(_compile_for_gaits(_locate_force_peaks, system))
+    return locate(*lax.stop_gradient((parameters, solution)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def measure_force_peaks(
+    system: CollocationSystem, parameters: Array, state: CollocationState
 ) -> dict[str, Scalar]:
-    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, inside a larger program."""
-    extrema = locate_force_extrema(collocation_system, parameters, solution)
-    return evaluate_force_peaks(collocation_system, parameters, solution, extrema)
+    """Return the `measures.FORCE_PEAK_MEASURES` of a gait by name, with first derivatives."""
+    peaks, extrema = locate_force_peaks(system, parameters, state.solution)
+    tangent_function = make_tangent_function(system)
+    compute_derivatives = make_implicit_jacobian(
+        functools.partial(_compute_peak_derivatives, system),
+        lambda parameters, gait: (tangent_function(parameters, gait[0]), ()),
+        lambda *_: _compile_for_gaits(_compute_peak_derivatives, system),
+        make_jacobian=functools.partial(_compute_peak_derivatives, system),
+    )
+    return attach_derivatives(compute_derivatives, peaks, parameters, (state, extrema))
 
 
 class _ForceExtrema(NamedTuple):

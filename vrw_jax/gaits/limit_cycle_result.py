@@ -28,7 +28,7 @@ from vrw_jax.gaits.collocation_search import (
 )
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import attach_monodromy_derivatives, solve_cycle_with_derivatives
-from vrw_jax.gaits.force_peaks import evaluate_force_peaks, locate_force_extrema
+from vrw_jax.gaits.force_peaks import measure_force_peaks
 from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
@@ -39,7 +39,6 @@ from vrw_jax.gaits.slope_response import (
     compute_sensitivity_norms,
 )
 from vrw_jax.lanes.batching import is_inside_jit
-from vrw_jax.lanes.saved_traces import evaluate_by_saved_trace
 from vrw_jax.models.step_results import DoubleSupportIndicators, Margins, SectionState
 from vrw_jax.models.stepping import step
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
@@ -193,13 +192,8 @@ class LimitCycle(AbstractCycle):
         )
 
     def _locate_force_peaks(self) -> dict[str, Array]:
-        locate, evaluate = (
-            self.map_over_batch_axes(functools.partial(function, self.system))
-            for function in (locate_force_extrema, evaluate_force_peaks)
-        )
-        gait = self.parameters, self.collocation_state.solution
-        extrema = evaluate_by_saved_trace(locate, *lax.stop_gradient(gait))
-        return evaluate_by_saved_trace(evaluate, *gait, extrema)
+        measure = self.map_over_batch_axes(functools.partial(measure_force_peaks, self.system))
+        return measure(self.parameters, self.collocation_state)
 
     @property
     def margins(self) -> Margins:

@@ -7,6 +7,7 @@ loops, stay without this axis.
 
 import functools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -147,11 +148,12 @@ def _call(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[La
     flags = tuple(x.has_lanes for x in operands)
     if equation.params.get("name") != NOINLINE_FUNCTION_NAME or not any(flags):
         return _evaluate(n_lanes, closed_jaxpr, operands)
-    evaluate_arrays = lambda *arrays: [
-        x.array for x in _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, flags)))
-    ]
+    result_flags = _find_lanes(closed_jaxpr, flags)
+    evaluate_arrays = lambda *arrays: _make_arrays(
+        n_lanes, _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, flags))), result_flags
+    )
     results = mark_noinline(evaluate_arrays)(*(x.array for x in operands))
-    return list(map(LaneValue, results, _find_lanes(n_lanes, closed_jaxpr, flags)))
+    return list(map(LaneValue, results, result_flags))
 
 
 def _broadcast(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
@@ -274,41 +276,46 @@ def _multiply(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> lis
 
 
 @functools.lru_cache(maxsize=1024)
-def _find_lanes(
-    n_lanes: int, closed_jaxpr: ClosedJaxpr, argument_flags: tuple[bool, ...]
-) -> tuple[bool, ...]:
-    """Return which results of a trace have lanes."""
-    result_flags: list[bool] = []
-
-    def evaluate_arrays(arrays: Sequence[Any]) -> list[Any]:
-        results = _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, argument_flags)))
-        result_flags.extend(x.has_lanes for x in results)
-        return [x.array for x in results]
-
-    arguments = [
-        jax.ShapeDtypeStruct((*aval.shape, *(n_lanes,) * flag), aval.dtype)
-        for aval, flag in zip(closed_jaxpr.in_avals, argument_flags, strict=True)
-    ]
-    jax.eval_shape(evaluate_arrays, arguments)
-    return tuple(result_flags)
+def _find_lanes(closed_jaxpr: ClosedJaxpr, argument_flags: tuple[bool, ...]) -> tuple[bool, ...]:
+    """Return which results of a trace have lanes, if the arguments with a true flag have lanes."""
+    jaxpr = closed_jaxpr.jaxpr
+    flags = dict(zip(jaxpr.invars, argument_flags, strict=True))
+    read = lambda atom: not isinstance(atom, Literal) and flags.get(atom, False)
+    for equation in jaxpr.eqns:
+        operands, name = tuple(map(read, equation.invars)), equation.primitive.name
+        if name == "while":
+            results = _find_lanes_of_while(equation.params, operands)
+        elif name == "scan":
+            n_constants, n_carry = _count_scan_arguments(equation.params)
+            results = _spread_lanes(equation.params["jaxpr"], operands, n_constants, n_carry)
+        elif name in CALLED_JAXPR_PARAMETERS:
+            results = _find_lanes(equation.params[CALLED_JAXPR_PARAMETERS[name]], operands)
+        else:
+            results = (any(operands),) * len(equation.outvars)
+        flags |= zip(equation.outvars, results, strict=True)
+    return tuple(map(read, jaxpr.outvars))
 
 
 def _spread_lanes(
-    n_lanes: int,
-    closed_jaxpr: ClosedJaxpr,
-    constants: Sequence[LaneValue],
-    carry: Sequence[LaneValue],
-    others: Sequence[LaneValue] = (),
+    body: ClosedJaxpr, flags: tuple[bool, ...], n_constants: int, n_carry: int
 ) -> tuple[bool, ...]:
     """Return which results of a loop's body have lanes, if carried arrays do in any iteration."""
-    fixed, last = ([x.has_lanes for x in values] for values in (constants, others))
-    flags = [x.has_lanes for x in carry]
+    end = n_constants + n_carry
     while True:
-        result_flags = _find_lanes(n_lanes, closed_jaxpr, (*fixed, *flags, *last))
-        spread = [a or b for a, b in zip(flags, result_flags, strict=False)]
-        if spread == flags:
-            return (*flags, *result_flags[len(flags) :])
-        flags = spread
+        results = _find_lanes(body, flags)
+        spread = *flags[:n_constants], *map(operator.or_, flags[n_constants:end], results)
+        if spread == flags[:end]:
+            return *flags[n_constants:end], *results[n_carry:]
+        flags = *spread, *flags[end:]
+
+
+def _find_lanes_of_while(params: Any, flags: tuple[bool, ...]) -> tuple[bool, ...]:
+    """Return which arrays a loop carries have lanes: all, if lanes end at different iterations."""
+    n_condition, n_body = params["cond_nconsts"], params["body_nconsts"]
+    body_flags = flags[n_condition:]
+    carry = _spread_lanes(params["body_jaxpr"], body_flags, n_body, len(body_flags) - n_body)
+    varies = _find_lanes(params["cond_jaxpr"], (*flags[:n_condition], *carry))[0]
+    return (True,) * len(carry) if varies else carry
 
 
 def _make_arrays(n_lanes: int, values: Sequence[LaneValue], flags: Sequence[bool]) -> list[Any]:
@@ -333,10 +340,9 @@ def _while(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[L
     condition_constants = operands[:n_condition]
     body_constants = operands[n_condition : n_condition + n_body]
     carry = operands[n_condition + n_body :]
-    flags = _spread_lanes(n_lanes, params["body_jaxpr"], body_constants, carry)
+    flags = _find_lanes_of_while(params, tuple(x.has_lanes for x in operands))
     condition_flags = *(x.has_lanes for x in condition_constants), *flags
-    (varies,) = _find_lanes(n_lanes, params["cond_jaxpr"], condition_flags)
-    flags = (True,) * len(flags) if varies else flags
+    (varies,) = _find_lanes(params["cond_jaxpr"], condition_flags)
     make_arrays = lambda values: _make_arrays(n_lanes, values, flags)
     make_values = lambda arrays: list(map(LaneValue, arrays, flags))
 
@@ -371,7 +377,8 @@ def _scan(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[La
     constants, carry = operands[:n_constants], operands[n_constants : n_constants + n_carry]
     scanned = operands[n_constants + n_carry :]
     scanned_flags = [x.has_lanes for x in scanned]
-    flags = _spread_lanes(n_lanes, params["jaxpr"], constants, carry, scanned)
+    operand_flags = tuple(x.has_lanes for x in operands)
+    flags = _spread_lanes(params["jaxpr"], operand_flags, n_constants, n_carry)
 
     def advance(arrays: list[Any], slices: list[Any]) -> tuple[list[Any], list[Any]]:
         values = [

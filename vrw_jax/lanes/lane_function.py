@@ -466,7 +466,7 @@ class _LaneFunctionVariant:
     def _compile(self, function: Callable, differentiated_arguments: tuple) -> Callable:
         """Compile a function of the arrays of one lane, which `jax.vmap` maps to lanes."""
         key = self._key and make_key(self._key, "one lane", differentiated_arguments)
-        lane_function = _append_lane_axis(function, 0, self._name)
+        lane_function = with_lane_axis(function, 0, self._name)
         return unbatch(CompiledBatchFunction(lane_function, self._xla_block_size, key=key))
 
     def _compile_for_batches(
@@ -490,7 +490,7 @@ class _LaneFunctionVariant:
 
         key = self._key and make_key(self._key, "batches", shared_shapes)
         return CompiledBatchFunction(
-            _append_lane_axis(evaluate_assembled, 1, self._name), self._xla_block_size, key=key
+            with_lane_axis(evaluate_assembled, 1, self._name), self._xla_block_size, key=key
         )
 
 
@@ -520,8 +520,11 @@ def _convert_numbers(arrays: Sequence[Any]) -> list[Any]:
     return [jnp.asarray(x, dtype) if isinstance(x, float) else jnp.asarray(x) for x in arrays]
 
 
-def _append_lane_axis(function: Callable, n_shared: int, name: str) -> Callable:
-    """Return a function of lanes on the last axis from a function of one lane, with a name."""
+def with_lane_axis(function: Callable, n_shared: int = 0, name: str = "a function") -> Callable:
+    """Return a function of lanes on the last axis from a function of one lane, with a name.
+
+    The first `n_shared` arguments are the same for all lanes.
+    """
     with_lanes_for_machine_code = append_lane_axis(function, n_shared)
 
     def call_with_lanes(*arguments: Any) -> Any:

@@ -78,27 +78,6 @@ def wrap_with_saved_trace(
     return evaluate_saved_trace
 
 
-_saved_programs: dict[str, Callable] = {}
-"""Functions compiled from their saved traces, by their keys."""
-
-
-def evaluate_by_saved_trace(traced_function: Callable, *arguments: Any) -> Any:
-    """Return `traced_function(*arguments)`, computed from the saved trace of the function.
-
-    Arguments that JAX traces call the function itself, which may then be mapped or differentiated.
-    The result consists of tuples, lists and dictionaries of arrays.
-    """
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
-        return traced_function(*arguments)
-    try:
-        program_key = make_key(traced_function, store.describe_trace_environment())
-    except UnresolvableFunctionError:
-        return jax.jit(traced_function)(*arguments)
-    if program_key not in _saved_programs:
-        _saved_programs[program_key] = jax.jit(wrap_with_saved_trace(traced_function))
-    return _saved_programs[program_key](*arguments)
-
-
 def _load_or_export_trace(
     traced_function: Callable,
     example_arguments: tuple,
