@@ -19,6 +19,7 @@ from vrw_jax.gaits.collocation_search import (
     predict_start_from_gait_surface,
 )
 from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
+from vrw_jax.gaits.derivatives import attach_derivatives
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
     Gait,
@@ -276,17 +277,11 @@ def compute_step_and_derivatives(
     parameters.
     """
 
-    n_parameter_values = len(parameter_values)
-    take_step = lambda step_inputs: model.take_step(
-        collocation_system.make_wheel(step_inputs[:n_parameter_values]),
-        step_inputs[n_parameter_values:],
-        options,
-    )
-    step, step_input_jacobian = evaluate_with_jacobian(
-        take_step, jnp.concatenate([parameter_values, section_state])
-    )
-    input_derivatives = jnp.concatenate(
-        [jnp.eye(n_parameter_values, dtype=section_state.dtype), section_state_derivatives], axis=1
-    )
-    step_derivatives = jax.tree.map(lambda x: x @ input_derivatives.T, step_input_jacobian)
-    return step, move_derivative_axis_first(step_derivatives)
+    def take_step(parameter_values: Array) -> StepResult:
+        start = attach_derivatives(
+            lambda *_: section_state_derivatives, section_state, parameter_values, ()
+        )
+        return model.take_step(collocation_system.make_wheel(parameter_values), start, options)
+
+    step, parameter_jacobian = evaluate_with_jacobian(take_step, parameter_values)
+    return step, move_derivative_axis_first(parameter_jacobian)

@@ -42,8 +42,8 @@ def enable_all_ad_modes(
     differentiated. If `function_to_differentiate` is given, derivatives are those of this function,
     which may for example use tighter tolerances. `compile_jacobian` compiles Jacobians of any
     order, or replaces them by other functions; its second argument are the `argnums` of each order.
-    A Jacobian returns (Jacobians with respect to the arguments `argnums`, float outputs), and the
-    other outputs. Function and Jacobians are compiled once each: outside of `jit`,
+    A Jacobian returns (columns, float outputs), and the other outputs, as those of
+    `compute_jacobian_columns`. Function and Jacobians are compiled once each: outside of `jit`,
     forward mode, reverse mode and single directions all call the same compiled Jacobian.
 
     - `differentiated_arguments`: `argnums` of the orders that `function` already has.
@@ -53,21 +53,16 @@ def enable_all_ad_modes(
 
     @functools.cache
     def get_differentiable_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
-        compute_output_jacobians = _differentiate_float_outputs(
-            function_to_differentiate or function, argnums
-        )
-
-        def compute_argument_jacobians(*arrays: Any) -> tuple[PyTree, PyTree]:
-            output_jacobians, (float_outputs, nonfloat_outputs) = compute_output_jacobians(*arrays)
-            argument_jacobians = jax.tree.transpose(
-                jax.tree.structure(float_outputs), jax.tree.structure(argnums), output_jacobians
+        def compute_jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
+            columns, float_outputs, nonfloat_outputs = compute_jacobian_columns(
+                function_to_differentiate or function, arrays, argnums, has_lanes=False
             )
-            return (argument_jacobians, float_outputs), nonfloat_outputs
+            return (columns, float_outputs), nonfloat_outputs
 
         argnums_by_order = (*differentiated_arguments, argnums)
         return enable_all_ad_modes(
-            compile_jacobian(compute_argument_jacobians, argnums_by_order),
-            compute_argument_jacobians,
+            compile_jacobian(compute_jacobian, argnums_by_order),
+            compute_jacobian,
             compile_jacobian,
             argnums_by_order,
         )
@@ -80,12 +75,10 @@ def enable_all_ad_modes(
         if not perturbed_argnums:
             function_result = wrapped_function(*primals)
             return function_result, make_zero_tangent(function_result)
-        (argument_jacobians, float_outputs), nonfloat_outputs = get_differentiable_jacobian(
-            perturbed_argnums
-        )(*primals)
-        output_tangent = _apply_argument_jacobians(
-            float_outputs, argument_jacobians, tuple(tangents[i] for i in perturbed_argnums)
+        (columns, float_outputs), nonfloat_outputs = get_differentiable_jacobian(perturbed_argnums)(
+            *primals
         )
+        output_tangent = _apply_columns(columns, [tangents[i] for i in perturbed_argnums])
         return (float_outputs, nonfloat_outputs), (
             output_tangent,
             make_zero_tangent(nonfloat_outputs),
@@ -126,13 +119,11 @@ def differentiate(
         def compile_jacobian(jacobian: ForwardFunction, argnums_by_order: tuple) -> ForwardFunction:
             if make_column_function is None or len(argnums_by_order) > 1:
                 return jacobian
-            (argnums,) = argnums_by_order
-            compute_columns = make_column_function(structure, argnums)
+            compute_columns = make_column_function(structure, *argnums_by_order)
 
             def compute_jacobian(*leaves: Array) -> tuple:
                 columns, float_outputs, nonfloat_outputs = compute_columns(*leaves)
-                jacobian = _split_jacobian_by_leaf(columns, leaves, argnums)
-                return (jacobian, float_outputs), nonfloat_outputs
+                return (columns, float_outputs), nonfloat_outputs
 
             return compute_jacobian
 
@@ -159,57 +150,44 @@ def make_leaf_function(function: Callable, structure: Any) -> ForwardFunction:
     )
 
 
-def _split_jacobian_by_leaf(
-    jacobian_columns: Any, argument_leaves: Sequence[Array], input_indices: Sequence[int]
-) -> tuple:
-    """Split a Jacobian into one tree per selected leaf.
-
-    - `jacobian_columns`: Jacobian, whose leading axis runs over all entries of the selected leaves;
-    - `input_indices`: indices of the selected leaves in `argument_leaves`.
-    """
-    jacobian_by_leaf, first_column = [], 0
-    for i in input_indices:
-        leaf_shape = jnp.shape(argument_leaves[i])
-        end_column = first_column + math.prod(leaf_shape)
-        columns_of_leaf = slice(first_column, end_column)
-        select_leaf_columns = lambda x, columns=columns_of_leaf, leaf_shape=leaf_shape: (
-            jnp.moveaxis(x[columns], 0, -1).reshape(*x.shape[1:], *leaf_shape)
-        )
-        jacobian_by_leaf.append(jax.tree.map(select_leaf_columns, jacobian_columns))
-        first_column = end_column
-    return tuple(jacobian_by_leaf)
-
-
 def compute_jacobian_columns(
-    batch_function: BatchFunction, argument_leaves: Sequence[Array], input_indices: Sequence[int]
+    function: Callable,
+    argument_leaves: Sequence[Array],
+    input_indices: Sequence[int],
+    has_lanes: bool = True,
 ) -> tuple:
-    """Return the Jacobian columns, the float results and all other results of a batched function.
+    """Return the Jacobian columns, the float results and all other results of a function.
 
     The columns are derivatives with respect to the leaves at `input_indices`. The leading axis of
-    the columns runs over the entries of the leaves. `batch_function` returns float arrays with the
-    batch on the last axis, and auxiliary results.
+    the columns runs over the entries of the leaves. `function` returns float arrays, and auxiliary
+    results. If `has_lanes` is true, the last axis of all arrays is the batch.
     """
 
     def evaluate_at_selected_leaves(*selected_leaf_values: Array) -> tuple:
         all_leaves = list(argument_leaves)
         for i, selected_leaf_value in zip(input_indices, selected_leaf_values, strict=True):
             all_leaves[i] = selected_leaf_value
-        return batch_function(*all_leaves)
+        return function(*all_leaves)
 
     selected_leaves = [argument_leaves[i] for i in input_indices]
-    n_entries_by_leaf = [math.prod(leaf.shape[:-1]) for leaf in selected_leaves]
+    n_lane_axes = int(has_lanes)
+    n_entries_by_leaf = [math.prod(x.shape[: x.ndim - n_lane_axes]) for x in selected_leaves]
     n_vectors = sum(n_entries_by_leaf)
     # Each entry of a unit vector is a separate constant 0 or 1, so that machine code omits products
     # with 0.
     unit_vectors, unit_tangents = iter(np.eye(n_vectors)), []
     for leaf, n_entries in zip(selected_leaves, n_entries_by_leaf, strict=True):
-        lane_tangents = [
+        lane_shape = leaf.shape[leaf.ndim - n_lane_axes :]
+        tangents = [
             jnp.broadcast_to(
-                jnp.asarray(next(unit_vectors), leaf.dtype)[:, None], (n_vectors, leaf.shape[-1])
+                jnp.asarray(next(unit_vectors), leaf.dtype).reshape(-1, *(1,) * n_lane_axes),
+                (n_vectors, *lane_shape),
             )
             for _ in range(n_entries)
         ]
-        unit_tangents.append(lane_tangents[0] if leaf.ndim == 1 else jnp.stack(lane_tangents, 1))
+        if leaf.ndim > n_lane_axes:
+            tangents = [jnp.stack(tangents, 1).reshape(n_vectors, *leaf.shape)]
+        unit_tangents += tangents
     directional_derivative_function = lambda tangents: jax.jvp(
         evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
     )
@@ -235,22 +213,15 @@ def _differentiate_float_outputs(
 
 
 @jax.jit
-def _apply_argument_jacobians(
-    output_template: PyTree, jacobians: PyTree, tangents: tuple
-) -> PyTree:
-    """Return the sum over arguments of Jacobian times tangent, leaf by leaf.
+def _apply_columns(columns: PyTree, tangents: Sequence[Array]) -> PyTree:
+    """Return the sum over columns of a Jacobian times entries of tangents, leaf by leaf.
 
     Products are written as sums, because a matrix product of small arrays is a library call.
     """
-
-    def apply_leaf_jacobians(_: Array, *leaf_jacobians: Array) -> Array:
-        product_terms = [
-            jnp.sum(jacobian * tangent, axis=tuple(range(-jnp.ndim(tangent), 0)))
-            for jacobian, tangent in zip(leaf_jacobians, tangents, strict=True)
-        ]
-        return sum(product_terms[1:], start=product_terms[0])
-
-    return jax.tree.map(apply_leaf_jacobians, output_template, *jacobians)
+    weights = jnp.concatenate([jnp.ravel(x) for x in tangents])
+    return jax.tree.map(
+        lambda x: jnp.sum(x * weights.reshape(-1, *(1,) * (x.ndim - 1)), 0, x.dtype), columns
+    )
 
 
 ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]
