@@ -330,10 +330,10 @@ def compute_value_and_tangents(
     evaluate_at_floats = lambda all_float_inputs: differentiated_function(
         *eqx.combine(all_float_inputs, non_float_inputs)
     )
-    tangents_of_value = jax.vmap(
-        lambda float_tangent: jax.jvp(evaluate_at_floats, (float_primals,), (float_tangent,))[1]
+    return jax.vmap(
+        lambda tangent: jax.jvp(evaluate_at_floats, (float_primals,), (tangent,)),
+        out_axes=(None, 0),
     )(eqx.filter(input_tangents, eqx.is_inexact_array))
-    return evaluate_at_floats(float_primals), tangents_of_value
 
 
 @eqx.filter_jit
