@@ -32,10 +32,10 @@ from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits import finder
 from vrw_jax.lanes.keys import make_key
+from vrw_jax.studies import scan_collocation, scan_store
 from vrw_jax.studies import scan_dask as dask
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies import scan_planning as planning
-from vrw_jax.studies import scan_store
 from vrw_jax.studies.measure_catalog import ALWAYS_INCLUDED_VARIABLES
 from vrw_jax.studies.scan_collocation import CollocationScanEngine
 from vrw_jax.studies.scan_dask import connect_dask_workers
@@ -526,7 +526,7 @@ def test_the_engine_is_traced_once(
 ) -> None:
     engine({"damping": np.array([200.0])})
     monkeypatch.setattr(
-        CollocationScanEngine, "_compile_programs", lambda *_: pytest.fail("compiled again")
+        scan_collocation, "compile_exported_function", lambda *_: pytest.fail("compiled again")
     )
     engine({"slope": np.array([0.29, 0.3]), "stiffness": np.array([480.0, 500.0])})
 
@@ -535,24 +535,22 @@ def test_the_engine_is_traced_once(
 
 
 def test_parallel_batches_give_the_same_results(
-    engine: CollocationScanEngine, engine_results: Mapping[str, np.ndarray]
+    engine: CollocationScanEngine,
+    engine_results: Mapping[str, np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each of two batches waits until the other has begun: with turns none would ever go on."""
     barrier = threading.Barrier(2, timeout=60.0)
-    programs = [engine._free_programs.get(timeout=60.0) for _ in range(2)]
+    programs = engine.programs["cycles"]
 
-    def met(program: Callable) -> Callable:
+    def meet(program: Callable) -> Callable:
         return lambda values: (barrier.wait(), program(values))[1]
 
-    for program in programs:
-        engine._free_programs.put(program._replace(cycle_program=met(program.cycle_program)))
+    meeting_programs = {device: meet(program) for device, program in programs.items()}
+    monkeypatch.setitem(engine.programs, "cycles", meeting_programs)
     columns = SMALL_GRID.select_samples((slice(None), slice(None)))
     size = SCAN_BATCH_SIZE + SMALL_GRID.size
     joint_result = engine({name: np.resize(column, size) for name, column in columns.items()})
-    for _ in programs:
-        engine._free_programs.get()
-    for program in programs:
-        engine._free_programs.put(program)
     for name, value in engine_results.items():
         np.testing.assert_array_equal(joint_result[name][: SMALL_GRID.size], value, name)
         np.testing.assert_array_equal(
@@ -574,8 +572,8 @@ engine = CollocationScanEngine(scanning.make_plan().evaluation_request)
 columns = scanning.SMALL_GRID.select_samples((slice(None), slice(None)))
 size = SCAN_BATCH_SIZE + scanning.SMALL_GRID.size
 results = engine({{name: np.resize(column, size) for name, column in columns.items()}})
-devices = {{engine._free_programs.get().device.id for _ in range(engine._n_workers)}}
-assert devices == {{0, 1}}, devices
+for programs in (engine.programs["cycles"], engine.programs["steps"]):
+    assert {{device.id for device in programs}} == {{0, 1}}, programs
 np.savez({place!r}, **results)
 """
 
@@ -640,7 +638,7 @@ def test_a_worker_uses_the_trace_keys_of_the_calling_process() -> None:
     evaluation_request = make_plan().evaluation_request
     parsed = pickle.loads(pickle.dumps(evaluation_request))
     own, of_worker = map(CollocationScanEngine, (evaluation_request, parsed))
-    for name in ("_evaluate_cycle_batch", "_evaluate_step_batch"):
+    for name in ("evaluate_cycles", "evaluate_steps"):
         assert make_key(getattr(own, name)) == make_key(getattr(of_worker, name))
 
 

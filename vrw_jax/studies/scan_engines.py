@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -34,7 +33,6 @@ from vrw_jax.lanes.batching import (
     map_in_numpy_batches,
     select_tree_rows,
 )
-from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.ladder import ModelCode, find_selection_reason
 from vrw_jax.models.measures import PASSAGE_MEASURES, SELECTION_MARGIN_NAMES
 from vrw_jax.studies.first_passage import first_passage
@@ -47,6 +45,7 @@ from vrw_jax.studies.measure_catalog import (
 from vrw_jax.studies.scan_collocation import (
     CollocationScanEngine,
     EvaluationRequest,
+    map_in_threads,
     mask_failed_samples,
 )
 from vrw_jax.studies.scan_design import ParameterSamples
@@ -64,11 +63,8 @@ def _evaluate_blocks(
 ) -> ValuesByVariable:
     """Return the values of each variable for blocks of samples, computed in threads."""
     first_block, *other_blocks = blocks
-    results = [evaluate(first_block)]  # This call compiles for all threads.
-    # Threads have separate settings.
-    evaluate = with_default_jax_settings(evaluate)
-    with ThreadPoolExecutor(n_threads) as thread_pool:
-        return concatenate_tree_rows(*results, *thread_pool.map(evaluate, other_blocks))
+    first_results = evaluate(first_block)  # This call compiles for all threads.
+    return concatenate_tree_rows(first_results, *map_in_threads(evaluate, other_blocks, n_threads))
 
 
 def evaluate_contact_gaits(
@@ -103,7 +99,7 @@ def _evaluate_contact_block(
     rows = rows[has_enough_friction] if has_enough_friction.any() else rows[:1]
     slow_gaits = find_slow_gaits(gait_finder, rows)
     make_reader = functools.partial(MeasureReader, gait_finder.measure_reader)
-    derivatives = evaluation_request.requested_derivatives
+    derivatives = list(filter(None, map(parse_derivative, evaluation_request.measure_names)))
     names = [name for name in evaluation_request.measure_names if parse_derivative(name) is None]
     read_gaits = functools.partial(_read_gait_measures, make_reader((*names, "spectral_radius")))
     results = map_in_batches(read_gaits, batch_size, slow_gaits)
