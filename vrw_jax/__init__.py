@@ -45,24 +45,25 @@ from vrw_jax.models.trajectory import simulate
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.models.walk_batch import StepBatchResult
-from vrw_jax.studies.basin_share import BasinShare, basin_share
-from vrw_jax.studies.basins import basin
-from vrw_jax.studies.branch_robustness import measure_basins, measure_gait_sensitivity
+from vrw_jax.studies.basins import BasinShare, basin, basin_share
 from vrw_jax.studies.first_passage import FirstPassage, first_passage
 from vrw_jax.studies.fit import compare_laws, fit
 from vrw_jax.studies.fit_result import FitResult
-from vrw_jax.studies.gait_sensitivity import GaitSensitivity, gait_sensitivity
-from vrw_jax.studies.measure_result import MeasureResult
 from vrw_jax.studies.multifidelity import MultifidelityMean, multifidelity_mean
 from vrw_jax.studies.optimum_curve import ActiveSetChange, OptimumCurve
 from vrw_jax.studies.phase_response import PhaseResponse, phase_response
-from vrw_jax.studies.scan_design import grid, saltelli, samples, sobol, uniform
+from vrw_jax.studies.robustness import (
+    GaitSensitivity,
+    gait_sensitivity,
+    measure_basins,
+    measure_gait_sensitivity,
+)
+from vrw_jax.studies.scan_design import grid, saltelli, samples, sobol, sobol_indices, uniform
 from vrw_jax.studies.scan_execution import scan
 from vrw_jax.studies.scan_store import open_scan
-from vrw_jax.studies.sensitivity_indices import sobol_indices
 from vrw_jax.studies.smallest_disturbance import SmallestDisturbance, smallest_disturbance
 from vrw_jax.studies.special_point_map import SpecialPointMap, map_special_points
-from vrw_jax.studies.tolerance_request import measure_to_tolerance
+from vrw_jax.studies.tolerance_request import MeasureResult, measure_to_tolerance
 from vrw_jax.studies.tune_objective import WheelObjective
 from vrw_jax.studies.tune_problem import tune
 from vrw_jax.studies.tune_result import TuneResult

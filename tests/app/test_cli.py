@@ -26,12 +26,11 @@ from vrw_jax.app import commands as cli
 from vrw_jax.app import scanning
 from vrw_jax.app.commands import app
 from vrw_jax.app.config import parse_config
-from vrw_jax.app.console import make_scan_progress_reporter
-from vrw_jax.app.encoding import replace_unencodable_characters
+from vrw_jax.app.console import make_scan_progress_reporter, replace_unencodable_characters
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import Branch
 from vrw_jax.studies import SpecialPointMap
-from vrw_jax.studies import scan_forecast as forecast
+from vrw_jax.studies import scan_execution as forecast
 from vrw_jax.studies.scan_execution import ScanProgress
 from vrw_jax.studies.scan_planning import ScanPlan
 from vrw_jax.studies.scan_store import open_scan
@@ -152,8 +151,8 @@ def test_characters_that_a_terminal_lacks_are_spelled(
     encoding: str, words: list[str], sentence: str
 ) -> None:
     code = (
-        "from vrw_jax.app import console, encoding\n"
-        "encoding.replace_unencodable_output()\n"
+        "from vrw_jax.app import console\n"
+        "console.replace_unencodable_output()\n"
         'headings = ("quantity", "symbol", "unit")\n'
         'console.print_text_table("λ", [("θ̇⁻", "λ4⁺", "N·s²")], headings)\n'
         'console.print_error_sentence("φ ≥ 0 … Ω")'

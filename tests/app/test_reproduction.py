@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from vrw_jax import plot as plots
 from vrw_jax.app import commands as cli
+from vrw_jax.app import paper_claims as facts
 from vrw_jax.app import paper_reproduction as reproduce
-from vrw_jax.app import paper_table as facts
-from vrw_jax.app.paper_fact import PaperEvidence
+from vrw_jax.app.paper_evidence import PaperEvidence
 from vrw_jax.base.outcomes import Outcome
 
 FIGURE_NAMES = (

@@ -13,7 +13,7 @@ from reference_code.constrained_wheel import Wheel, run_phase
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.studies.basin_share import compute_share_error
+from vrw_jax.studies.basins import compute_share_error
 
 TABLE_1 = vrw.WheelParams()
 GRAVITY, HALF_ANGLE, SLOPE = 9.81, np.pi / 8, 0.1

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax.studies.fidelity import ContactWheelBatch, StepQuantities
 from vrw_jax.studies.refinement import JACOBIAN_COST_IN_STEPS, refine_gaits
-from vrw_jax.studies.tolerance_contact import ContactWheelBatch, StepQuantities
 
 FIXED_VALUE = 0.3
 """First number of the fixed point; the second number is zero."""

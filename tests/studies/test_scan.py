@@ -32,13 +32,13 @@ from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits import finder
 from vrw_jax.lanes.keys import make_key
-from vrw_jax.studies import scan_collocation, scan_store
 from vrw_jax.studies import scan_dask as dask
 from vrw_jax.studies import scan_design as designs
+from vrw_jax.studies import scan_engines, scan_store
 from vrw_jax.studies import scan_planning as planning
 from vrw_jax.studies.measure_catalog import ALWAYS_INCLUDED_VARIABLES
-from vrw_jax.studies.scan_collocation import CollocationScanEngine
 from vrw_jax.studies.scan_dask import connect_dask_workers
+from vrw_jax.studies.scan_engines import CollocationScanEngine
 from vrw_jax.studies.scan_execution import ScanProgress
 from vrw_jax.studies.scan_planning import (
     ChunkResult,
@@ -526,7 +526,7 @@ def test_the_engine_is_traced_once(
 ) -> None:
     engine({"damping": np.array([200.0])})
     monkeypatch.setattr(
-        scan_collocation, "compile_exported_function", lambda *_: pytest.fail("compiled again")
+        scan_engines, "compile_exported_function", lambda *_: pytest.fail("compiled again")
     )
     engine({"slope": np.array([0.29, 0.3]), "stiffness": np.array([480.0, 500.0])})
 
@@ -564,7 +564,7 @@ os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
 import jax, numpy as np
 import vrw_jax
 from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
-from vrw_jax.studies.scan_collocation import CollocationScanEngine
+from vrw_jax.studies.scan_engines import CollocationScanEngine
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
 from support import scanning

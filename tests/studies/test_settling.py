@@ -5,14 +5,14 @@ from unittest.mock import Mock
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.studies.settling import (
+from vrw_jax.studies.fidelity import ContactWheelBatch, StepQuantities
+from vrw_jax.studies.refinement import (
     MAX_LEAPS,
     MAX_SETTLED_DRIFT,
     N_STEPS_PER_LEAP,
     N_WARMUP_STEPS,
     walk_until_settled,
 )
-from vrw_jax.studies.tolerance_contact import ContactWheelBatch, StepQuantities
 
 
 def walk_scalar_map(one_step, start: float, failing_interval: tuple[float, float] = (0.0, 0.0)):

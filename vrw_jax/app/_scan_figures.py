@@ -45,8 +45,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.models.measures import LAW_PREFIXES, MARGIN_MEASURES, MEASURES, describe_violation
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
-from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS
-from vrw_jax.studies.sensitivity_indices import sobol_indices
+from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS, sobol_indices
 from vrw_jax.studies.store_integrity import read_scan_manifest
 
 PARAMETER_AXIS_ORDER = dict.fromkeys(

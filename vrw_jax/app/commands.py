@@ -26,12 +26,12 @@ from vrw_jax.app.config import Config, is_figure_file, load_config, parse_assign
 from vrw_jax.app.console import (
     ExitCode,
     print_error_sentence,
+    replace_unencodable_output,
     report_command_errors,
     show_computation_stages,
     show_warnings_as_sentences,
     stdout_console,
 )
-from vrw_jax.app.encoding import replace_unencodable_output
 from vrw_jax.app.explorer import make_page_address
 from vrw_jax.base.checks import check_path
 from vrw_jax.base.outcomes import Outcome
@@ -47,8 +47,8 @@ from vrw_jax.models.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models.registry import list_model_config_names
 from vrw_jax.models.stepping import step
 from vrw_jax.studies.first_passage import first_passage
-from vrw_jax.studies.gait_sensitivity import gait_sensitivity
-from vrw_jax.studies.scan_forecast import forecast_scan
+from vrw_jax.studies.robustness import gait_sensitivity
+from vrw_jax.studies.scan_execution import forecast_scan
 from vrw_jax.studies.special_point_map import follow_special_points, require_map_grid
 from vrw_jax.studies.tune_problem import tune
 from vrw_jax.wheel.params import WheelParams

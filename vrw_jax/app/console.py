@@ -1,10 +1,13 @@
 """Output of commands: tables, progress, and one-sentence error messages for mistakes of users."""
 
+import codecs
 import contextlib
 import enum
+import io
 import os
 import sys
 import time
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +21,6 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from vrw_jax.app.encoding import replace_unencodable_characters
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import PROGRESS_VARIABLE
@@ -27,12 +29,58 @@ from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES
 from vrw_jax.models.step_results import StepResult
-from vrw_jax.studies.scan_execution import ScanProgress
-from vrw_jax.studies.scan_forecast import format_duration
+from vrw_jax.studies.scan_execution import ScanProgress, format_duration
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, WheelParams
 
 if TYPE_CHECKING:
-    from vrw_jax.app.paper_fact import PaperFact
+    from vrw_jax.app.paper_evidence import PaperFact
+
+
+ENCODING_ERROR_HANDLER_NAME = "vrw_spell"
+"""Name of the handler for encoding errors, chosen because no other library uses it."""
+
+ASCII_REPLACEMENTS = {
+    "α": "alpha", "θ": "theta", "κ": "kappa", "λ": "lambda", "μ": "mu", "ρ": "rho", "σ": "sigma",
+    "φ": "phi", "Δ": "Delta ", "∂": "d", "\u0307": "'", "\u0308": "''", "²": "^2", "ᵀ": "^T",
+    "·": ".", "−": "-", "→": "->", "≤": "<=", "≥": ">=", "≈": "~", "±": "+-", "’": "'",
+    "“": '"', "”": '"', "§": "section ",
+}  # fmt: skip
+"""ASCII replacements for the other characters that commands print."""
+
+
+def replace_unencodable_output() -> None:
+    """Replace, in standard output and standard error, characters that the stream's encoding
+    lacks.
+    """
+    codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
+    for output_stream in (sys.stdout, sys.stderr):
+        if isinstance(output_stream, io.TextIOWrapper):
+            output_stream.reconfigure(errors=ENCODING_ERROR_HANDLER_NAME)
+
+
+def replace_unencodable_characters(printed_text: str, encoding_name: str) -> str:
+    """Return a text in which all characters that the encoding lacks are replaced."""
+    codecs.register_error(ENCODING_ERROR_HANDLER_NAME, _handle_encoding_error)
+    return printed_text.encode(encoding_name, ENCODING_ERROR_HANDLER_NAME).decode(encoding_name)
+
+
+def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
+    """Return the replacement for characters that an encoding lacks, and the index after them."""
+    if not isinstance(encoding_error, UnicodeEncodeError):
+        raise encoding_error
+    return "".join(
+        map(_replace_with_ascii, encoding_error.object[encoding_error.start : encoding_error.end])
+    ), encoding_error.end
+
+
+def _replace_with_ascii(unencodable_character: str) -> str:
+    """Return an ASCII text for a character: its replacement, or replacements of its components."""
+    if unencodable_character.isascii() or unencodable_character in ASCII_REPLACEMENTS:
+        return ASCII_REPLACEMENTS.get(unencodable_character, unencodable_character)
+    decomposed_characters = unicodedata.normalize("NFKD", unencodable_character)
+    if decomposed_characters == unencodable_character:
+        return "" if unicodedata.combining(unencodable_character) else "?"
+    return "".join(map(_replace_with_ascii, decomposed_characters))
 
 
 class ExitCode(enum.IntEnum):
@@ -200,7 +248,7 @@ def print_paper_facts(paper_facts: "list[PaperFact]", folder: Path) -> None:
         ),
         ("fact", "where", "published", "found", ""),
     )
-    from vrw_jax.app.paper_table import summarize_paper_facts
+    from vrw_jax.app.paper_claims import summarize_paper_facts
 
     stdout_console.print(
         f"{summarize_paper_facts(paper_facts)}; see the figures and {folder / 'facts.md'}."

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array
 
-from vrw_jax.app.paper_fact import (
+from vrw_jax.app.paper_evidence import (
     STEP_ERROR_TOLERANCE,
     ClaimValues,
     PaperClaim,

@@ -13,15 +13,16 @@ import xarray as xr
 from jaxtyping import Array
 
 from vrw_jax import plot as plots
-from vrw_jax.app.paper_fact import PaperEvidence, PaperFact
-from vrw_jax.app.paper_gaits import (
+from vrw_jax.app.paper_claims import compute_paper_facts, write_facts_files
+from vrw_jax.app.paper_evidence import (
+    PaperEvidence,
+    PaperFact,
     make_formally_continued_model,
     measure_gaits_along_parameter,
     replace_wheel_parameter,
     walk_along_parameter,
     walk_into_gait,
 )
-from vrw_jax.app.paper_table import compute_paper_facts, write_facts_files
 from vrw_jax.base.checks import check_path
 from vrw_jax.models.stepping import paper_start
 from vrw_jax.models.trajectory import simulate

@@ -1,18 +1,30 @@
-"""Basins of attraction: the gait or the failure in which a walk from each start of a grid ends."""
+"""Basins of attraction: where walks from many starts end, and the share that reaches a gait."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, NamedTuple, get_args
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from vrw_jax.base.checks import check_int, check_reals, check_type, require_untraced_arguments
+from vrw_jax.base.checks import (
+    check_choice,
+    check_int,
+    check_range,
+    check_real,
+    check_reals,
+    check_type,
+    require_untraced_arguments,
+)
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
+from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     AbstractWalker,
@@ -22,6 +34,9 @@ from vrw_jax.base.walker import (
     name_coordinates,
 )
 from vrw_jax.gaits.attractors import find_distinct_orbits, measure_orbit_steps, walk_until_periodic
+from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.gait_search import limit_cycle
+from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     POST_LANDING_COMPONENT_NAMES,
@@ -29,6 +44,7 @@ from vrw_jax.models.measures import (
     make_measure_attributes,
 )
 from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -37,7 +53,7 @@ from vrw_jax.models.stepping import (
     require_single_wheel,
 )
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.params import WheelParams
+from vrw_jax.wheel.params import WheelParams, compute_wheel_units
 
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """One or more values of each component of a start, by name. A component with a single number is not
@@ -285,3 +301,339 @@ def _make_orbit_variables(
             for measure_name, measure_values in orbit_measures.items()
         },
     }
+
+
+# Largest distance between the section states of a walk and of the gait at which the walk has
+# arrived. Distances are in units of the wheel. The value is chosen far above the errors of a gait
+# step and of a gait. It is far below the distances of most gaits from the boundaries of their
+# basins.
+MAX_ARRIVAL_DISTANCE = 1e-6
+
+
+class StableGait(NamedTuple):
+    """Stable gait of one wheel, with the wheel's parameters, the model and the step options."""
+
+    params: WheelParams
+    model: AbstractWheel
+    step_options: StepOptions
+    section_states: np.ndarray  # before the landing of each step, (period_n, m)
+
+    @classmethod
+    def from_cycle(
+        cls,
+        caller_name: str,
+        params: WheelParams,
+        model: ModelLike | None,
+        cycle: AbstractCycle | None,
+        options: StepOptions | None,
+    ) -> "StableGait":
+        """Return the stable gait of `cycle`, which is by default the result of `limit_cycle`.
+
+        Raise TypeError or ValueError if an argument is invalid or the gait is not stable. The
+        messages contain `caller_name`, the name of the public function.
+        """
+        require_untraced_arguments(
+            caller_name, "map vrw.walk over the starts", params, options, cycle
+        )
+        require_single_wheel(params, f"call {caller_name} for one wheel after the other")
+        checked_model = convert_model_argument(model).fallback_model  # valid for any start
+        checked_step_options = convert_step_options(options)
+        checked_step_options.check_tolerances(np.dtype(params.damping.dtype))
+        if cycle is None:
+            cycle = limit_cycle(params, model=checked_model)
+        check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
+        if int(cycle.outcome) != Outcome.STEPPED:
+            raise ValueError(
+                f"this wheel has no gait that could have a basin: {cycle.why} Take a wheel for "
+                "which vrw.limit_cycle finds a gait."
+            )
+        spectral_radius = float(cycle.spectral_radius_value)
+        if not spectral_radius < 1.0:
+            raise ValueError(
+                f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable "
+                "and has no basin: take a wheel whose gait has a spectral radius below 1."
+            )
+        section_states = [np.asarray(cycle.section_state)[None]]
+        for _ in range(cycle.period_n):
+            section_states.append(
+                step_batch(
+                    params, section_states[-1], model=checked_model, options=checked_step_options
+                ).section_state
+            )
+        stable_gait = cls(
+            params, checked_model, checked_step_options, np.concatenate(section_states[:-1])
+        )
+        if not stable_gait.is_on_gait(section_states[-1])[0]:
+            raise ValueError(
+                f"cycle does not repeat after {cycle.period_n} steps of this wheel with "
+                f"{type(checked_model).__name__}: give a cycle of the same wheel and model."
+            )
+        return stable_gait
+
+    def require_start_within_step(self, changes: str) -> None:
+        """Raise a ValueError unless the gait has one step, within which its model can start."""
+        if not self.model.can_start_within_gait_step:
+            raise ValueError(
+                f"{type(self.model).__name__} cannot begin within a step, so that {changes} within "
+                "a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb "
+                "starts by vrw.basin_share."
+            )
+        if len(self.section_states) > 1:
+            raise ValueError(
+                f"cycle repeats after {len(self.section_states)} steps, but {changes} within a "
+                "step need a gait of one step: give a cycle with period_n=1."
+            )
+
+    def is_on_gait(self, section_states: np.ndarray) -> np.ndarray:
+        """Return whether each section state agrees with a section state of the gait, shape
+        (states,).
+
+        Two states agree if their distance is at most `max_gait_distance`.
+        """
+        state_units = self.model.collect_section_units(
+            compute_wheel_units(self.params.symbols()), self.params.n_legs
+        )
+        n_entries = self.model.count_continuous_section_entries(self.params)
+        state_differences = section_states[:, None, :n_entries] - self.section_states[:, :n_entries]
+        scaled_differences = state_differences / np.asarray(state_units)[:n_entries]
+        return np.abs(scaled_differences).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
+
+
+# Number of gait steps between two tests, chosen because more frequent tests need many calls.
+N_STEPS_PER_ARRIVAL_TEST = 10
+
+
+def walk_until_on_gait(
+    stable_gait: StableGait,
+    start_states: np.ndarray,
+    max_steps: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Walk at most `max_steps` gait steps from `start_states`, until the walks are on the gait.
+
+    Return whether each walk arrives, its `Outcome` (STEPPED if it continues), and its number of
+    gait steps up to arrival, failure or `max_steps`.
+
+    - `start_states`: section states before the first landing, shape (starts, components).
+    """
+    n_starts = len(start_states)
+    has_arrived = np.zeros(n_starts, bool)
+    walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
+    n_steps_walked = np.zeros(n_starts, int)
+    embed_section_states: Any = jax.vmap(
+        functools.partial(stable_gait.model.complete_section_state, stable_gait.params)
+    )
+    walking_indices = np.arange(n_starts)
+    section_states = np.asarray(embed_section_states(jnp.asarray(start_states)))
+    for first_step in range(0, max_steps, N_STEPS_PER_ARRIVAL_TEST):
+        if not len(walking_indices):
+            break
+        walk_results = step_batch(
+            stable_gait.params,
+            section_states,
+            min(N_STEPS_PER_ARRIVAL_TEST, max_steps - first_step),
+            model=stable_gait.model,
+            options=stable_gait.step_options,
+        )
+        has_stepped = walk_results.outcome == Outcome.STEPPED
+        is_on_gait = has_stepped & stable_gait.is_on_gait(walk_results.section_state)
+        has_arrived[walking_indices] = is_on_gait
+        walk_outcomes[walking_indices] = walk_results.outcome
+        n_steps_walked[walking_indices] += walk_results.n_stepped
+        is_walking = has_stepped & ~is_on_gait
+        walking_indices = walking_indices[is_walking]
+        section_states = walk_results.section_state[is_walking]
+    return has_arrived, walk_outcomes, n_steps_walked
+
+
+StartSamplingName = Literal["sobol", "random"]
+StartBox = Mapping[str, float | tuple[float, float]]
+"""Bounds (lower, upper) of each component of a start state, by the name of the component.
+
+A single number fixes the component.
+"""
+
+
+class BasinShare(AbstractPrintable):
+    """Share of the start states in a box from which a wheel arrives at its gait.
+
+    - `share`: share of the starts whose walk arrives at the gait;
+    - `share_error`: standard error of `share` for independent starts;
+    - `walking_share`: share of the starts whose walk has not failed after 1, 2, ... gait steps,
+      shape (max_steps,);
+    - `walking_share_error`: standard errors of `walking_share`, shape (max_steps,);
+    - `elsewhere_share`: share of the starts whose walk neither fails nor arrives at the gait within
+      `max_steps` gait steps;
+    - `failure_shares`: shares of the starts whose walk fails, by the name of the `Outcome`;
+    - `n_starts`: number of starts.
+
+    Examples:
+        >>> box = {"theta_touchdown": 0.1, "dtheta_touchdown": (0.8, 2.8)}
+        >>> box |= {"dL1_touchdown": (-0.6, 0.2)}
+        >>> print(vrw.basin_share(vrw.WheelParams(damping=150.0), box, n_starts=256))
+        BasinShare
+          ends up on the gait: 0.7461 (standard error 0.0273)
+          walks after 200 steps: 0.7461 (standard error 0.0273)
+          TOUCHDOWN_BEFORE_STOPPER: 0.2539
+          starts: 256
+    """
+
+    share: float
+    share_error: float
+    walking_share: Float[np.ndarray, " n_steps"]
+    walking_share_error: Float[np.ndarray, " n_steps"]
+    elsewhere_share: float
+    failure_shares: dict[str, float] = eqx.field(static=True)
+    n_starts: int = eqx.field(static=True)
+
+    def summary_rows(self) -> list[LabelAndText]:
+        """Return pairs of label and text for the shares, with their standard errors."""
+        format_share = lambda share, error: f"{share:.4f} (standard error {error:.4f})"
+        return [
+            ("ends up on the gait", format_share(self.share, self.share_error)),
+            (
+                f"walks after {len(self.walking_share)} steps",
+                format_share(self.walking_share[-1], self.walking_share_error[-1]),
+            ),
+            *(
+                (outcome_name, f"{share:.4f}")
+                for outcome_name, share in self.failure_shares.items()
+            ),
+            ("starts", f"{self.n_starts:,}"),
+        ]
+
+
+@announce_wait("gaits and walks", "20 s")
+def basin_share(
+    params: WheelParams,
+    box: StartBox,
+    *,
+    model: ModelLike | None = None,
+    cycle: AbstractCycle | None = None,
+    options: StepOptions | None = None,
+    n_starts: int = 4096,
+    max_steps: int = 200,
+    sampling: StartSamplingName = "sobol",
+    seed: int = 0,
+) -> BasinShare:
+    """Return the share of the start states in a box from which a wheel arrives at its gait.
+
+    The starts are spread evenly over `box`. A walk arrives at the gait when its section state
+    differs from that of the gait by less than 1e-6. The unit is that of the wheel
+    (`compute_wheel_units`). The gait must be stable, so that the walk stays on it.
+
+    The errors are standard errors of a binomial share. For the error, one start that arrives and
+    one that does not are added. The error is therefore positive for a share of 0 or 1. The errors
+    hold for `sampling="random"`. In most boxes, points of a scrambled Sobol' sequence have smaller
+    errors.
+
+    Args:
+        params: parameters of the wheel.
+        box: bounds (lower, upper) or a number for each of "theta_touchdown", "dtheta_touchdown" and
+            "dL1_touchdown", in rad, rad/s, m/s; or for each of "theta_post_impact" and
+            "dtheta_post_impact", in rad, rad/s. Starts to which no landing leads count as
+            BAD_INPUT.
+        model: model of the wheel; by default that of the paper, `ViscoelasticWheel()`. "auto" means
+            unilateral contact, which is valid for all starts.
+        cycle: the gait; by default the result of `limit_cycle`.
+        options: numerical options of the gait steps.
+        n_starts: number of starts, best a power of 2.
+        max_steps: largest number of gait steps of a walk.
+        sampling: "sobol", or "random" for independent starts.
+        seed: seed of the starts.
+
+    Returns:
+        A `BasinShare`: the share of starts whose walks reach the gait, and its error.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, or if the wheel has no stable gait.
+
+    Examples:
+        >>> box = {"theta_touchdown": 0.1, "dtheta_touchdown": (0.8, 2.8)}
+        >>> box |= {"dL1_touchdown": (-0.6, 0.2)}
+        >>> result = vrw.basin_share(vrw.WheelParams(damping=150.0), box, n_starts=256)
+        >>> print(f"{result.share:.2f}")
+        0.75
+    """
+    n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
+    check_choice("sampling", sampling, get_args(StartSamplingName))
+    seed, box_bounds = check_int("seed", seed, 0), parse_start_box(box)
+    stable_gait = StableGait.from_cycle("vrw.basin_share", params, model, cycle, options)
+    return compute_basin_share(stable_gait, box_bounds, n_starts, max_steps, sampling, seed)
+
+
+StartBoxBounds = tuple[tuple[str, ...], np.ndarray, np.ndarray]
+"""Names, lower bounds and upper bounds of the components of start states, rad, rad/s and m/s."""
+
+
+def compute_basin_share(
+    stable_gait: StableGait,
+    box_bounds: StartBoxBounds,
+    n_starts: int,
+    max_steps: int,
+    sampling_name: str = "sobol",
+    seed: int = 0,
+) -> BasinShare:
+    """Return the `BasinShare` for a stable gait and for valid arguments of `basin_share`."""
+    start_component_names, lower_bounds, upper_bounds = box_bounds
+    n_start_components = len(start_component_names)
+    random_generator = np.random.default_rng(seed)
+    if sampling_name == "random":
+        unit_cube_points = random_generator.random((n_starts, n_start_components))
+    else:
+        from scipy.stats import qmc  # This import is slow.
+
+        sobol_sampler = qmc.Sobol(n_start_components, rng=random_generator)
+        unit_cube_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
+    starts = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
+    start_states = compute_section_states_of_starts(
+        stable_gait.params, start_component_names, starts
+    )
+    is_on_gait, walk_outcomes, n_steps_walked = walk_until_on_gait(
+        stable_gait, start_states, max_steps
+    )
+    n_steps_walked[is_on_gait] = max_steps
+    walking_share = np.mean(n_steps_walked[:, None] >= np.arange(1, max_steps + 1), 0)
+    failure_codes, n_failures = np.unique(
+        walk_outcomes[walk_outcomes != Outcome.STEPPED], return_counts=True
+    )
+    arrival_share = float(is_on_gait.mean())
+    return BasinShare(
+        share=arrival_share,
+        share_error=compute_share_error(arrival_share, n_starts),
+        walking_share=walking_share,
+        walking_share_error=compute_share_error(walking_share, n_starts),
+        elsewhere_share=float(np.mean((walk_outcomes == Outcome.STEPPED) & ~is_on_gait)),
+        failure_shares={
+            Outcome(failure_code).name: float(n / n_starts)
+            for failure_code, n in zip(failure_codes, n_failures, strict=True)
+        },
+        n_starts=n_starts,
+    )
+
+
+def compute_share_error(sampled_share: Any, n_draws: int) -> Any:
+    """Return the standard error of a share that is estimated from `n_draws` independent draws.
+
+    `sampled_share` is a share or an array of shares. One draw with each result is added (Laplace's
+    rule of succession), so that the error is positive.
+    """
+    smoothed_share = (sampled_share * n_draws + 1.0) / (n_draws + 2.0)
+    return (smoothed_share * (1.0 - smoothed_share) / n_draws) ** 0.5
+
+
+def parse_start_box(box: StartBox) -> StartBoxBounds:
+    """Return the names and bounds of the components of start states in `box`.
+
+    Raise TypeError if the box is not a mapping. Raise ValueError unless the box bounds all
+    components of one kind of start.
+    """
+    check_type("box", box, Mapping, "write {'theta_touchdown': 0.1, 'dtheta_touchdown': (1, 2)...}")
+    start_component_names = select_start_components("box", box, "a number or two bounds")
+    bounds_of_start_component = [
+        (check_real(component_name, box[component_name]),) * 2
+        if np.ndim(box[component_name]) == 0
+        else check_range(component_name, box[component_name])
+        for component_name in start_component_names
+    ]
+    lower_bounds, upper_bounds = np.array(bounds_of_start_component).T
+    return start_component_names, lower_bounds, upper_bounds

@@ -21,7 +21,7 @@ from vrw_jax.models.measures import (
     STEP_MEASURES,
     make_measure_attributes,
 )
-from vrw_jax.studies.step_quantities import MEASURE_FUNCTIONS
+from vrw_jax.studies.fidelity import MEASURE_FUNCTIONS
 from vrw_jax.wheel.params import PARAMETER_NAMES
 
 ValuesByVariable = dict[str, np.ndarray]

@@ -30,12 +30,20 @@ from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.models.measures import MEASURES
-from vrw_jax.studies.lower_fidelity import ModelIndex, find_paper_gaits, select_wheels
-from vrw_jax.studies.measure_result import MeasureResult
+from vrw_jax.studies.fidelity import (
+    MEASURE_FUNCTIONS,
+    ContactWheelBatch,
+    ModelIndex,
+    evaluate_measures,
+    find_paper_gaits,
+    select_wheels,
+)
 from vrw_jax.studies.refinement import estimate_measures_from_lower_gaits
-from vrw_jax.studies.step_quantities import MEASURE_FUNCTIONS, evaluate_measures
-from vrw_jax.studies.tolerance_contact import ContactWheelBatch
-from vrw_jax.studies.tolerance_request import broadcast_params_and_friction, measure_to_tolerance
+from vrw_jax.studies.tolerance_request import (
+    MeasureResult,
+    broadcast_params_and_friction,
+    measure_to_tolerance,
+)
 from vrw_jax.wheel.params import WheelParams
 
 

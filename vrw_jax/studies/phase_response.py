@@ -24,7 +24,7 @@ from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import concatenate_tree_rows
-from vrw_jax.studies.gait_arrival import StableGait
+from vrw_jax.studies.basins import StableGait
 
 
 class PhaseResponse(AbstractPrintable):

@@ -1,4 +1,10 @@
-"""Refine gaits with unilateral contact by Newton's method, with bounds for the errors of measures.
+"""Find gaits with unilateral contact by walks and Newton's method, and bound errors of measures.
+
+In a fast walk, the states of the legs decay within a few steps. The remaining motion then drifts
+slowly on one curve for hundreds of steps. A few steps determine the drift per step and its decay. A
+leap in the direction of the drift replaces the remaining steps (projective integration: C. W. Gear
+and I. G. Kevrekidis, SIAM J. Sci. Comput. 24, 2003). A leap ends at the latest at the predicted
+limit of the drift. The state at the end of a walk is the initial guess for the refinement.
 
 One walking step with unilateral contact from a section state x yields the defect r = P(x) - x,
 where P is the return map. Newton's correction is d = (I - DP)^-1 r. The gait's step quantities are
@@ -15,14 +21,165 @@ import numpy as np
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET
-from vrw_jax.studies.lower_fidelity import LowerFidelityGaits, ModelIndex
-from vrw_jax.studies.step_quantities import (
-    N_DURATIONS,
-    N_STEP_QUANTITIES,
+from vrw_jax.studies.fidelity import (
+    QUANTITY_NAMES,
+    ContactWheelBatch,
+    LowerFidelityGaits,
+    ModelIndex,
+    StepQuantities,
     compute_measure_derivatives,
     evaluate_measures,
+    replace_rows,
 )
-from vrw_jax.studies.tolerance_contact import ContactWheelBatch, StepQuantities
+
+
+class WalkEnds(NamedTuple):
+    """Full section state and outcome at the end of each walk."""
+
+    has_settled: np.ndarray  # whether the walk has settled, probably near a gait
+    section_states: np.ndarray  # (walks, 4 + 3 n)
+    walk_outcomes: np.ndarray  # STEPPED, or the failure that ended the walk
+    n_steps: np.ndarray  # number of walking steps
+
+
+# Number of walking steps before the first leap.
+N_WARMUP_STEPS = 20
+# Largest number of leaps.
+MAX_LEAPS = 10
+# Number of walking steps after a leap. The value is chosen because five steps miss three of 118
+# gaits, among 451 wheels for which the paper's model has no gait.
+N_STEPS_PER_LEAP = 7
+# Largest length of a leap, in rad, rad/s, m and m/s, chosen because longer leaps skip pairs of
+# close gaits.
+MAX_LEAP_DISTANCE = 0.15
+# Largest ratio of the fade distance to the length of all remaining leaps together. A walk with a
+# larger ratio ends. The fade distance is the distance to the predicted limit of the drift.
+MAX_FADE_DISTANCE_RATIO = 2.0
+# Largest number of remaining leaps at which `MAX_FADE_DISTANCE_RATIO` is tested, chosen because a
+# drift may first grow and then decay.
+MAX_LEAPS_LEFT_TO_GIVE_UP = 3
+
+
+def walk_until_settled(
+    wheel_batch: ContactWheelBatch,
+    wheel_indices: np.ndarray,
+    section_states: np.ndarray,
+) -> WalkEnds:
+    """Return the ends of walks that start at full section states, (walks, 4 + 3 n).
+
+    Each walk settles, fails, or ends without settling after the last leap.
+    """
+    n_walks, n_continuous_entries = len(wheel_indices), section_states.shape[1] - wheel_batch.n_legs
+    loose_step_batch = wheel_batch.make_walk_batch()
+    walk_ends = WalkEnds(
+        np.zeros(n_walks, bool),
+        section_states.copy(),
+        np.full(n_walks, int(Outcome.STEPPED)),
+        np.zeros(n_walks, int),
+    )
+    active_walk_indices, start_states = np.arange(n_walks), section_states
+    n_steps_before_leaps = (
+        N_WARMUP_STEPS,
+        *MAX_LEAPS * (N_STEPS_PER_LEAP,),
+    )
+    for leap_index, n_steps_before_leap in enumerate(n_steps_before_leaps):
+        if not len(active_walk_indices):
+            break
+        walk_ends.n_steps[active_walk_indices] += n_steps_before_leap
+        active_wheel_indices = wheel_indices[active_walk_indices]
+        third_last_step = loose_step_batch.take_steps(
+            active_wheel_indices, start_states, n_steps_before_leap - 2
+        )
+        failed_walk_indices = np.flatnonzero(third_last_step.step_outcomes != Outcome.STEPPED)
+        if len(failed_walk_indices):
+            # A leap failed, or the tolerance of the first steps is too loose.
+            retried_step = (loose_step_batch if leap_index else wheel_batch).take_steps(
+                active_wheel_indices[failed_walk_indices],
+                walk_ends.section_states[active_walk_indices[failed_walk_indices]],
+                n_steps_before_leap - 2,
+            )
+            third_last_step = StepQuantities(*map(np.array, third_last_step))
+            replace_rows(third_last_step, failed_walk_indices, retried_step)
+        last_steps = [third_last_step]
+        for _ in range(2):
+            last_steps.append(
+                loose_step_batch.take_steps(active_wheel_indices, last_steps[-1].section_states)
+            )
+        step_outcomes = np.stack([step.step_outcomes for step in last_steps])
+        has_stepped = np.all(step_outcomes == Outcome.STEPPED, axis=0)
+        first_failed_step_index = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
+        walk_ends.walk_outcomes[active_walk_indices] = step_outcomes[
+            first_failed_step_index, np.arange(len(active_walk_indices))
+        ]
+        active_walk_indices = active_walk_indices[has_stepped]
+        last_states = np.stack([step.section_states[has_stepped] for step in last_steps])
+        walk_ends.section_states[active_walk_indices] = last_states[-1]
+        walk_ends.has_settled[active_walk_indices], leap_vectors, fade_distance = (
+            _extrapolate_drift(last_states, n_continuous_entries)
+        )
+        n_remaining_leaps = MAX_LEAPS - leap_index
+        is_walk_continued = ~walk_ends.has_settled[active_walk_indices] & (
+            (n_remaining_leaps > MAX_LEAPS_LEFT_TO_GIVE_UP)
+            | (fade_distance <= MAX_FADE_DISTANCE_RATIO * MAX_LEAP_DISTANCE * n_remaining_leaps)
+        )
+        active_walk_indices = active_walk_indices[is_walk_continued]
+        start_states = walk_ends.section_states[active_walk_indices]
+        # Each walking step first places loaded feet on the slope, so a leap ends at a valid start.
+        start_states[:, :n_continuous_entries] += leap_vectors[is_walk_continued]
+    return walk_ends
+
+
+# Largest drift per walking step, and largest fade distance, in a settled walk.
+MAX_SETTLED_DRIFT = 5e-4
+# Drift per walking step below which errors of the steps dominate.
+DRIFT_NOISE_LEVEL = 1e-5
+
+
+def _extrapolate_drift(
+    last_states: np.ndarray, n_continuous_entries: int
+) -> tuple[np.ndarray, ...]:
+    """Return whether each walk has settled, the leap of each walk, and the fade distance.
+
+    The first `n_continuous_entries` entries of a section state are continuous. A leap starts at the
+    last state. The fade distance is the distance from this state to the predicted limit of the
+    drift. The leap and the fade distance are zero if the contact codes of the legs change.
+
+    - `last_states`: last three section states of each walk, (3, walks, 4 + 3 n).
+    """
+    leg_codes = last_states[:, :, n_continuous_entries:]
+    has_same_leg_codes = np.all(leg_codes == leg_codes[-1], axis=(0, 2))
+    earlier_state_change, last_state_change = np.diff(
+        last_states[:, :, :n_continuous_entries], axis=0
+    )
+    drift_per_step = np.abs(last_state_change).max(1)
+    with np.errstate(all="ignore"):
+        decay_rate = np.nan_to_num(
+            np.sum(earlier_state_change * last_state_change, axis=1)
+            / np.sum(earlier_state_change * earlier_state_change, axis=1)
+        )
+        n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
+        fade_distance = np.where(
+            drift_per_step < DRIFT_NOISE_LEVEL,
+            0.0,
+            np.abs(n_steps_to_fade) * drift_per_step,
+        )
+        n_leap_steps = np.where(
+            drift_per_step > 0.0,
+            np.minimum(n_steps_to_fade, MAX_LEAP_DISTANCE / drift_per_step),
+            0.0,
+        )
+    # A drift that changes sign at each step leads to a gait of two steps.
+    has_settled = (
+        has_same_leg_codes
+        & (fade_distance < MAX_SETTLED_DRIFT)
+        & (drift_per_step < MAX_SETTLED_DRIFT)
+    )
+    has_leap_vector = has_same_leg_codes & ~has_settled & (decay_rate > 0.0)
+    return (
+        has_settled,
+        np.where(has_leap_vector, n_leap_steps, 0.0)[:, None] * last_state_change,
+        np.where(has_same_leg_codes, fade_distance, 0.0),
+    )
 
 
 class MeasureEstimates(NamedTuple):
@@ -83,41 +240,35 @@ def estimate_measures(
         section_coordinates: indices of the corrected coordinates of a section state.
     """
     n_continuous_entries = section_states.shape[1] - wheel_batch.n_legs
-    has_same_leg_codes = np.all(
-        section_states[:, n_continuous_entries:]
-        == contact_step.section_states[:, n_continuous_entries:],
-        axis=1,
-    ) & (contact_step.step_outcomes == Outcome.STEPPED)
-    section_state_defect = (contact_step.section_states - section_states)[
-        :, section_coordinates
-    ] * has_same_leg_codes[:, None]
+    state_change = contact_step.section_states - section_states
+    has_same_leg_codes = np.all(state_change[:, n_continuous_entries:] == 0.0, axis=1) & (
+        contact_step.step_outcomes == Outcome.STEPPED
+    )
+    defect = state_change[:, section_coordinates] * has_same_leg_codes[:, None]
     with np.errstate(all="ignore"):
-        newton_correction = np.einsum("ijk,ik->ij", inverse_newton_matrix, section_state_defect)
-        gait_quantities = contact_step.step_quantities + np.einsum(
-            "ijk,ik->ij", step_quantity_jacobian, newton_correction
+        correction = np.einsum("ijk,ik->ij", inverse_newton_matrix, defect)
+        quantities = contact_step.step_quantities + np.einsum(
+            "ijk,ik->ij", step_quantity_jacobian, correction
         )
-        measure_jacobian = compute_measure_derivatives(measure_names, gait_quantities)
-        section_state_sensitivity = np.abs(measure_jacobian @ step_quantity_jacobian)
-        correction_effect_on_measures = np.einsum(
-            "ijk,ik->ij", section_state_sensitivity, np.abs(newton_correction)
+        measure_jacobian = compute_measure_derivatives(measure_names, quantities)
+        state_sensitivity = np.abs(measure_jacobian @ step_quantity_jacobian)
+        quantity_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
+            state_sensitivity @ np.abs(inverse_newton_matrix), axis=-1
         )
         step_error_bound = STEP_ERROR_IN_TOLERANCES * float(wheel_batch.step_options.rtol)
-        total_quantity_sensitivity = np.abs(measure_jacobian).sum(-1) + np.sum(
-            section_state_sensitivity @ np.abs(inverse_newton_matrix), axis=-1
-        )
         # An unresolved contact adds its time to one duration and takes the time from another.
-        duration_sensitivity_range = np.ptp(measure_jacobian[:, :, :N_DURATIONS], axis=-1)
-        missed_contact_duration = (
-            N_PRESUMED_MISSED_CONTACTS * wheel_batch.compute_min_contact_duration(wheel_indices)
+        duration_sensitivity = np.ptp(measure_jacobian[:, :, :3], axis=-1)
+        missed_duration = N_PRESUMED_MISSED_CONTACTS * wheel_batch.compute_min_contact_duration(
+            wheel_indices
         )
         return MeasureEstimates(
             has_same_leg_codes,
-            newton_correction,
-            evaluate_measures(measure_names, gait_quantities),
-            correction_effect_on_measures,
+            correction,
+            evaluate_measures(measure_names, quantities),
+            np.einsum("ijk,ik->ij", state_sensitivity, np.abs(correction)),
             measure_jacobian,
-            step_error_bound * total_quantity_sensitivity,
-            missed_contact_duration[:, None] * duration_sensitivity_range,
+            step_error_bound * quantity_sensitivity,
+            missed_duration[:, None] * duration_sensitivity,
         )
 
 
@@ -166,18 +317,12 @@ class RefinedGaits(NamedTuple):
         `gait_indices` are the indices of the wheel's gaits. Two gaits are different if a measure
         differs by more than the sum of both error bounds.
         """
-        distinct_indices: list[int] = []
-        is_attracting_gait = (self.is_found & self.is_attracting)[gait_indices]
-        for gait_index in gait_indices[is_attracting_gait].tolist():
-            measure_differences = np.abs(
-                self.measure_values[gait_index] - self.measure_values[distinct_indices]
-            )
-            error_bound_sums = (
-                self.measure_error_bounds[gait_index] + self.measure_error_bounds[distinct_indices]
-            )
-            if np.all(np.any(measure_differences > error_bound_sums, axis=1)):
-                distinct_indices.append(gait_index)
-        return sorted(distinct_indices, key=lambda gait_index: self.walking_speed[gait_index])
+        values, bounds, distinct = self.measure_values, self.measure_error_bounds, list[int]()
+        for i in gait_indices[(self.is_found & self.is_attracting)[gait_indices]].tolist():
+            is_different = np.abs(values[i] - values[distinct]) > bounds[i] + bounds[distinct]
+            if np.all(np.any(is_different, axis=1)):
+                distinct.append(i)
+        return sorted(distinct, key=lambda i: self.walking_speed[i])
 
 
 # Largest number of Jacobians computed for one gait.
@@ -225,149 +370,110 @@ def refine_gaits(
     Newton's corrections of a gait end when the remaining error is below the allowed error.
     """
     n_gaits, n_coordinates = section_states.shape
-    measure_values = np.full((n_gaits, len(measure_names)), np.nan)
-    gaits = RefinedGaits(
-        is_found=np.zeros(n_gaits, bool),
-        is_attracting=np.zeros(n_gaits, bool),
-        measure_values=measure_values,
-        measure_error_bounds=np.full_like(measure_values, np.inf),
-        n_steps=np.zeros(n_gaits, int),
-        section_states=section_states.copy(),
-        walking_speed=np.full(n_gaits, np.nan),
-    )
-    numerical_error_bounds = np.full_like(measure_values, np.inf)
-    needs_tolerance_comparison = np.zeros(n_gaits, bool)
-    inverse_newton_matrix = np.zeros((n_gaits, n_coordinates, n_coordinates))
-    step_quantity_jacobian = np.zeros((n_gaits, N_STEP_QUANTITIES, n_coordinates))
+    values, error_bounds, numerical_bounds = np.full((3, n_gaits, len(measure_names)), np.inf)
+    values[:] = np.nan
+    is_found, is_compared, n_steps = np.zeros((3, n_gaits), int)
+    is_found, is_compared = is_found.astype(bool), is_compared.astype(bool)
+    section_states, speeds = section_states.copy(), np.full(n_gaits, np.nan)
+    inverses = np.zeros((n_gaits, n_coordinates, n_coordinates))
+    quantity_jacobians = np.zeros((n_gaits, len(QUANTITY_NAMES), n_coordinates))
 
-    def estimate_gait_measures(
-        stepping_batch: ContactWheelBatch, gait_indices: np.ndarray, contact_step: StepQuantities
+    def take_steps(batch: ContactWheelBatch, gaits: np.ndarray) -> StepQuantities:
+        n_steps[gaits] += 1
+        return batch.take_steps(wheel_indices[gaits], section_states[gaits])
+
+    def estimate(
+        batch: ContactWheelBatch, gaits: np.ndarray, step: StepQuantities
     ) -> MeasureEstimates:
         return estimate_measures(
-            stepping_batch,
-            wheel_indices[gait_indices],
-            gaits.section_states[gait_indices],
-            contact_step,
-            inverse_newton_matrix[gait_indices],
-            step_quantity_jacobian[gait_indices],
+            batch,
+            wheel_indices[gaits],
+            section_states[gaits],
+            step,
+            inverses[gaits],
+            quantity_jacobians[gaits],
             measure_names,
         )
 
-    next_gait_indices = np.arange(n_gaits)
+    remaining = np.arange(n_gaits)
     for _ in range(MAX_JACOBIANS_PER_GAIT):
-        if not len(next_gait_indices):
+        if not len(remaining):
             break
-        gait_indices, next_gait_indices = next_gait_indices, next_gait_indices[:0]
-        contact_step, return_map_jacobian, step_quantity_jacobian[gait_indices] = (
-            wheel_batch.linearize_steps(
-                wheel_indices[gait_indices], gaits.section_states[gait_indices]
-            )
+        gaits, remaining = remaining, remaining[:0]
+        step, jacobian, quantity_jacobians[gaits] = wheel_batch.linearize_steps(
+            wheel_indices[gaits], section_states[gaits]
         )
-        inverse_newton_matrix[gait_indices] = solve_linear_systems(
-            np.eye(n_coordinates) - return_map_jacobian,
-            np.broadcast_to(np.eye(n_coordinates), return_map_jacobian.shape),
+        identity = np.eye(n_coordinates)
+        inverses[gaits] = solve_linear_systems(
+            identity - jacobian, np.broadcast_to(identity, jacobian.shape)
         )
-        gaits.n_steps[gait_indices] += JACOBIAN_COST_IN_STEPS
-        previous_correction_length = np.full(len(gait_indices), np.inf)
+        n_steps[gaits] += JACOBIAN_COST_IN_STEPS
+        last_length = np.full(len(gaits), np.inf)
         for n_corrections in range(MAX_CORRECTIONS_PER_JACOBIAN):
-            measure_estimates = estimate_gait_measures(wheel_batch, gait_indices, contact_step)
-            correction_length = np.linalg.norm(measure_estimates.newton_correction, axis=1)
-            contraction_rate = correction_length / np.maximum(
-                previous_correction_length, np.finfo(float).tiny
+            estimates = estimate(wheel_batch, gaits, step)
+            has_same_codes = estimates.has_same_leg_codes
+            length = np.linalg.norm(estimates.newton_correction, axis=1)
+            contraction = length / np.maximum(last_length, np.finfo(float).tiny)
+            is_slow = contraction > MAX_CONTRACTION_RATE
+            goal = compute_error_goal(estimates.measure_values)
+            remaining_bound = REFINEMENT_SAFETY_FACTOR * estimates.correction_effect_on_measures
+            step_bound, missed_bound = (
+                estimates.numerical_error_bound,
+                estimates.missed_contact_error_bound,
             )
-            is_contraction_slow = contraction_rate > MAX_CONTRACTION_RATE
-            error_bound = REFINEMENT_SAFETY_FACTOR * measure_estimates.correction_effect_on_measures
-            error_bound_goal = compute_error_goal(measure_estimates.measure_values)
-            is_error_within_goal = (n_corrections > 0) & np.all(
-                error_bound
-                <= np.maximum(
-                    error_bound_goal - measure_estimates.numerical_error_bound,
-                    measure_estimates.numerical_error_bound,
-                ),
-                axis=1,
+            is_accurate = (n_corrections > 0) & np.all(
+                remaining_bound <= np.maximum(goal - step_bound, step_bound), axis=1
             )
-            is_correction_at_stall_length = correction_length <= STALL_LENGTH_IN_TOLERANCES * float(
-                wheel_batch.step_options.rtol
+            is_stalled = length <= STALL_LENGTH_IN_TOLERANCES * float(wheel_batch.step_options.rtol)
+            is_finished = has_same_codes & np.where(is_slow, is_stalled, is_accurate)
+            finished = gaits[is_finished]
+            is_found[finished] = True
+            values[finished] = estimates.measure_values[is_finished]
+            error_bounds[finished] = remaining_bound[is_finished]
+            numerical_bounds[finished] = (step_bound + missed_bound)[is_finished]
+            speeds[finished] = evaluate_measures(("speed",), step.step_quantities)[is_finished, 0]
+            is_presumed_error_large = missed_bound > MAX_PRESUMED_ERROR_FRACTION * goal
+            is_compared[finished] = is_every_gait_compared | np.any(
+                is_presumed_error_large[is_finished], axis=1
             )
-            is_refinement_finished = measure_estimates.has_same_leg_codes & np.where(
-                is_contraction_slow, is_correction_at_stall_length, is_error_within_goal
+            is_continued = (
+                ~is_finished
+                & (step.step_outcomes == Outcome.STEPPED)
+                & (length <= MAX_CORRECTION_LENGTH)
+                & (contraction < 1.0)
             )
-            finished_gait_indices = gait_indices[is_refinement_finished]
-            gaits.is_found[finished_gait_indices] = True
-            has_large_presumed_error = np.any(
-                measure_estimates.missed_contact_error_bound
-                > MAX_PRESUMED_ERROR_FRACTION * error_bound_goal,
-                axis=1,
-            )
-            for gait_results, new_results in (
-                (gaits.measure_values, measure_estimates.measure_values),
-                (gaits.measure_error_bounds, error_bound),
-                (
-                    numerical_error_bounds,
-                    measure_estimates.numerical_error_bound
-                    + measure_estimates.missed_contact_error_bound,
-                ),
-                (
-                    gaits.walking_speed,
-                    evaluate_measures(("speed",), contact_step.step_quantities)[:, 0],
-                ),
-                (needs_tolerance_comparison, is_every_gait_compared | has_large_presumed_error),
-            ):
-                gait_results[finished_gait_indices] = new_results[is_refinement_finished]
-            is_refinement_continued = (
-                ~is_refinement_finished
-                & (contact_step.step_outcomes == Outcome.STEPPED)
-                & (correction_length <= MAX_CORRECTION_LENGTH)
-                & (contraction_rate < 1.0)
-            )
-            gaits.section_states[gait_indices[is_refinement_continued]] = np.where(
-                measure_estimates.has_same_leg_codes[:, None],
-                gaits.section_states[gait_indices] + measure_estimates.newton_correction,
-                contact_step.section_states,
-            )[is_refinement_continued]
-            needs_new_jacobian = is_refinement_continued & (
-                is_contraction_slow | ~measure_estimates.has_same_leg_codes
-            )
-            next_gait_indices = np.append(next_gait_indices, gait_indices[needs_new_jacobian])
-            is_refinement_continued &= ~needs_new_jacobian
-            gait_indices = gait_indices[is_refinement_continued]
-            previous_correction_length = correction_length[is_refinement_continued]
-            if not len(gait_indices):
+            section_states[gaits[is_continued]] = np.where(
+                has_same_codes[:, None],
+                section_states[gaits] + estimates.newton_correction,
+                step.section_states,
+            )[is_continued]
+            needs_jacobian = is_continued & (is_slow | ~has_same_codes)
+            remaining = np.append(remaining, gaits[needs_jacobian])
+            is_continued &= ~needs_jacobian
+            gaits, last_length = gaits[is_continued], length[is_continued]
+            if not len(gaits):
                 break
-            contact_step = wheel_batch.take_steps(
-                wheel_indices[gait_indices], gaits.section_states[gait_indices]
-            )
-            gaits.n_steps[gait_indices] += 1
-    compared_gait_indices = np.flatnonzero(needs_tolerance_comparison)
-    error_bounds_by_tolerance = [np.zeros((len(compared_gait_indices), len(measure_names)))]
-    for comparison_batch in wheel_batch.make_comparison_batches():
+            step = take_steps(wheel_batch, gaits)
+    compared = np.flatnonzero(is_compared)
+    compared_bounds = [np.zeros((len(compared), len(measure_names)))]
+    for batch in wheel_batch.make_comparison_batches():
         # The duration of the shortest resolved contact depends on the tolerance.
-        contact_step = comparison_batch.take_steps(
-            wheel_indices[compared_gait_indices], gaits.section_states[compared_gait_indices]
-        )
-        measure_estimates = estimate_gait_measures(
-            comparison_batch, compared_gait_indices, contact_step
-        )
-        error_bound = REFINEMENT_SAFETY_FACTOR * np.abs(
-            measure_estimates.measure_values - gaits.measure_values[compared_gait_indices]
-        )
-        error_bound += np.minimum(
-            measure_estimates.numerical_error_bound, numerical_error_bounds[compared_gait_indices]
-        )
+        estimates = estimate(batch, compared, take_steps(batch, compared))
+        bound = REFINEMENT_SAFETY_FACTOR * np.abs(estimates.measure_values - values[compared])
+        bound += np.minimum(estimates.numerical_error_bound, numerical_bounds[compared])
         # A step that changes the legs' codes gives no bound.
-        error_bounds_by_tolerance.append(
-            np.where(measure_estimates.has_same_leg_codes[:, None], error_bound, np.inf)
-        )
-        gaits.n_steps[compared_gait_indices] += 1
-    numerical_error_bounds[compared_gait_indices] = np.max(error_bounds_by_tolerance, axis=0)
-    measure_error_bounds = gaits.measure_error_bounds + numerical_error_bounds
+        compared_bounds.append(np.where(estimates.has_same_leg_codes[:, None], bound, np.inf))
+    numerical_bounds[compared] = np.max(compared_bounds, axis=0)
+    error_bounds = error_bounds + numerical_bounds
     # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
     # above a half.
-    inverse_newton_eigenvalues = np.linalg.eigvals(
-        np.nan_to_num(inverse_newton_matrix, posinf=0.0, neginf=0.0)
-    )
-    return gaits._replace(
-        is_found=gaits.is_found & np.isfinite(measure_error_bounds).all(1),
-        is_attracting=inverse_newton_eigenvalues.real.min(-1) > 0.5,
-        measure_error_bounds=measure_error_bounds,
+    eigenvalues = np.linalg.eigvals(np.nan_to_num(inverses, posinf=0.0, neginf=0.0))
+    return RefinedGaits(
+        is_found & np.isfinite(error_bounds).all(1),
+        eigenvalues.real.min(-1) > 0.5,
+        values,
+        error_bounds,
+        n_steps,
+        section_states,
+        speeds,
     )

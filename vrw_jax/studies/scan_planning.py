@@ -50,9 +50,8 @@ from vrw_jax.studies.measure_catalog import (
     parse_derivative,
     select_measure_catalog,
 )
-from vrw_jax.studies.scan_collocation import EvaluationRequest
 from vrw_jax.studies.scan_design import AbstractSampleDesign, ParameterSamples
-from vrw_jax.studies.scan_engines import SampleEvaluator, make_scan_engine
+from vrw_jax.studies.scan_engines import EvaluationRequest, SampleEvaluator, make_scan_engine
 from vrw_jax.studies.scan_store import (
     PROVENANCE_ATTRIBUTE,
     REQUESTED_MEASURES_ATTRIBUTE,

@@ -19,7 +19,7 @@ from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.models.stepping import ModelLike
-from vrw_jax.studies.gait_arrival import StableGait, walk_until_on_gait
+from vrw_jax.studies.basins import StableGait, walk_until_on_gait
 from vrw_jax.wheel.params import WheelParams
 
 DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
