@@ -34,8 +34,9 @@ from vrw_jax.gaits.phase_collocation import (
     PhasePoint,
     PhasePoints,
     PhaseSequence,
+    close_cycle,
     estimate_mesh_error,
-    linearize_cycle,
+    linearize_steps,
     reconstruct_gait_step,
 )
 from vrw_jax.gaits.phase_sequence import (
@@ -88,6 +89,16 @@ class CollocationSystem(NamedTuple):
         """
         return functools.partial(compute_phase_constants, self.n_legs, self.law_structure)
 
+    def complete_parameters(self, parameters: Array, *scales: Array) -> Array:
+        """Return the parameters with the values that `scale_laws` takes after those of laws.
+
+        The scales are those of the units of length and time, by default 1.
+        """
+        if self.law_structure == NO_LAWS:
+            return parameters
+        share = jnp.ones_like(parameters[0])
+        return jnp.stack([*parameters, share, *(scales or (share, share))])
+
     @property
     def has_alternating_legs(self) -> bool:
         """Return whether the laws of the legs alternate from step to step."""
@@ -133,14 +144,26 @@ class CollocationSystem(NamedTuple):
 
         The result contains tangents with respect to the parameters in `parameter_indices`.
         """
-        return linearize_cycle(
+        return close_cycle(
+            parameters,
+            collocation_solution.section_state,
+            *self.linearize_steps(
+                parameters, collocation_solution, is_phase_active, parameter_indices
+            ),
+        )
+
+    def linearize_steps(
+        self, parameters: LaneParameters, solution: Any, is_phase_active: Any, indices: Any
+    ) -> tuple[tuple, tuple]:
+        """Linearize the equations of the gait steps without closing the cycle."""
+        return linearize_steps(
             self.phase_sequence,
             self.phase_meshes,
             self.phase_constants_function,
             parameters,
-            collocation_solution,
+            solution,
             is_phase_active > 0.5,
-            parameter_indices,
+            indices,
         )
 
     def evaluate_phase_points(
@@ -633,6 +656,23 @@ def list_search_attempts(cycle_options: CycleOptions) -> list[SearchAttempt]:
     return search_attempts
 
 
+def _make_homotopy_start(
+    collocation_system: CollocationSystem, parameters: LaneParameters
+) -> LaneParameters:
+    """Return the parameters of the wheel in Table 1, at which homotopies begin.
+
+    Its legs have the paper's force, so the share of a law is zero.
+    """
+    n, table_1_wheel = len(PARAMETER_NAMES), WheelParams(n_legs=collocation_system.n_legs)
+    values = stack_parameters(table_1_wheel).astype(parameters.dtype)[:, None]
+    values = jnp.broadcast_to(values, (n, *parameters.shape[1:]))
+    if collocation_system.law_structure == NO_LAWS:
+        return values
+    end = len(parameters) - N_LAW_SCALES
+    share = jnp.zeros_like(parameters[:1])
+    return jnp.concatenate([values, parameters[n:end], share, parameters[end + 1 :]])
+
+
 def _run_search_attempt(
     collocation_system: CollocationSystem,
     attempt_index: Array,
@@ -652,23 +692,7 @@ def _run_search_attempt(
     is_on_segment = search_attempt.homotopy_segment > 0
     is_before_target = is_on_segment & (search_attempt.homotopy_segment < N_HOMOTOPY_SEGMENTS)
     is_second_try = search_attempt.is_second_try == 1
-    table_1_wheel = WheelParams(n_legs=collocation_system.n_legs)
-    n_wheel_parameters = len(PARAMETER_NAMES)
-    table_1_parameters = jnp.broadcast_to(
-        stack_parameters(table_1_wheel).astype(parameters.dtype)[:, None],
-        (n_wheel_parameters, *parameters.shape[1:]),
-    )
-    if collocation_system.law_structure != NO_LAWS:
-        # The homotopy begins with the paper's force, so the share of the law is zero there.
-        share_index = len(parameters) - N_LAW_SCALES
-        table_1_parameters = jnp.concatenate(
-            [
-                table_1_parameters,
-                parameters[n_wheel_parameters:share_index],
-                jnp.zeros_like(parameters[:1]),
-                parameters[share_index + 1 :],
-            ]
-        )
+    table_1_parameters = _make_homotopy_start(collocation_system, parameters)
     homotopy_fraction = (
         search_attempt.homotopy_segment.astype(parameters.dtype) / N_HOMOTOPY_SEGMENTS
     )
@@ -711,24 +735,18 @@ def _run_search_attempt(
     # The result for a wheel on the homotopy may decide the search for the wheel at its end.
     has_cycle = attempt_result.collocation_state.has_cycle
     failed_check = attempt_result.collocation_state.failed_check
+    failure, last_failure = HomotopyFailure.FIRST_TRY_FAILED, HomotopyFailure.BOTH_TRIES_FAILED
     homotopy_check = jnp.where(
         failed_check > 0.0,
         failed_check + jnp.where(is_before_target, HOMOTOPY_FAILURE_CODE_OFFSET, 0.0),
-        jnp.where(
-            is_second_try,
-            float(HomotopyFailure.BOTH_TRIES_FAILED),
-            float(HomotopyFailure.FIRST_TRY_FAILED),
-        ),
+        jnp.where(is_second_try, float(last_failure), float(failure)),
     )
-    is_segment_solved = (has_cycle > 0.5) | (
-        is_before_target & (failed_check == FAILED_MESH_CHECK_CODE)
-    )
+    is_mesh_coarse = failed_check == FAILED_MESH_CHECK_CODE
+    is_segment_solved = (has_cycle > 0.5) | (is_before_target & is_mesh_coarse)
     homotopy_check = jnp.where(is_segment_solved, 0.0, homotopy_check)
     # The long search without double support may end far from gaits, which is no reason.
     failed_check = jnp.where(
-        (attempt_index == N_DIRECT_ATTEMPTS - 1) & (failed_check != FAILED_MESH_CHECK_CODE),
-        0.0,
-        failed_check,
+        (attempt_index == N_DIRECT_ATTEMPTS - 1) & ~is_mesh_coarse, 0.0, failed_check
     )
     attempt_result = attempt_result._replace(
         collocation_state=attempt_result.collocation_state._replace(

@@ -174,7 +174,7 @@ def _zero_without_cycle(collocation_state: CollocationState, tree_over_lanes: An
     )
 
 
-def _make_derivative_compiler(
+def make_derivative_compiler(
     n_compiled_orders: int, collocation_system: CollocationSystem
 ) -> ExecutionWrapper:
     """Return a function that compiles a batch function for a given order of derivatives.
@@ -200,7 +200,7 @@ def make_tangent_function(collocation_system: CollocationSystem) -> Callable:
     compute_tangents = with_implicit_derivative(
         functools.partial(_compute_collocation_tangents, collocation_system),
         lambda *primal_arrays: compute_tangents(*primal_arrays),
-        _make_derivative_compiler(2, collocation_system),
+        make_derivative_compiler(2, collocation_system),
     )
     return compute_tangents
 
@@ -238,21 +238,23 @@ def _search_in_scaled_units(
         gait_step_end_states=jnp.concatenate([position_units[:2], position_units[:2] / time_unit]),
     )
     scaled_search_guess = jax.tree.map(operator.truediv, si_guess, (state_units,) * len(si_guess))
-    scaled_parameters = [
+    scaled_values = [
         parameter_value / wheel_units.compute_unit_in_si(parameter_domain.unit)
         for parameter_value, parameter_domain in zip(
             parameters, PARAMETER_DOMAINS.values(), strict=False
         )
     ]
-    if collocation_system.law_structure != NO_LAWS:
-        # A law is evaluated in SI units.
-        scales = jnp.ones_like(time_unit), wheel_units.length_unit, time_unit
-        scaled_parameters += [*parameters[len(PARAMETER_NAMES) :], *scales]
+    # A law is evaluated in SI units.
+    scaled_parameters = collocation_system.complete_parameters(
+        jnp.stack([*scaled_values, *parameters[len(PARAMETER_NAMES) :]]),
+        wheel_units.length_unit,
+        time_unit,
+    )
     search_result = search_all_attempts(
         collocation_system,
         run_attempts,
         starts_only_from_guess,
-        jnp.stack(scaled_parameters),
+        scaled_parameters,
         *scaled_search_guess,
     )
     monodromy_matrix = section_units[:, None] * search_result.monodromy_matrix / section_units
@@ -315,7 +317,7 @@ def attach_monodromy_derivatives(
     compute_parameter_jacobian = make_implicit_jacobian(
         functools.partial(_compute_masked_monodromy, collocation_system),
         make_tangent_function(collocation_system),
-        _make_derivative_compiler(2, collocation_system),
+        make_derivative_compiler(2, collocation_system),
         make_jacobian=functools.partial(_compute_monodromy_tangents, collocation_system),
     )
 

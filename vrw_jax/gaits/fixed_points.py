@@ -134,10 +134,10 @@ def solve_fixed_point(
 ) -> FixedPointResult:
     """Find a fixed point of `function` applied `period_n` times, by Newton's method.
 
-    The result is differentiable with respect to all values that `function` closes over. Two further
-    Newton iterations with derivatives provide the derivatives of the fixed point to third order.
-    They provide the derivatives of its Jacobian to first order. If Newton's method does not
-    converge, the start is returned unchanged, without derivatives.
+    The result is differentiable with respect to all values that `function` closes over, by the
+    implicit function theorem. Derivatives of order n of the fixed point require those of `function`
+    to the same order, and derivatives of its Jacobian to the next order. If Newton's method does
+    not converge, the start is returned unchanged, without derivatives.
 
     Args:
         function: map from a vector to a vector of the same shape, differentiable in forward mode.
@@ -164,40 +164,21 @@ def solve_fixed_point(
         0.739085 True
     """
 
-    fixed_point = _solve_checked_fixed_point(
-        _run_newton_loop, function, start, period_n, tolerance, units, max_iterations, invariants
+    fixed_point = solve_fixed_point_implicit(
+        function,
+        start,
+        period_n=period_n,
+        tolerance=tolerance,
+        units=units,
+        max_iterations=max_iterations,
+        invariants=invariants,
+        differentiates_jacobian=True,
     )
     if isinstance(function, ReturnMap):
         fixed_point = fixed_point._replace(
             termination=function.find_termination(fixed_point.x, period_n)
         )
     return fixed_point
-
-
-def solve_fixed_point_implicit(
-    function: Callable[[Array], Array],
-    start: Float[Array, " n"],
-    *,
-    period_n: int = 1,
-    tolerance: float | Scalar = 1e-12,
-    units: Any = None,
-    invariants: Sequence[Callable[[Array], Array]] = (),
-) -> FixedPointResult:
-    """Find a fixed point of a map whose second derivatives are expensive.
-
-    The arguments are those of `solve_fixed_point`. Derivatives of order n of the fixed point
-    require only derivatives of order n of `function`. Derivatives of the Jacobian are NaN.
-    """
-    return _solve_checked_fixed_point(
-        _run_newton_implicit,
-        function,
-        start,
-        period_n,
-        tolerance,
-        units,
-        MAX_NEWTON_ITERATIONS,
-        invariants,
-    )
 
 
 def check_vector_map(function: Callable, state_name: str, state: Array) -> None:
@@ -229,17 +210,23 @@ def check_state_units(units: Any, state: Float[Array, " n"]) -> Float[Array, " n
     return jnp.broadcast_to(lax.stop_gradient(units).astype(state.dtype), state.shape)
 
 
-def _solve_checked_fixed_point(
-    newton_method: Callable[..., FixedPointResult],
+def solve_fixed_point_implicit(
     function: Callable[[Array], Array],
     start: Any,
-    period_n: int,
-    tolerance: float | Scalar,
-    units: Any,
-    max_iterations: int,
+    *,
+    period_n: int = 1,
+    tolerance: float | Scalar = 1e-12,
+    units: Any = None,
+    max_iterations: int = MAX_NEWTON_ITERATIONS,
     invariants: Sequence[Callable[[Array], Array]] = (),
+    differentiates_jacobian: bool = False,
 ) -> FixedPointResult:
-    """Check the arguments, and find the fixed point by `newton_method`."""
+    """Find a fixed point of a map whose second derivatives are expensive.
+
+    The other arguments are those of `solve_fixed_point`. Derivatives of order n of the fixed point
+    require only derivatives of order n of `function`. Derivatives of the Jacobian are NaN, unless
+    `differentiates_jacobian` is true.
+    """
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
     max_iterations = check_int("max_iterations", max_iterations)
@@ -253,7 +240,9 @@ def _solve_checked_fixed_point(
     tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
     # A unit of 0 is replaced by the size of the component.
     units = jnp.zeros_like(start) if units is None else check_state_units(units, start)
-    newton_configuration = (newton_method, function, period_n, tuple(invariants), max_iterations)
+    newton_configuration = (
+        function, period_n, tuple(invariants), max_iterations, differentiates_jacobian,
+    )  # fmt: skip
     find_fixed_point = functools.partial(_find_fixed_point_of_iterate, newton_configuration)
     compiled_program = None
     if isinstance(function, ReturnMap):
@@ -266,7 +255,7 @@ def _solve_checked_fixed_point(
 def _find_fixed_point_of_iterate(
     newton_configuration: tuple, start: Array, tolerance: Array, units: Array
 ) -> FixedPointResult:
-    newton_method, function, period_n, invariants, max_iterations = newton_configuration
+    function, period_n, invariants, *loop_configuration = newton_configuration
 
     def evaluate_equations(x: Array) -> Array:
         """Return the state after `period_n` maps, and the changes of the invariants at `x`."""
@@ -275,26 +264,12 @@ def _find_fixed_point_of_iterate(
         return jnp.concatenate([next_x, *changes])
 
     closure_converted_map, closed_over_values = jax.closure_convert(evaluate_equations, start)
-    return newton_method(
-        closure_converted_map, max_iterations, start, tolerance, units, *closed_over_values
+    return _run_newton_loop(
+        closure_converted_map, *loop_configuration, start, tolerance, units, *closed_over_values
     )
 
 
 ClosureConvertedMap = Callable[..., Array]
-
-
-def _compute_newton_correction(
-    closure_converted_map: ClosureConvertedMap, x: Array, closed_over_values: tuple
-) -> tuple[Array, Array, Array]:
-    """Return Newton's correction, the Jacobian of the map, and the largest component of the defect
-    map(x) - x.
-    """
-    values, jacobian = evaluate_with_jacobian(
-        lambda y: closure_converted_map(y, *closed_over_values), x
-    )
-    defect = values - jnp.pad(x, (0, len(values) - len(x)))
-    newton_correction = _solve_fixed_point_equations(jacobian, defect)
-    return newton_correction, jacobian[: len(x)], jnp.max(jnp.abs(defect))
 
 
 def _solve_fixed_point_equations(jacobian: Array, right_side: Array) -> Array:
@@ -310,9 +285,9 @@ def _solve_fixed_point_equations(jacobian: Array, right_side: Array) -> Array:
     return jax.scipy.linalg.solve_triangular(r, q.T @ right_side)
 
 
-N_DERIVATIVE_ITERATIONS = 2
-"""Number of Newton iterations with derivatives. The value is chosen because a single iteration
-provides only first derivatives of the fixed point.
+N_FINAL_ITERATIONS = 2
+"""Number of Newton iterations after convergence. The value is chosen because the map may jump near
+the point, and because the last Jacobian is then that of the fixed point.
 """
 
 
@@ -322,10 +297,11 @@ largest component. The value is chosen because far from a solution few correctio
 """
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1, 2))
 def _run_newton_loop(
     closure_converted_map: ClosureConvertedMap,
     max_iterations: int,
+    differentiates_jacobian: bool,
     start: Array,
     tolerance: Array,
     units: Array,
@@ -344,19 +320,22 @@ def _run_newton_loop(
         )
 
     def needs_newton_iteration(loop_state: tuple) -> Array:
-        _, correction_norm, n_iterations, n_derivative_iterations, *_ = loop_state
+        _, correction_norm, n_iterations, n_final_iterations, *_ = loop_state
         return is_newton_searching(correction_norm, n_iterations) | (
-            (correction_norm <= tolerance) & (n_derivative_iterations < N_DERIVATIVE_ITERATIONS)
+            (correction_norm <= tolerance) & (n_final_iterations < N_FINAL_ITERATIONS)
         )
 
     def iterate_newton(loop_state: tuple) -> tuple:
-        x, last_norm, n_iterations, n_derivative_iterations, n_stalled, *_ = loop_state
+        x, last_norm, n_iterations, n_final_iterations, n_stalled, *_ = loop_state
         is_searching_iteration = is_newton_searching(last_norm, n_iterations).astype(
             n_iterations.dtype
         )
-        newton_correction, jacobian, residual = _compute_newton_correction(
-            closure_converted_map, x, closed_over_values
+        values, jacobian = evaluate_with_jacobian(
+            lambda y: closure_converted_map(y, *closed_over_values), x
         )
+        defect = values - jnp.pad(x, (0, len(values) - len(x)))
+        newton_correction = _solve_fixed_point_equations(jacobian, defect)
+        jacobian, residual = jacobian[: len(x)], jnp.max(jnp.abs(defect))
         # The sum of the terms of a component is no more accurate than its largest term.
         component_sizes = jnp.max(
             jnp.abs(jnp.stack([start, x, x + newton_correction, jnp.abs(jacobian) @ jnp.abs(x)])), 0
@@ -378,7 +357,7 @@ def _run_newton_loop(
             next_x,
             correction_norm,
             n_iterations + is_searching_iteration,
-            n_derivative_iterations + 1 - is_searching_iteration,
+            n_final_iterations + 1 - is_searching_iteration,
             n_stalled,
             jacobian,
             residual,
@@ -410,67 +389,37 @@ def _run_newton_loop(
 @_run_newton_loop.defjvp
 @with_default_jax_settings
 def _run_newton_jvp(
-    closure_converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
-) -> tuple[FixedPointResult, FixedPointResult]:
-    """Return the fixed point and its tangent, by Newton iterations with derivatives.
-
-    The iterations start at the fixed point.
-    """
-    start, _, _, *closed_over_values = primals
-    newton_result = _run_newton_loop(
-        closure_converted_map, max_iterations, *lax.stop_gradient(primals)
-    )
-
-    def solve_from_fixed_point(*closed_over_values: Any) -> FixedPointResult:
-        def iterate_with_derivatives(point: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            newton_correction, jacobian, residual = _compute_newton_correction(
-                closure_converted_map, point, closed_over_values
-            )
-            next_point = point + jnp.where(newton_result.converged, newton_correction, 0.0)
-            return next_point, (jacobian, residual)
-
-        point, (jacobians, residuals) = lax.scan(
-            iterate_with_derivatives, newton_result.x, None, length=N_DERIVATIVE_ITERATIONS
-        )
-        x = jnp.where(newton_result.converged, point, start)
-        return FixedPointResult(
-            x, jacobians[-1], residuals[-1], newton_result.converged, newton_result.n_iterations
-        )
-
-    return jax.jvp(solve_from_fixed_point, tuple(closed_over_values), tuple(tangents[3:]))
-
-
-# The same loop, with derivatives by the implicit function theorem.
-_run_newton_implicit = jax.custom_jvp(_run_newton_loop, nondiff_argnums=(0, 1))
-
-
-@_run_newton_implicit.defjvp
-@with_default_jax_settings
-def _run_newton_implicit_jvp(
-    closure_converted_map: ClosureConvertedMap, max_iterations: int, primals: tuple, tangents: tuple
+    closure_converted_map: ClosureConvertedMap,
+    max_iterations: int,
+    differentiates_jacobian: bool,
+    primals: tuple,
+    tangents: tuple,
 ) -> tuple[FixedPointResult, FixedPointResult]:
     """Return the fixed point and its tangent by the implicit function theorem.
 
     The tangent depends on the fixed point. Derivatives of the tangent therefore use the same rule.
     """
-    newton_result = _run_newton_implicit(closure_converted_map, max_iterations, *primals)
-    closed_over_values, closed_over_tangents = tuple(primals[3:]), tuple(tangents[3:])
-    _, map_output_tangent = jax.jvp(
-        lambda *arguments: closure_converted_map(newton_result.x, *arguments),
-        closed_over_values,
-        closed_over_tangents,
+    result = _run_newton_loop(
+        closure_converted_map, max_iterations, differentiates_jacobian, *primals
     )
-    _, jacobian = evaluate_with_jacobian(
-        lambda x: closure_converted_map(x, *closed_over_values), newton_result.x
+    closed_over_values, value_tangents = tuple(primals[3:]), tuple(tangents[3:])
+    compute_jacobian = lambda x, *values: evaluate_with_jacobian(
+        lambda x: closure_converted_map(x, *values), x
+    )[1]
+    _, image_tangent = jax.jvp(
+        functools.partial(closure_converted_map, result.x), closed_over_values, value_tangents
     )
-    fixed_point_tangent = jnp.where(
-        newton_result.converged, _solve_fixed_point_equations(jacobian, map_output_tangent), 0.0
+    jacobian = compute_jacobian(result.x, *closed_over_values)
+    x_tangent = jnp.where(
+        result.converged, _solve_fixed_point_equations(jacobian, image_tangent), 0.0
     )
-    nan_jacobian_tangent = jnp.full_like(newton_result.jacobian, jnp.nan) * jnp.sum(
-        fixed_point_tangent
-    )
-    return newton_result, make_zero_tangent(newton_result)._replace(
-        x=fixed_point_tangent, jacobian=nan_jacobian_tangent
+    jacobian_tangent = jnp.full_like(result.jacobian, jnp.nan) * jnp.sum(x_tangent)
+    if differentiates_jacobian:
+        _, jacobian_tangent = jax.jvp(
+            compute_jacobian, (result.x, *closed_over_values), (x_tangent, *value_tangents)
+        )
+    return result, make_zero_tangent(result)._replace(
+        x=x_tangent, jacobian=jacobian_tangent[: len(result.x)]
     )
 
 

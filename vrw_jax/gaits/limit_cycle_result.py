@@ -35,8 +35,8 @@ from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.gaits.slope_response import (
     COLLOCATION_RESPONSE_MEASURES,
     SlopeResponse,
-    compute_collocation_slope_response,
     compute_sensitivity_norms,
+    make_slope_response_function,
 )
 from vrw_jax.lanes.batching import is_inside_jit
 from vrw_jax.models.step_results import DoubleSupportIndicators, Margins, SectionState
@@ -164,10 +164,8 @@ class LimitCycle(AbstractCycle):
                 f"the cycle has {self.period_n} steps, but a gait sensitivity norm is defined here "
                 "for gaits that repeat after one: give a cycle of period_n = 1."
             )
-        compute_slope_response = functools.partial(compute_collocation_slope_response, self.system)
-        return self.map_over_batch_axes(compute_slope_response)(
-            self.parameters, self.collocation_state
-        )
+        compute_response = self.map_over_batch_axes(make_slope_response_function(self.system))
+        return compute_response(self.parameters, self.collocation_state)
 
     def gait_sensitivity(self, measure_name: str) -> Array:
         """Return the gait sensitivity norm of a measure, in the measure's unit per rad of slope.
@@ -282,24 +280,18 @@ def _evaluate_own_measure(
 _attach_monodromy_compiled = jax.jit(attach_monodromy_derivatives, static_argnums=0)
 
 
-def solve_limit_cycle(
-    params: WheelParams,
-    collocation_system: CollocationSystem,
-    cycle_guess: CollocationState | None,
-    starts_only_from_guess: bool = False,
-) -> LimitCycle:
-    """Find the cycle of one wheel on the mesh of the collocation system."""
-    cycle_solver = _solve_limit_cycle if is_inside_jit() else _solve_limit_cycle_compiled
-    return cycle_solver(params, collocation_system, cycle_guess, starts_only_from_guess)
+def solve_limit_cycle(*arguments: Any) -> LimitCycle:
+    """Return the result of `_solve_limit_cycle`, which is compiled if no `jit` traces the call."""
+    return (_solve_limit_cycle if is_inside_jit() else _solve_limit_cycle_compiled)(*arguments)
 
 
 def _solve_limit_cycle(
     params: WheelParams,
     collocation_system: CollocationSystem,
     cycle_guess: CollocationState | None,
-    starts_only_from_guess: bool,
+    starts_only_from_guess: bool = False,
 ) -> LimitCycle:
-    """Find the cycle of one wheel by the search, outside compiled code."""
+    """Find the cycle of one wheel on the mesh of the collocation system."""
     is_in_domain = params.is_in_domain()
     parameters = stack_parameters(params)
     table_1_parameters = stack_parameters(params.make_table_1_wheel()).astype(parameters.dtype)

@@ -4,17 +4,18 @@ The unknowns of the cycle are the section state, the durations of all phases and
 at all nodes. Each phase is divided into mesh intervals with four Gauss nodes (order 8). Positions
 and rates are explicit functions of the unknowns.
 
-`linearize_cycle` visits each mesh interval once and propagates a few tangents. The first tangent is
+`linearize_steps` visits each mesh interval once and propagates a few tangents. The first tangent is
 the Newton correction. Further tangents belong to the components of the section state, to the
 requested parameters, and to the duration of the current phase. The node equations are eliminated in
 each interval. The duration of a phase is eliminated at its end event. The section state is
-eliminated when the cycle is closed. The monodromy matrix and the sensitivities of all unknowns are
+eliminated by `close_cycle`. The monodromy matrix and the sensitivities of all unknowns are
 therefore tangents of one linearization.
 
 The last axis of each array contains the batch elements, which are independent wheels. No branch of
 the code depends on values.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -587,7 +588,7 @@ class _LinearizationContext(NamedTuple):
         return (phase_start.state.q, phase_start.tangents.q), gait_step_tangent_outputs
 
 
-def linearize_cycle(
+def linearize_steps(
     phase_sequence: PhaseSequence,
     phase_meshes: tuple[PhaseMesh, ...],
     compute_phase_constants: Callable[..., PhaseConstants],
@@ -595,30 +596,31 @@ def linearize_cycle(
     trial_solution: CollocationSolution,
     is_phase_active: Bool[Array, "n n_phases lanes"],
     parameter_indices: tuple[int, ...],
-) -> CycleLinearization:
-    """Return the Newton correction, the monodromy matrix and the parameter tangents of a cycle.
+) -> tuple[tuple, tuple]:
+    """Linearize the equations of gait steps at `trial_solution`.
 
-    The equations are linearized at `trial_solution`. A phase is inactive if `is_phase_active` is
-    False. Its duration is 0 s, and only its reset is applied. `parameter_indices` selects the
-    parameters to which the parameter tangents belong.
+    A phase is inactive if `is_phase_active` is False. Its duration is 0 s, and only its reset is
+    applied. `parameter_indices` selects the parameters to which the parameter tangents belong.
+
+    Return the section state at the end and its tangents. The states at the ends of the steps
+    follow, and the tangents of these states, of durations and of accelerations. The directions are
+    the Newton correction, the components of the section state at the start, and the parameters.
     """
     float_dtype = parameters.dtype
     phase_constants_tangents: tuple[LaneArray, ...] = ()
     if parameter_indices:
-        unit_parameter_tangents = np.eye(len(parameters), dtype=float_dtype)[
-            list(parameter_indices)
-        ]
+        unit_tangents = np.eye(len(parameters), dtype=float_dtype)[list(parameter_indices)]
         phase_constants, phase_constants_tangents = evaluate_with_jvps(
             compute_phase_constants,
             tuple(parameters),
             tuple(
                 jnp.broadcast_to(x[:, None], (len(parameter_indices), *parameters.shape[1:]))
-                for x in unit_parameter_tangents.T
+                for x in unit_tangents.T
             ),
         )
     else:
         phase_constants = compute_phase_constants(*parameters)
-    linearization_context = _LinearizationContext(
+    context = _LinearizationContext(
         phase_sequence,
         phase_meshes,
         parameter_indices,
@@ -628,78 +630,67 @@ def linearize_cycle(
         phase_constants_tangents,
         make_fusion_barrier(parameters),
     )
-    section_state = trial_solution.section_state
-    section_tangent_slice = linearization_context.section_tangent_slice
-    n_tangents = linearization_context.n_tangents
-    section_unit_tangents = np.eye(n_tangents, dtype=float_dtype)[:, section_tangent_slice, None]
-    section_state_and_tangents = (
-        section_state,
-        jnp.broadcast_to(section_unit_tangents, (n_tangents, *section_state.shape)),
-    )
-    gait_step_inputs = (
+    section_state, n_tangents = trial_solution.section_state, context.n_tangents
+    unit_tangents = np.eye(n_tangents, dtype=float_dtype)[:, context.section_tangent_slice, None]
+    start = section_state, jnp.broadcast_to(unit_tangents, (n_tangents, *section_state.shape))
+    step_inputs = (
         trial_solution.durations,
         trial_solution.accelerations,
         is_phase_active,
         *phase_sequence.list_parities(len(trial_solution.durations), float_dtype),
     )
-    if trial_solution.durations.shape[0] == 1:
-        (section_state_after_cycle, section_tangents_after_cycle), gait_step_tangent_outputs = (
-            linearization_context.linearize_gait_step(
-                section_state_and_tangents, jax.tree.map(lambda x: x[0], gait_step_inputs)
-            )
-        )
-        gait_step_tangent_outputs = jax.tree.map(lambda x: x[None], gait_step_tangent_outputs)
-    else:
-        (section_state_after_cycle, section_tangents_after_cycle), gait_step_tangent_outputs = (
-            lax.scan(
-                linearization_context.linearize_gait_step,
-                section_state_and_tangents,
-                gait_step_inputs,
-            )
-        )
+    if len(trial_solution.durations) > 1:
+        return lax.scan(context.linearize_gait_step, start, step_inputs)
+    end, outputs = context.linearize_gait_step(start, jax.tree.map(lambda x: x[0], step_inputs))
+    return end, jax.tree.map(lambda x: x[None], outputs)
 
-    monodromy = jnp.swapaxes(section_tangents_after_cycle[section_tangent_slice], 0, 1)
-    drop_section_tangents = lambda x: jnp.concatenate([x[:1], x[section_tangent_slice.stop :]])
-    newton_correction_unit_vector = np.eye(
-        n_tangents - phase_sequence.section_size, dtype=float_dtype
-    )[0][:, None, None]
-    right_hand_sides = drop_section_tangents(
-        section_tangents_after_cycle
-    ) + newton_correction_unit_vector * (section_state_after_cycle - section_state)
-    cycle_closing_matrix = invert_small_matrices(
-        jnp.eye(phase_sequence.section_size, dtype=float_dtype)[:, :, None] - monodromy
+
+def close_cycle(
+    parameters: LaneArray, section_state: LaneArray, end: tuple, outputs: tuple
+) -> CycleLinearization:
+    """Return the Newton correction, the monodromy matrix and the parameter tangents of a cycle.
+
+    - `section_state`: section state at the start of its first gait step;
+    - `end`, `outputs`: results of `linearize_steps`.
+    """
+    (end_state, end_tangents), n = end, len(section_state)
+    prevent_fusion = make_fusion_barrier(parameters)
+    section_tangents = slice(1, 1 + n)
+    monodromy = jnp.swapaxes(end_tangents[section_tangents], 0, 1)
+    drop_section_tangents = lambda x: jnp.concatenate([x[:1], x[1 + n :]])
+    correction_direction = np.eye(len(end_tangents) - n, dtype=parameters.dtype)[0][:, None, None]
+    right_hand_sides = drop_section_tangents(end_tangents) + correction_direction * (
+        end_state - section_state
     )
-    section_state_tangents = jnp.swapaxes(
-        contract_inner_axis(cycle_closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
+    closing_matrix = invert_small_matrices(
+        jnp.eye(n, dtype=parameters.dtype)[:, :, None] - monodromy
+    )
+    state_tangents = jnp.swapaxes(
+        contract_inner_axis(closing_matrix, jnp.swapaxes(right_hand_sides, 0, 1)), 0, 1
     )
 
-    def close_cycle_tangents(open_cycle_tangent: Array) -> Array:
+    def close_tangents(open_tangents: Array) -> Array:
         """Return the tangents of the closed cycle, whose section state is an unknown.
 
         The axes (n, tangent, ...) of the argument become (tangent, n, ...).
         """
-        open_cycle_tangent = jnp.swapaxes(open_cycle_tangent, 0, 1)
-        return drop_section_tangents(open_cycle_tangent) + contract_inner_axis(
-            section_state_tangents, open_cycle_tangent[section_tangent_slice]
+        open_tangents = jnp.swapaxes(open_tangents, 0, 1)
+        return drop_section_tangents(open_tangents) + contract_inner_axis(
+            state_tangents, open_tangents[section_tangents]
         )
 
-    gait_step_end_states, *open_cycle_tangents = linearization_context.prevent_fusion(
-        gait_step_tangent_outputs
+    step_end_states, *open_tangents = prevent_fusion(outputs)
+    step_end_tangents, *solution_tangents = map(
+        functools.partial(jax.tree.map, close_tangents), open_tangents
     )
-    gait_step_end_tangents, duration_tangents, acceleration_tangents = jax.tree.map(
-        close_cycle_tangents, tuple(open_cycle_tangents)
-    )
-    gait_step_end_tangents, solution_tangents = linearization_context.prevent_fusion(
-        (
-            gait_step_end_tangents,
-            CollocationSolution(section_state_tangents, duration_tangents, acceleration_tangents),
-        )
+    step_end_tangents, tangents = prevent_fusion(
+        (step_end_tangents, CollocationSolution(state_tangents, *solution_tangents))
     )
     return CycleLinearization(
-        newton_correction=jax.tree.map(lambda x: x[0], solution_tangents),
-        parameter_tangents=jax.tree.map(lambda x: x[1:], solution_tangents),
-        gait_step_end_states=gait_step_end_states + gait_step_end_tangents[0],
-        gait_step_end_tangents=gait_step_end_tangents[1:],
+        newton_correction=jax.tree.map(lambda x: x[0], tangents),
+        parameter_tangents=jax.tree.map(lambda x: x[1:], tangents),
+        gait_step_end_states=step_end_states + step_end_tangents[0],
+        gait_step_end_tangents=step_end_tangents[1:],
         monodromy=monodromy,
     )
 

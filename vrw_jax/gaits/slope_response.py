@@ -6,22 +6,21 @@ Its sum over all later gait steps has a closed form.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from vrw_jax.base.batch_algebra import evaluate_with_jvps
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits import floquet
-from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem
-from vrw_jax.gaits.phase_collocation import reconstruct_gait_step
-from vrw_jax.lanes.autodiff import ForwardFunction, compute_square_root, enable_all_ad_modes
-from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem, LaneParameters
+from vrw_jax.gaits.derivatives import make_derivative_compiler, make_tangent_function
+from vrw_jax.lanes.autodiff import compute_square_root, with_implicit_derivative
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 N_CHORD_ITERATIONS = 3
@@ -158,7 +157,7 @@ def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n
 
 
 def compute_step_slope_response(
-    model: AbstractWheel,
+    model: Any,
     params: WheelParams,
     section_state: Array,
     measure_names: Sequence[str],
@@ -207,129 +206,62 @@ COLLOCATION_RESPONSE_MEASURES = (
 """Names of the measures of a gait step that follow from its durations and its first landing."""
 
 
-def compute_collocation_slope_response(
-    collocation_system: CollocationSystem, parameters: Array, collocation_state: CollocationState
-) -> SlopeResponse:
+@functools.cache
+def make_slope_response_function(collocation_system: CollocationSystem) -> Callable:
     """Return the slope response of a gait step of the paper's model, computed from its collocation.
 
-    The measures are `COLLOCATION_RESPONSE_MEASURES`. The state is (theta+, dtheta+) just after a
-    landing, in the frame of the line of the ground under both feet. The response is differentiable
-    on the branch of gaits in every mode, up to second order.
+    The result is a function of the parameters and the collocation state of a gait. The measures are
+    `COLLOCATION_RESPONSE_MEASURES`. The state is (theta+, dtheta+) just after a landing, in the
+    frame of the line of the ground under both feet. The response is differentiable on the branch of
+    gaits, in every mode and to any order.
     """
-    collocation_solution, is_phase_active = (
-        collocation_state.solution,
-        collocation_state.is_phase_active[0],
+    compute_jacobian = with_implicit_derivative(
+        functools.partial(_compute_step_jacobian, collocation_system),
+        make_tangent_function(collocation_system),
+        make_derivative_compiler(2, collocation_system),
     )
-    gait_unknowns = lax.stop_gradient(
-        (
-            collocation_solution.durations[0],
-            *(phase_accelerations[0] for phase_accelerations in collocation_solution.accelerations),
+    n_state_entries = collocation_system.phase_sequence.section_size
+    return jax.jit(
+        lambda parameters, collocation_state: SlopeResponse.from_jacobian(
+            compute_jacobian(parameters, lax.stop_gradient(collocation_state)), n_state_entries
         )
     )
-    return _make_collocation_response_function(collocation_system)(
+
+
+def _compute_step_jacobian(
+    collocation_system: CollocationSystem,
+    parameters: LaneParameters,
+    collocation_state: CollocationState,
+) -> Array:
+    """Return the Jacobian of (end state, measures) with respect to (start state, slope, next
+    slope), for each wheel on the last axis.
+    """
+    solution, sequence = collocation_state.solution, collocation_system.phase_sequence
+    # The last constant of a phase is the angle by which the next line is steeper.
+    parameters = jnp.concatenate(
+        [collocation_system.complete_parameters(parameters), jnp.zeros_like(parameters[:1])]
+    )
+    (_, end_tangents), (_, _, duration_tangents, _) = collocation_system.linearize_steps(
         parameters,
-        collocation_solution.section_state,
-        lax.stop_gradient(is_phase_active),
-        *gait_unknowns,
-    )[0]
+        solution,
+        collocation_state.is_phase_active,
+        (PARAMETER_NAMES.index("slope"), len(parameters) - 1),
+    )
+    phase_constants = collocation_system.phase_constants_function(*parameters)
 
+    def measure(section_state: Array, durations: Array) -> Array:
+        start = sequence.step_start_map(phase_constants, tuple(section_state))
+        period, (step_length,) = jnp.sum(durations, 0), start.held_constants
+        fraction, speed = durations[0] / period, step_length / period
+        return jnp.stack([fraction, period, speed, step_length, *durations])
 
-@functools.cache
-def _make_collocation_response_function(collocation_system: CollocationSystem) -> ForwardFunction:
-    """Return a function that computes the slope response of a collocated gait step.
-
-    The arguments of the function are the parameters, the section state and the solution of the
-    step. Newton's method computes durations and accelerations for other start states and slopes.
-    Its Jacobian is that of the gait's step.
-    """
-    slope_index = PARAMETER_NAMES.index("slope")
-
-    def compute_response(
-        parameters: Array, section_state: Array, is_phase_active: Array, *gait_unknowns: Array
-    ) -> tuple:
-        gait_unknown_vector, unflatten_unknowns = ravel_pytree(gait_unknowns)
-
-        def reconstruct_from_unknowns(
-            unknown_vector: Array, step_start_and_slopes: Array, parameters: Array
-        ) -> tuple:
-            durations, *accelerations = unflatten_unknowns(unknown_vector)
-            line_parameters = parameters.at[slope_index].set(step_start_and_slopes[2])
-            phase_constants = (
-                *collocation_system.phase_constants_function(*line_parameters),
-                step_start_and_slopes[3] - step_start_and_slopes[2],
-            )
-            end_section_state, phase_points = reconstruct_gait_step(
-                collocation_system.phase_sequence,
-                collocation_system.phase_meshes,
-                phase_constants,
-                tuple(step_start_and_slopes[:2]),
-                durations,
-                tuple(accelerations),
-            )
-            return phase_constants, end_section_state, phase_points
-
-        def evaluate_cycle_residual(
-            unknown_vector: Array, step_start_and_slopes: Array, parameters: Array
-        ) -> Array:
-            durations, *accelerations = unflatten_unknowns(unknown_vector)
-            phase_constants, _, phase_points = reconstruct_from_unknowns(
-                unknown_vector, step_start_and_slopes, parameters
-            )
-            cycle_residual_parts: list[Array] = []
-            for phase_index, (phase, points_of_phase) in enumerate(
-                zip(collocation_system.phase_sequence.phases, phase_points, strict=True)
-            ):
-                node_accelerations = accelerations[phase_index].reshape(-1, phase.n_coordinates).T
-                cycle_residual_parts += phase.residual_function(
-                    phase_constants, points_of_phase.node_points, tuple(node_accelerations)
-                )
-                end_event_value = phase.end_event_function(
-                    phase_constants, points_of_phase.phase_end_point
-                )
-                cycle_residual_parts.append(
-                    jnp.where(
-                        is_phase_active[phase_index] > 0.5, end_event_value, durations[phase_index]
-                    )[None]
-                )
-            return jnp.concatenate(cycle_residual_parts)
-
-        step_start_and_slopes = jnp.concatenate(
-            [section_state, jnp.full(2, parameters[slope_index])]
-        )
-        residual_jacobian = jax.jacfwd(evaluate_cycle_residual)(
-            gait_unknown_vector, *lax.stop_gradient((step_start_and_slopes, parameters))
-        )
-        inverse_jacobian = invert_by_elimination(residual_jacobian)
-
-        def evaluate_step_outputs(step_start_and_slopes: Array) -> Array:
-            def refine_gait_unknowns(unknown_vector: Array, _: None) -> tuple[Array, None]:
-                newton_correction = inverse_jacobian @ evaluate_cycle_residual(
-                    unknown_vector, step_start_and_slopes, parameters
-                )
-                return unknown_vector - newton_correction, None
-
-            unknown_vector, _ = lax.scan(
-                refine_gait_unknowns, gait_unknown_vector, length=N_CHORD_ITERATIONS
-            )
-            _, end_section_state, phase_points = reconstruct_from_unknowns(
-                unknown_vector, step_start_and_slopes, parameters
-            )
-            durations, (step_length,) = (
-                unflatten_unknowns(unknown_vector)[0],
-                phase_points[0].phase_start_point.held_constants,
-            )
-            period = jnp.sum(durations)
-            measure_values = (
-                durations[0] / period,
-                period,
-                step_length / period,
-                step_length,
-                *durations,
-            )
-            return jnp.stack([*end_section_state, *measure_values])
-
-        return SlopeResponse.from_jacobian(
-            jax.jacfwd(evaluate_step_outputs)(step_start_and_slopes), len(section_state)
-        ), ()
-
-    return enable_all_ad_modes(compute_response)
+    n_directions, n_coordinates, _ = end_tangents.shape
+    start_tangents = jnp.eye(n_directions, n_coordinates, -1, parameters.dtype)[..., None]
+    _, measure_tangents = evaluate_with_jvps(
+        measure,
+        (solution.section_state, solution.durations[0]),
+        (jnp.broadcast_to(start_tangents, end_tangents.shape), duration_tangents[0]),
+    )
+    tangents = jnp.concatenate([end_tangents, measure_tangents], 1)[1:]
+    by_slope, by_tilt = tangents[-2:]
+    return jnp.stack([*tangents[:-2], by_slope - by_tilt, by_tilt], 1)
