@@ -11,7 +11,6 @@ import contextlib
 import functools
 import gc
 import hashlib
-import json
 import pickle
 import warnings
 from collections import OrderedDict
@@ -123,18 +122,17 @@ def _load_lane_program(
 
     - `trace_program`: function that traces the program, if it has been traced but never compiled.
     """
-    encoded_name, _, content = (disk_cache.load_cache_record(index_name) or b"").partition(b"\n")
-    encoded_result_types, _, pickled_skeleton = content.partition(b"\n")
-    if not pickled_skeleton:
+    record = disk_cache.load_cache_record(index_name)
+    if record is None:
         return None
     try:
-        structure = jax.tree.structure(pickle.loads(pickled_skeleton))
-        result_types = _parse_result_shapes_and_dtypes(encoded_result_types)
-        machine_code = load_machine_code(encoded_name.decode("ascii")) if encoded_name else None
+        code_name, result_types, skeleton = pickle.loads(record)
+        structure = jax.tree.structure(skeleton)
+        machine_code = load_machine_code(code_name) if code_name else None
     except Exception:  # Damaged bytes may raise any exception.
         disk_cache.warn_of_unusable_cache_record(f"{index_name} is no index of code")
         return None
-    if encoded_name and machine_code is None:
+    if code_name and machine_code is None:
         return None
     return LaneProgram(
         index_name, result_types, structure, lambda: machine_code or trace_program().machine_code
@@ -163,16 +161,14 @@ def _trace_lane_program(
             if len(_recent_traces) > MAX_RECENT_TRACES:
                 _recent_traces.popitem(last=False)
     closed_jaxpr, result_structure = trace
-    encoded_result_types = json.dumps(
-        [(aval.shape[:-1], aval.dtype.name) for aval in closed_jaxpr.out_avals]
-    )
+    result_types = tuple((aval.shape[:-1], aval.dtype) for aval in closed_jaxpr.out_avals)
 
     def save_index(code_name: str = "") -> None:
         """Save the name of the code, which is empty before it is compiled."""
         skeleton = jax.tree.unflatten(result_structure, range(result_structure.num_leaves))
         # A class inside a function cannot be pickled.
         with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
-            record = f"{code_name}\n{encoded_result_types}\n".encode() + pickle.dumps(skeleton)
+            record = pickle.dumps((code_name, result_types, skeleton))
             disk_cache.save_cache_record(str(index_name), record)
 
     compile_code = lambda: _compile_trace(
@@ -186,12 +182,7 @@ def _trace_lane_program(
     else:
         machine_code = compile_code()
         index_name, compile_code = machine_code.ffi_target_name, lambda: machine_code
-    return LaneProgram(
-        index_name,
-        _parse_result_shapes_and_dtypes(encoded_result_types),
-        result_structure,
-        compile_code,
-    )
+    return LaneProgram(index_name, result_types, result_structure, compile_code)
 
 
 def _compile_trace(
@@ -284,14 +275,6 @@ _llvm_compiler_pool = ThreadPoolExecutor(1, "llvm")
 
 One thread suffices, because LLVM's lock lets only one thread compile.
 """
-
-
-def _parse_result_shapes_and_dtypes(encoded_result_types: str | bytes) -> ResultShapesAndDtypes:
-    """Return `LaneProgram.result_shapes_and_dtypes`, parsed from JSON."""
-    return tuple(
-        (tuple(axis_lengths), np.dtype(dtype_name))
-        for axis_lengths, dtype_name in json.loads(encoded_result_types)
-    )
 
 
 def trace_for_machine_code(

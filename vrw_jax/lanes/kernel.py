@@ -1,7 +1,6 @@
 """LLVM module for a jaxpr: a loop over groups of lanes that reads arguments and writes results."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 from jax.extend.core import ClosedJaxpr
@@ -46,164 +45,98 @@ def write_llvm_kernel(
     )
     llvm_kernel.attributes.add("nounwind")
     llvm_builder = ir.IRBuilder(llvm_kernel.append_basic_block("entry"))
-    array_emitter = ArrayEmitter(
-        ValueEmitter(llvm_builder, max(lanes_per_group, 2)), max_unrolled_entries
-    )
-    input_pointer_table, output_pointer_table, n_lanes, first_lane_group, end_lane_group = (
-        llvm_kernel.args
-    )
+    value_emitter = ValueEmitter(llvm_builder, max(lanes_per_group, 2))
+    array_emitter = ArrayEmitter(value_emitter, max_unrolled_entries)
+    inputs, outputs, n_lanes, first_lane_group, end_lane_group = llvm_kernel.args
     argument_avals, result_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
+    has_single_lane = lanes_per_group == 1
 
-    def emit_pointer_loads(pointer_table: LlvmValue, n_pointers: int) -> list[LlvmValue]:
+    def load_pointers(pointer_table: LlvmValue, n_pointers: int) -> list[LlvmValue]:
         table = MemoryArray(array_emitter, (n_pointers,), llvm_pointer_type, pointer_table)
         return [table.emit_entry_load((i,)) for i in range(n_pointers)]
 
-    input_pointers = emit_pointer_loads(input_pointer_table, len(argument_avals))
-    output_pointers = emit_pointer_loads(output_pointer_table, len(result_avals))
+    input_pointers = load_pointers(inputs, len(argument_avals))
+    output_pointers = load_pointers(outputs, len(result_avals))
 
     def emit_lane_group(lane_group_index: LlvmValue, _: Any) -> list[LlvmValue]:
-        lane_group_access = _LaneGroupAccess(
-            array_emitter,
-            lanes_per_group == 1,
-            n_lanes,
-            llvm_builder.mul(lane_group_index, ir.Constant(I64, lanes_per_group)),
-        )
-        argument_arrays = list(
-            map(lane_group_access.read_argument_array, input_pointers, argument_avals)
-        )
-        result_arrays = JaxprLowering(array_emitter, PRIMITIVE_RULES).lower_jaxpr(
-            closed_jaxpr, argument_arrays
-        )
-        for output_pointer, aval, result_array in zip(
-            output_pointers, result_avals, result_arrays, strict=True
-        ):
-            lane_group_access.write_result_array(output_pointer, aval, result_array)
+        first_lane = llvm_builder.mul(lane_group_index, ir.Constant(I64, lanes_per_group))
+
+        def emit_address(base: LlvmValue, aval: Any, entry_index: EntryIndex) -> tuple:
+            """Return the address of an entry for the first lane of the group, and its type there.
+
+            The last axis of the caller's arrays is the lane axis.
+            """
+            number_type = I8 if aval.dtype.kind == "b" else LLVM_NUMBER_TYPES[aval.dtype.name]
+            if aval.shape == ():
+                return base, number_type
+            entry_offset = array_emitter.emit_memory_offset(entry_index, aval.shape[:-1])
+            lane_offset = llvm_builder.add(llvm_builder.mul(entry_offset, n_lanes), first_lane)
+            address = llvm_builder.gep(base, [lane_offset], source_etype=number_type)
+            if has_single_lane:
+                return address, number_type
+            return address, value_emitter.make_vector_type(number_type)
+
+        def read_argument(base: LlvmValue, aval: Any) -> LlvmArray:
+            """Return an argument; one without axes is one number for all lanes."""
+            if LANE_AXIS_SENTINEL in aval.shape[:-1]:
+                raise make_lane_axis_error("An argument", aval)
+
+            def load_entry(entry_index: EntryIndex) -> LlvmValue:
+                address, stored_type = emit_address(base, aval, entry_index)
+                value = llvm_builder.load(address, typ=stored_type, align=aval.dtype.itemsize)
+                if aval.dtype.kind == "b":
+                    zero = value_emitter.make_llvm_constant(stored_type, 0)
+                    value = llvm_builder.icmp_signed("!=", value, zero)
+                if not (has_single_lane and aval.shape):
+                    return value
+                vector = value_emitter.to_lane_vector(value)
+                if aval.dtype.kind != "f":
+                    return vector
+                # The vector is read from memory. LLVM would else compute only one of two equal
+                # entries, and then might not fuse the same products and sums.
+                memory = array_emitter.allocate_memory_array((2,), value.type)
+                for i in range(2):
+                    memory.emit_entry_store((i,), value)
+                return llvm_builder.load(memory.base_pointer, typ=vector.type, align=8)
+
+            array = LazyArray(aval.shape[:-1], array_emitter.get_entry_type(aval), load_entry)
+            fits_registers = math.prod(array.shape) <= array_emitter.MAX_REGISTER_ENTRIES
+            return array_emitter.get_array_entries(array) if fits_registers else array
+
+        def write_result(base: LlvmValue, aval: Any, result: LlvmArray) -> None:
+            if not has_lane_axis(aval):
+                raise LaneAxisError(
+                    f"A result has the shape {aval.str_short()}, the same for all lanes: compute "
+                    "it outside, or add zeros of the lanes."
+                )
+
+            def store_entry(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
+                address, stored_type = emit_address(base, aval, entry_index)
+                value = value_emitter.to_lane_vector(
+                    array_emitter.get_array_entry(result, entry_index)
+                )
+                if aval.dtype.kind == "b":
+                    value = llvm_builder.zext(value, value_emitter.make_vector_type(I8))
+                if has_single_lane:
+                    # The lane is read from memory, because LLVM would reduce an extracted entry,
+                    # and all operations before it, to scalars.
+                    memory = array_emitter.allocate_memory_array((), value.type)
+                    llvm_builder.store(value, memory.base_pointer)
+                    value = llvm_builder.load(memory.base_pointer, typ=stored_type)
+                llvm_builder.store(value, address, align=aval.dtype.itemsize)
+                return []
+
+            array_emitter.emit_index_loops(aval.shape[:-1], store_entry)
+
+        arguments = list(map(read_argument, input_pointers, argument_avals))
+        lowering = JaxprLowering(array_emitter, PRIMITIVE_RULES)
+        results = lowering.lower_jaxpr(closed_jaxpr, arguments)
+        for pointer, aval, result in zip(output_pointers, result_avals, results, strict=True):
+            write_result(pointer, aval, result)
         return []
 
     array_emitter.emit_range_loop(first_lane_group, end_lane_group, emit_lane_group)
     llvm_builder.ret_void()
-    add_ffi_handler(
-        llvm_module,
-        llvm_kernel,
-        len(argument_avals),
-        len(result_avals),
-        lanes_per_group,
-    )
+    n_arguments, n_results = len(argument_avals), len(result_avals)
+    add_ffi_handler(llvm_module, llvm_kernel, n_arguments, n_results, lanes_per_group)
     return str(llvm_module)
-
-
-@dataclass
-class _LaneGroupAccess:
-    """Emitter of loads and stores for one group of lanes in the caller's arrays.
-
-    The last axis of these arrays is the lane axis.
-    """
-
-    array_emitter: ArrayEmitter
-    has_single_lane: bool
-    n_lanes: LlvmValue
-    first_lane_index: LlvmValue
-
-    def read_argument_array(self, base_pointer: LlvmValue, aval: Any) -> LlvmArray:
-        """Return the argument at `base_pointer` as an array of LLVM values.
-
-        An argument without axes is one number for all lanes. Raise a NotImplementedError if an axis
-        before the last one has the length of the lane axis.
-        """
-        if LANE_AXIS_SENTINEL in aval.shape[:-1]:
-            raise make_lane_axis_error("An argument", aval)
-        llvm_builder = self.array_emitter.llvm_builder
-
-        def emit_entry_load(entry_index: EntryIndex) -> LlvmValue:
-            entry_address, llvm_stored_type = self.emit_lane_group_address(
-                base_pointer, aval, entry_index
-            )
-            entry_value = llvm_builder.load(
-                entry_address, typ=llvm_stored_type, align=aval.dtype.itemsize
-            )
-            if aval.dtype.kind == "b":
-                entry_value = llvm_builder.icmp_signed(
-                    "!=",
-                    entry_value,
-                    self.array_emitter.value_emitter.make_llvm_constant(llvm_stored_type, 0),
-                )
-            if not (self.has_single_lane and aval.shape):
-                return entry_value
-            vector = self.array_emitter.value_emitter.to_lane_vector(entry_value)
-            if aval.dtype.kind != "f":
-                return vector
-            # The vector is read from memory. LLVM would else compute only one of two equal entries,
-            # and then might not fuse the same products and sums.
-            memory = self.array_emitter.allocate_memory_array((2,), entry_value.type)
-            for i in range(2):
-                memory.emit_entry_store((i,), entry_value)
-            return llvm_builder.load(memory.base_pointer, typ=vector.type, align=8)
-
-        argument_array = LazyArray(
-            aval.shape[:-1], self.array_emitter.get_entry_type(aval), emit_entry_load
-        )
-        fits_registers = math.prod(argument_array.shape) <= self.array_emitter.MAX_REGISTER_ENTRIES
-        return (
-            self.array_emitter.get_array_entries(argument_array)
-            if fits_registers
-            else argument_array
-        )
-
-    def write_result_array(
-        self, base_pointer: LlvmValue, aval: Any, result_array: LlvmArray
-    ) -> None:
-        """Emit stores of `result_array`, for the lanes of the group, into the memory at
-        `base_pointer`.
-
-        Raise a NotImplementedError unless the last axis is the lane axis.
-        """
-        if not has_lane_axis(aval):
-            raise LaneAxisError(
-                f"A result has the shape {aval.str_short()}, the same for all lanes: compute it "
-                "outside, or add zeros of the lanes."
-            )
-        llvm_builder = self.array_emitter.llvm_builder
-
-        def emit_entry_store(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
-            entry_address, llvm_stored_type = self.emit_lane_group_address(
-                base_pointer, aval, entry_index
-            )
-            entry_value = self.array_emitter.value_emitter.to_lane_vector(
-                self.array_emitter.get_array_entry(result_array, entry_index)
-            )
-            if aval.dtype.kind == "b":
-                stored_vector_type = self.array_emitter.value_emitter.make_vector_type(I8)
-                entry_value = llvm_builder.zext(entry_value, stored_vector_type)
-            if self.has_single_lane:
-                # The lane is read from memory, because LLVM would reduce an extracted entry, and
-                # all operations before it, to scalars.
-                memory = self.array_emitter.allocate_memory_array((), entry_value.type)
-                llvm_builder.store(entry_value, memory.base_pointer)
-                entry_value = llvm_builder.load(memory.base_pointer, typ=llvm_stored_type)
-            llvm_builder.store(entry_value, entry_address, align=aval.dtype.itemsize)
-            return []
-
-        self.array_emitter.emit_index_loops(aval.shape[:-1], emit_entry_store)
-
-    def emit_lane_group_address(
-        self, base_pointer: LlvmValue, aval: Any, entry_index: EntryIndex
-    ) -> tuple[LlvmValue, ir.Type]:
-        """Return the address of an array entry for the first lane of the group, and the LLVM type
-        to load or store there.
-        """
-        llvm_builder = self.array_emitter.llvm_builder
-        llvm_element_type = I8 if aval.dtype.kind == "b" else LLVM_NUMBER_TYPES[aval.dtype.name]
-        if aval.shape == ():
-            return base_pointer, llvm_element_type
-        entry_offset = self.array_emitter.emit_memory_offset(entry_index, aval.shape[:-1])
-        lane_offset = llvm_builder.add(
-            llvm_builder.mul(entry_offset, self.n_lanes), self.first_lane_index
-        )
-        llvm_stored_type = (
-            llvm_element_type
-            if self.has_single_lane
-            else self.array_emitter.value_emitter.make_vector_type(llvm_element_type)
-        )
-        return llvm_builder.gep(
-            base_pointer, [lane_offset], source_etype=llvm_element_type
-        ), llvm_stored_type

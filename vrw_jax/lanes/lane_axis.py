@@ -18,6 +18,7 @@ from jax.extend.core import ClosedJaxpr, Literal
 
 from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.lanes.decompositions import DECOMPOSITIONS
+from vrw_jax.lanes.loops import count_scan_arguments
 from vrw_jax.lanes.lowering import CALLED_JAXPR_PARAMETERS, NOINLINE_FUNCTION_NAME, mark_noinline
 from vrw_jax.lanes.reductions import COMBINING_PRIMITIVE_BY_REDUCTION
 
@@ -286,7 +287,7 @@ def _find_lanes(closed_jaxpr: ClosedJaxpr, argument_flags: tuple[bool, ...]) -> 
         if name == "while":
             results = _find_lanes_of_while(equation.params, operands)
         elif name == "scan":
-            n_constants, n_carry = _count_scan_arguments(equation.params)
+            n_constants, n_carry = count_scan_arguments(equation.params)
             results = _spread_lanes(equation.params["jaxpr"], operands, n_constants, n_carry)
         elif name in CALLED_JAXPR_PARAMETERS:
             results = _find_lanes(equation.params[CALLED_JAXPR_PARAMETERS[name]], operands)
@@ -324,13 +325,6 @@ def _make_arrays(n_lanes: int, values: Sequence[LaneValue], flags: Sequence[bool
         _with_lanes(n_lanes, value) if flag else value.array
         for value, flag in zip(values, flags, strict=False)
     ]
-
-
-def _count_scan_arguments(params: Any) -> tuple[int, int]:
-    if "ft_in" in params:  # JAX has this parameter from release 0.11 or 0.12 on.
-        constants, carry, _ = params["ft_in"].unpack()
-        return len(constants), len(carry)
-    return params["num_consts"], params["num_carry"]
 
 
 def _while(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
@@ -373,7 +367,7 @@ def _while(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[L
 
 def _scan(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
     params = equation.params
-    n_constants, n_carry = _count_scan_arguments(params)
+    n_constants, n_carry = count_scan_arguments(params)
     constants, carry = operands[:n_constants], operands[n_constants : n_constants + n_carry]
     scanned = operands[n_constants + n_carry :]
     scanned_flags = [x.has_lanes for x in scanned]

@@ -70,6 +70,14 @@ def emit_while_loop(
     )
 
 
+def count_scan_arguments(params: Any) -> tuple[int, int]:
+    """Return the numbers of constants and of carried arrays of a `scan` loop."""
+    if "ft_in" in params:  # JAX has this parameter from release 0.11 or 0.12 on.
+        constants, carry, _ = params["ft_in"].unpack()
+        return len(constants), len(carry)
+    return params["num_consts"], params["num_carry"]
+
+
 def emit_scan_loop(
     jaxpr_lowering: JaxprLowering, equation: Any, operands: list[LlvmArray]
 ) -> list[LlvmArray]:
@@ -79,12 +87,7 @@ def emit_scan_loop(
     Scanned inputs and stacked outputs are in memory.
     """
     array_emitter, equation_params = jaxpr_lowering.array_emitter, equation.params
-    if "ft_in" in equation_params:  # JAX has this parameter from release 0.11 or 0.12 on.
-        loop_constants, loop_carry, _ = equation_params["ft_in"].unpack()
-        n_loop_constants, n_carried_arrays = len(loop_constants), len(loop_carry)
-    else:
-        n_loop_constants = equation_params["num_consts"]
-        n_carried_arrays = equation_params["num_carry"]
+    n_loop_constants, n_carried_arrays = count_scan_arguments(equation_params)
     body_jaxpr, n_iterations = equation_params["jaxpr"], equation_params["length"]
     stacked_output_avals = [x.aval for x in equation.outvars[n_carried_arrays:]]
     scanned_operands = operands[n_loop_constants + n_carried_arrays :]
