@@ -73,9 +73,7 @@ def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_re
     assert max_dls_result.kkt_residual < 1e-6
     assert {a.name for a in max_dls_result.active} >= {"takeoff_acceleration", "slope"}
     assert all(a.price > 0.0 for a in max_dls_result.active)
-    retained = make_problem("dls_fraction").make_evaluated_trial(
-        np.zeros(4), find_max_dls_gait(max_dls_result), vrw.Outcome.STEPPED, True
-    )
+    retained = find_max_dls_trial(max_dls_result)
     # A constraint counts as kept within ACTIVE widths; the gait found afresh differs by 1e-9.
     assert (
         compute_max_violation(
@@ -86,13 +84,13 @@ def test_the_optimum_meets_the_first_order_condition_and_every_margin(max_dls_re
     )
 
 
-def find_max_dls_gait(tuned: TuneResult):
-    """Return the gait at a result, computed without a guess."""
+def find_max_dls_trial(tuned: TuneResult):
+    """Return the trial at a result, computed without a guess."""
     problem = make_problem("dls_fraction")
     u = (
         np.array([float(getattr(tuned.params, n)) for n in FREE_PARAMETERS]) - problem.lower_bounds
     ) / problem.bound_widths
-    return problem.evaluate_trial(u, None).gait_evaluation
+    return problem.evaluate_trial(u, None)
 
 
 def test_no_wheel_on_a_grid_around_the_optimum_is_better(max_dls_result):

@@ -21,11 +21,8 @@ import numpy as np
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
-from vrw_jax.studies.tune_objective import (
-    GaitEvaluation,
-    compute_max_violation,
-    compute_slack_scales,
-)
+from vrw_jax.gaits.finder import Gait
+from vrw_jax.studies.tune_objective import compute_max_violation, compute_slack_scales
 
 
 class TuneStatus(StatusCode):
@@ -61,7 +58,7 @@ class EvaluatedTrial(NamedTuple):
     objective_gradient: np.ndarray  # gradient of the objective by normalized parameters
     constraint_slacks: np.ndarray  # constraint values minus their margins, in their own units
     slack_jacobian: np.ndarray  # (n_constraints, n_free_parameters)
-    gait_evaluation: GaitEvaluation
+    gait: Gait
 
     @property
     def has_gait_on_branch(self) -> Any:

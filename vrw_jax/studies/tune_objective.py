@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ from vrw_jax.base.checks import (
     check_reals,
     require_known_name,
 )
-from vrw_jax.gaits.finder import AbstractGaitFinder, Gait, GaitFunction, GaitMeasureReader
+from vrw_jax.gaits.finder import AbstractGaitFinder, GaitFunction, GaitMeasureReader
 from vrw_jax.gaits.margin_defaults import default_margins
 from vrw_jax.wheel.params import WheelParams
 
@@ -138,16 +138,6 @@ class ObjectiveAndConstraints:
                 measure_value if measure_name == constraint_name else -measure_value
             )
         return jnp.concatenate([jnp.ravel(objective_value), *constraint_values])
-
-
-class GaitEvaluation(NamedTuple):
-    """Gait with its objective and constraints. In a batch, the batch axis comes first."""
-
-    gait: Gait
-    objective_and_constraint_values: (
-        Array  # (1 + n_constraints,): the objective, then the constraints
-    )
-    parameter_jacobian: Array  # (n_parameters, 1 + n_constraints)
 
 
 def parse_constraint_margins(

@@ -77,7 +77,6 @@ from vrw_jax.studies.tune_objective import (
     UPPER_BOUND_PREFIX,
     ConstraintSpecification,
     CycleObjective,
-    GaitEvaluation,
     ObjectiveAndConstraints,
     WeightedMeasureSum,
     WheelObjective,
@@ -385,60 +384,39 @@ class TuneProblem:
         initial_guess = (
             make_guess(parameter_values)
             if neighbor_trial is None
-            else neighbor_trial.gait_evaluation.gait.cycle.warm_start
+            else neighbor_trial.gait.cycle.warm_start
         )
         gait = find_gait(parameter_values, initial_guess)
-        gait_evaluation = GaitEvaluation(
-            gait, *evaluate_measures(self.objective_and_constraints, gait)
-        )
-        gait_outcome = np.asarray(gait.outcome)
-        is_on_branch = np.ones(gait_outcome.shape, bool)
+        values, jacobian = map(np.array, evaluate_measures(self.objective_and_constraints, gait))
+        free_jacobian = np.swapaxes(jacobian[..., self.free_parameter_indices, :], -1, -2)
+        outcome = np.asarray(gait.outcome)
+        has_gait = outcome == Outcome.STEPPED
+        is_on_branch = np.ones(outcome.shape, bool)
         if neighbor_trial is not None:
             # A trial without a gait has a failure of its own.
-            is_on_branch = (gait_outcome != Outcome.STEPPED) | is_same_branch(
-                neighbor_trial.gait_evaluation.gait.branch_point,
+            is_on_branch = ~has_gait | is_same_branch(
+                neighbor_trial.gait.branch_point,
                 gait.branch_point,
                 numpy_values - self.denormalize_parameters(neighbor_trial.normalized_parameters),
             )
-        return self.make_evaluated_trial(
-            normalized_parameters, gait_evaluation, gait_outcome, is_on_branch
-        )
-
-    def make_evaluated_trial(
-        self,
-        normalized_parameters: np.ndarray,
-        gait_evaluation: GaitEvaluation,
-        gait_outcome: Any,
-        is_on_branch: Any,
-    ) -> EvaluatedTrial:
-        """Return the trial for a gait whose objective and constraints have been evaluated.
-
-        All arguments may have a leading axis over a batch of trials.
-        """
-        values = np.array(gait_evaluation.objective_and_constraint_values)
-        free_jacobian = np.swapaxes(
-            np.array(gait_evaluation.parameter_jacobian)[..., self.free_parameter_indices, :],
-            -1,
-            -2,
-        )
-        if self.wheel_objective is not None and gait_outcome == Outcome.STEPPED and is_on_branch:
+        if self.wheel_objective is not None and has_gait and is_on_branch:
             values[0], free_jacobian[0] = self.wheel_objective.evaluate_with_gradient(
                 self.make_wheel(normalized_parameters), self.free_parameters
             )
-        has_gait = np.asarray(gait_outcome == Outcome.STEPPED)[..., None]
+        has_gait = has_gait[..., None]
         values = np.where(has_gait, values, np.nan)
         normalized_jacobian = np.where(
             has_gait[..., None], free_jacobian * self.bound_widths, np.nan
         )
         return EvaluatedTrial(
             normalized_parameters,
-            gait_outcome,
+            outcome,
             is_on_branch,
             values[..., 0][()],  # a number unless it is a batch
             normalized_jacobian[..., 0, :],
             values[..., 1:] - self.min_constraint_values,
             normalized_jacobian[..., 1:, :],
-            gait_evaluation,
+            gait,
         )
 
     def explore_random_starts(self, n_starts: int, seed: int) -> ExplorationResult:
@@ -461,7 +439,7 @@ class TuneProblem:
         walk.
         """
         best_trial = maximization_result.best_trial
-        best_gait = best_trial.gait_evaluation.gait
+        best_gait = best_trial.gait
         params = self.make_wheel(best_trial.normalized_parameters)
         model: Any = self.gait_finder.model
         laws = getattr(params, "laws", None)
