@@ -4,7 +4,8 @@
     python -m experiments.speed.first_answers gradient  # only calls whose name contains the word
 
 Each call runs twice in new processes on one core, and the second process finds the compiled code of
-the first. The times include the start of Python and the import. The command writes
+the first. The times include the start of Python and the import, for which Python's bytecode exists
+as after an installation by pip. The command writes
 `docs/figures/first_answers.csv` and the table of `docs/benchmarks/compiling.md`. Run it on an idle
 machine.
 """
@@ -67,9 +68,17 @@ params, start = vrw.WheelParams(), (0.1, 1.6, -0.1)
 """
 
 
-def measure_process(call: str, cache: str) -> tuple[float, float]:
-    """Return CPU time and wall time of a new process that computes a call, s."""
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache, "VRW_PROGRESS": "0"}
+def measure_process(call: str, cache: str, bytecode: str) -> tuple[float, float]:
+    """Return CPU time and wall time of a new process that computes a call, s.
+
+    - `bytecode`: folder of Python's bytecode.
+    """
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": cache,
+        "VRW_PROGRESS": "0",
+        "PYTHONPYCACHEPREFIX": bytecode,
+        "PYTHONDONTWRITEBYTECODE": "",
+    }
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     subprocess.run([sys.executable, "-c", PREPARATION + call], env=environment, check=True)
     after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter() - began
@@ -81,11 +90,15 @@ def main() -> None:
     parser.add_argument("word", nargs="?", default="", help="part of the names of the calls")
     word = parser.parse_args().word
     rows = []
+    bytecode = tempfile.TemporaryDirectory()
+    measure_process("", bytecode.name, bytecode.name)
     for name, call in CALLS.items():
         if word not in name:
             continue
         with tempfile.TemporaryDirectory() as cache, use_one_core():
-            (cold, cold_wall), (warm, warm_wall) = (measure_process(call, cache) for _ in range(2))
+            (cold, cold_wall), (warm, warm_wall) = (
+                measure_process(call, cache, bytecode.name) for _ in range(2)
+            )
         rows.append(
             {
                 "first answer": name,
