@@ -64,7 +64,8 @@ class AbstractWalker(abc.ABC):
     - `invariants`: functions of section coordinates and parameters that a step conserves;
     - `measures`: measures of a gait, see `vrw.measure`;
     - `ground`: `{"height": name}` names the parameter that is the rise from the foothold of a step
-      to the next one, so that walks and batches take `heights`.
+      to the next one, so that walks and batches take `heights`;
+    - `sample_motion`: method that returns the motion during a step, for fits to time series.
 
     Parameters are a tree of numbers, such as a dictionary or an `equinox.Module`.
 
@@ -127,6 +128,19 @@ class AbstractWalker(abc.ABC):
     def measure_step(self, params: Any, x: Array, step: Any, options: StepOptions) -> dict:
         """Return the values of `measures` for the step from `x`, by name."""
         return {measure.name: jnp.asarray(measure(step, params)) for measure in self.measures}
+
+    def sample_motion(
+        self, params: Any, x: Any, options: StepOptions, n_samples: int
+    ) -> tuple[dict[str, Any], Any]:
+        """Return the motion during a step, with which `vrw.fit` compares measured time series.
+
+        The first result contains variables by name, each at `n_samples` equidistant times of every
+        phase, shape (phases, n_samples). The second contains the durations of the phases, s.
+        """
+        raise TypeError(
+            f"the motion within a step of a {type(self).__name__} is unknown, so that only its "
+            "steps can be fitted: write its method sample_motion."
+        )
 
     def check_definition(self, params: Any, x: Any, name: str) -> None:
         """Raise an error if functions of the walker do not fit to parameters and a start.

@@ -40,6 +40,7 @@ from vrw_jax.base.walker import (
 )
 from vrw_jax.flow.hybrid_simulation import (
     Event,
+    EventRun,
     Guard,
     HybridSolution,
     Mode,
@@ -47,7 +48,7 @@ from vrw_jax.flow.hybrid_simulation import (
     run_events,
     simulate_modes,
 )
-from vrw_jax.flow.phase_integration import StateArray
+from vrw_jax.flow.phase_integration import StateArray, sample_phase
 
 MAX_EVENTS_PER_STEP = 16
 """Default limit of the events in one step, chosen above those of walkers with several legs."""
@@ -265,10 +266,15 @@ class HybridSystem(AbstractWalker):
             for mode in self.modes.values()
         )
 
-    def take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
-        """Return one step of one element; `compile_step` compiles this function."""
-        modes, n_modes = self._bind_modes(params), len(self.modes)
-        first_guards = np.cumsum([0, *(len(mode.guards) for mode in modes)])[:-1]
+    def _run_step(
+        self,
+        params: Any,
+        x: Array,
+        options: StepOptions,
+        make_log: Callable[[StateArray], Any],
+        update_log: Callable,
+    ) -> EventRun:
+        """Simulate one step, and record its events in a log."""
         section_guards = [
             (mode_index, guard_index)
             for mode_index, mode in enumerate(self.modes.values())
@@ -278,6 +284,22 @@ class HybridSystem(AbstractWalker):
         is_section = lambda event: jnp.any(
             jnp.stack([(event.mode == m) & (event.guard == g) for m, g in section_guards])
         )
+        start = self.embed(x, params)
+        return run_events(
+            self._bind_modes(params),
+            options,
+            start,
+            jnp.asarray(self._find_mode(None), jnp.int32),
+            self.max_events,
+            make_log(start),
+            update_log,
+            is_section,
+        )
+
+    def take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
+        """Return one step of one element; `compile_step` compiles this function."""
+        n_guards, n_modes = [len(mode.guards) for mode in self.modes.values()], len(self.modes)
+        first_guards = np.cumsum([0, *n_guards])[:-1]
 
         def log_event(log: Any, n_events: Array, has_event: Array, event: Event) -> tuple:
             mode_durations, events = log
@@ -291,18 +313,11 @@ class HybridSystem(AbstractWalker):
                 jnp.where(is_entry, guard, events).astype(jnp.int32),
             )
 
-        start = self.embed(x, params)
-        log = jnp.zeros(n_modes) + 0.0 * start[0], jnp.full(self.max_events, -1, jnp.int32)
-        run = run_events(
-            modes,
-            options,
-            start,
-            jnp.asarray(self._find_mode(None), jnp.int32),
-            self.max_events,
-            log,
-            log_event,
-            is_section,
+        make_log = lambda start: (
+            jnp.zeros(n_modes) + 0.0 * start[0],
+            jnp.full(self.max_events, -1, jnp.int32),
         )
+        run = self._run_step(params, x, options, make_log, log_event)
         mode_durations, events = run.log
         return HybridStep(
             self.project(run.state, params),
@@ -313,6 +328,54 @@ class HybridSystem(AbstractWalker):
             run.solver_steps,
             run.termination,
         )
+
+    def sample_motion(
+        self, params: Any, x: Array, options: StepOptions, n_samples: int
+    ) -> tuple[dict[str, Array], Array]:
+        """Return the state, and the measures of modes, at times between the events of a step.
+
+        A measure is zero outside its mode. The phases are the intervals between events, of which
+        there are `max_events`; those after the step have the duration zero.
+        """
+        return _compile_sampling(self, n_samples)(params, x, options)
+
+    def _sample_motion(
+        self, n_samples: int, params: Any, x: Array, options: StepOptions
+    ) -> tuple[dict[str, Array], Array]:
+        def log_event(log: Any, n_events: Array, has_event: Array, event: Event) -> tuple:
+            is_entry = has_event & (jnp.arange(self.max_events) == n_events)
+            states, durations, modes = log
+            return (
+                jnp.where(is_entry[:, None], event.state_after, states),
+                jnp.where(is_entry, event.duration, durations),
+                jnp.where(is_entry, event.mode, modes),
+            )
+
+        make_log = lambda start: (
+            jnp.zeros((self.max_events, len(start))) + start,
+            jnp.zeros(self.max_events) + 0.0 * start[0],
+            jnp.zeros(self.max_events, jnp.int32),
+        )
+        states, durations, modes = self._run_step(params, x, options, make_log, log_event).log
+        starts = jnp.concatenate([self.embed(x, params)[None], states[:-1]])
+        samplers = [
+            lambda state, duration, field=mode.field: sample_phase(
+                field, state, duration, n_samples, options
+            )
+            for mode in self._bind_modes(params)
+        ]
+        samples = jax.lax.map(
+            lambda interval: jax.lax.switch(interval[0], samplers, *interval[1:]),
+            (modes, starts, durations),
+        )
+        columns = {name: samples[..., i] for i, name in enumerate(self.state)}
+        for measure in self.measures:
+            if measure.phase:
+                evaluate = lambda y, measure=measure: measure(y, params)
+                is_mode = modes == self._find_mode(measure.phase)
+                values = jax.vmap(jax.vmap(evaluate))(samples)
+                columns[measure.name] = jnp.where(is_mode[:, None], values, 0.0)
+        return columns, durations
 
     def step(self, params: Any, x: Any, options: StepOptions | None = None) -> HybridStep:
         """Return the step that begins at section coordinates `x`, shape (n,).
@@ -479,6 +542,11 @@ def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> Hy
         ),
         max_events=system.max_events,
     )
+
+
+@functools.lru_cache
+def _compile_sampling(system: HybridSystem, n_samples: int) -> Any:
+    return lanes.jit(functools.partial(system._sample_motion, n_samples))
 
 
 @functools.lru_cache

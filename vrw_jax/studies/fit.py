@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,9 +23,10 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import list_parameters
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.finder_selection import resolve_finder
 from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.studies import fit_data, fit_problem
@@ -39,6 +39,10 @@ N_STARTS = 8
 START_RANGE_FACTOR = 2.0
 """Factor by which starts differ from the given walker, where no bounds are given."""
 N_FOLDS = 5
+DURATION_MARGIN = 1.2
+"""Ratio of the predicted duration of a walk at the given parameters to that of a series. The walk
+may become so much faster during the search."""
+MAX_STEPS = 1000
 
 
 @announce_wait("predictions with derivatives, and their fit", "30 s")
@@ -65,7 +69,7 @@ def fit(
     - **gaits**: each row is a steady gait, and its columns are measures such as "period";
     - **steps**, with a column "step": each row is a step of a walk that need not be periodic. The
       columns are durations, states at touchdown, or "touchdown_time" and "takeoff_time";
-    - **series**, with a column "time": variables of `vrw.simulate`, such as forces and angles.
+    - **series**, with a column "time": forces, angles and lengths, as in `vrw.simulate`.
 
     Each measured column has a column of its standard errors, as "period_error". Units are those of
     xarray's attribute `units`, or in the heading, as "period [ms]"; SI units otherwise. Columns
@@ -81,17 +85,17 @@ def fit(
         params: the walker at which the search starts, with the known parameters.
         free: names of the unknown parameters, which all rows share; "slope_offset" is added to the
             slopes of all rows, and "time_offset" to all times.
-        model: the model, or a `HybridSystem`; the paper's, `ViscoelasticWheel()`, by default.
+        model: the model, or your own walker; the paper's, `ViscoelasticWheel()`, by default.
         bounds: lower and upper bound of unknowns by name; by default the domain of the parameter.
         priors: mean and standard deviation of unknowns by name.
         start: section state at the start of a walk, one for each walk, or "gait" for the steady
-            gait. By default it is unknown and estimated too. For a `HybridSystem`, it is required.
+            gait. By default it is unknown and estimated too. For gaits, the search begins there.
         extra: first values of further unknowns that `observe` uses, by name.
         observe: function of the predicted columns and of `extra`, as dictionaries. It returns what
             the sensors report.
         covariance: covariance of the columns of a row, instead of standard errors.
-        window: duration over which each sample of a series is a mean, s; by default the sampling
-            interval, and 0 for instantaneous values.
+        window: time before and after a sample of a series over which it is a mean, with weights
+            that fall linearly, s; by default the sampling interval, and 0 for instantaneous values.
         n_starts: number of starts of the search, of which the best fit is returned.
         options: numerical options of the steps.
 
@@ -109,100 +113,71 @@ def fit(
         ('damping',) 1 True
     """
     require_untraced_arguments("vrw.fit", "use result.log_likelihood", params)
-    problem, targets, starts, table, units, walker = make_fit_problem(
-        data, params, free, model=model, bounds=bounds, priors=priors, start=start, extra=extra,
-        observe=observe, covariance=covariance, window=window, n_starts=n_starts, options=options,
-    )  # fmt: skip
-    if not table.is_batch:
-        return make_result(problem, targets, starts, table, units, params, walker, is_batch=False)
-    mean_targets = targets._replace(values=targets.values.mean(0, keepdims=True))
-    mean_fit = make_result(
-        problem, mean_targets, starts, table, units, params, walker, is_batch=False
-    )
-    starts = np.tile(mean_fit.values, (len(table.values), 1))
-    return make_result(problem, targets, starts, table, units, params, walker, is_batch=True)
-
-
-def make_fit_problem(
-    data: Any,
-    params: Any,
-    free: Sequence[str],
-    *,
-    model: Any,
-    bounds: Any,
-    priors: Any,
-    start: Any,
-    extra: Any,
-    observe: Any,
-    covariance: Any,
-    window: Any,
-    n_starts: int,
-    options: StepOptions | None,
-) -> tuple[FitProblem, FitTarget, np.ndarray, fit_data.FitData, tuple[str, ...], Any]:
-    """Check all arguments of `fit`, and return the problem, its targets and its starts."""
     free = check_names("free", free, '"damping", "stiffness"')
     bounds, priors, extra = dict(bounds or {}), dict(priors or {}), dict(extra or {})
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     n_starts = check_int("n_starts", n_starts)
-    system = model if isinstance(model, HybridSystem) else None
-    finder: Any = None
-    time_unit: Any = None
-    if system is None:
-        model = resolve_model(params, model)
-        finder = resolve_finder(params, model, None)
-        model = finder.model
-        base_values = np.asarray(model.collect_parameter_values(params), float)
-        structure: Any = params.n_legs
-        units, domains = model.units, model.parameter_domains
-        time_unit = math.sqrt(float(params.locked_length) / float(params.gravity))
+    finder: Any
+    if is_own_walker(model):
+        guess = None if start is None or isinstance(start, str) else np.atleast_2d(start)[0]
+        if guess is None and model.starts is None:
+            raise ValueError(
+                "start is None, but this walker has no starts from which a search begins: give "
+                "section coordinates, or one row of them for each walk."
+            )
+        finder = resolve_finder(params, model, options, guess=guess)
+        time_unit = None
+        own_units = [(measure.name, measure.unit) for measure in finder.described_measures]
+        own_units += [(name, x.unit) for name, x in finder.model.named_domains]
+        # Without a declaration, the unit is unknown.
+        units = {"period": "s"} | {name: unit for name, unit in own_units if unit != "1"}
+        entries = finder.coordinates
     else:
-        leaves, structure = jax.tree.flatten(params)
-        base_values = np.array([check_real("a parameter", x) for x in leaves])
-        units, domains = {"period": "s"}, {}
-    parameter_names = fit_problem.list_parameter_names(system or model, structure)
+        finder = resolve_finder(params, resolve_model(params, model), None)
+        time_unit = math.sqrt(float(params.locked_length) / float(params.gravity))
+        units = finder.model.units
+        # The landing on both feet of the paper's wheel leaves two of the three entries.
+        entries = fit_problem.START_NAMES[:2]
+    model = finder.model
+    domains, parameter_names = model.parameter_domains, model.parameter_names
     table = fit_data.read_data(data, covariance, units, parameter_names)
     fit_data.check_plausible(table, units, time_unit)
-    if table.kind == "gaits" and system is not None:
+    if table.kind == "series" and not model.is_compliant:
         raise ValueError(
-            "data have no column 'step', but gaits of a HybridSystem are fitted as steps: add the "
-            "column, and give start=."
-        )
-    if table.kind == "series" and (system is not None or model.reports_contacts):
-        raise ValueError(
-            "data have a column 'time', but time series are those of the paper's phases: give "
-            "vrw.ViscoelasticWheel(), or fit the steps."
+            "data have a column 'time', but series need legs with springs: fit the steps or gaits."
         )
     walks = np.unique(table.labels.get("walk", np.zeros(1)))
     row_walks = np.searchsorted(walks, table.labels.get("walk", np.zeros(table.values.shape[1])))
     starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
-    if starts_from_gait and (system is not None or not finder.supports_cold_start):
-        raise ValueError(
-            "start is 'gait', but the gaits of this walker are found from a start only: give a "
-            "section state."
-        )
-    first_states: Any = None
-    row_steps: Any = None
+    first_states: Any = _find_first_states(table.kind, params, finder, start, len(walks))
+    has_unknown_starts = start is None and table.kind != "gaits"
+    if has_unknown_starts and model.is_wheel and first_states.shape[1] > 3:
+        # Of a full section state, Leg 1 stands on the ground, and the others on their stoppers.
+        first_states = first_states[:, [0, 1, 4 + params.n_legs]]
+    start_names = [
+        f"{fit_problem.START_PREFIX}{entry}{f'[{walk}]' if len(walks) > 1 else ''}"
+        for walk in range(len(walks))
+        for entry in entries
+        if has_unknown_starts
+    ]
+    row_steps = table.labels.get("step")
     n_steps = 1
-    start_names: list[str] = []
-    if table.kind != "gaits":
-        cycle: Any = limit_cycle(params, model=model) if system is None else None
-        first_states = _make_starts(table, params, model, system, cycle, start, walks)
-        entries = fit_problem.list_start_names(system, first_states.shape[1])
-        if start is None:
-            # The landing on both feet of the paper's wheel leaves two of the three entries.
-            n_entries = 2 if system is None and not model.reports_contacts else len(entries)
-            start_names = fit_problem.make_start_names(len(walks), entries[:n_entries])
-        if table.kind == "steps":
-            row_steps = table.labels["step"].astype(int)
-            row_steps = row_steps - min(row_steps)
-            n_steps = int(row_steps.max()) + 1
-        elif not starts_from_gait:
-            period = float(cycle.period) if bool(cycle.found) else 2.0 * time_unit
-            n_steps = math.ceil(float(table.labels["time"].max()) / (0.7 * period)) + 1
-    elif finder is not None and not finder.supports_cold_start:
-        guess = start if start is not None else limit_cycle(params, model=model).section_state
-        first_states = np.asarray(guess, float)[None]
+    if row_steps is not None:
+        row_steps = row_steps.astype(int) - int(row_steps.min())
+        n_steps = int(row_steps.max()) + 1
+    times = table.labels.get("time")
+    if times is not None:
+        spacing = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
+        window = spacing if window is None else float(check_real("window", window))
+    if times is not None and window is not None and not starts_from_gait:
+        if times.min() < window:
+            raise ValueError(
+                f"the series begins {times.min():g} s after the first touchdown, but its samples "
+                f"are means over {window:g} s before and after them: begin later, or give window=."
+            )
+        last_time = float(times.max()) + window
+        n_steps = max(n_steps, _count_steps(finder, params, first_states, last_time, options))
     offset_names = [f"{name}{fit_problem.OFFSET_SUFFIX}" for name in parameter_names]
     if table.kind == "series":
         offset_names.append(fit_problem.TIME_OFFSET)
@@ -218,12 +193,14 @@ def make_fit_problem(
         raise ValueError(f"the unknowns are {unknown_names}, but each is named once: change free.")
     for name in (*bounds, *priors):
         require_known_name(name, unknown_names, "unknown")
-    _require_measures(table, finder, system, observe, units)
+    if table.kind == "gaits" and observe is None:
+        for name in table.names:
+            require_known_name(name, finder.differentiable_measures, "measure of gaits")
+    base_values = np.asarray(model.collect_parameter_values(params), float)
     known_values = dict(zip(parameter_names, base_values, strict=True)) | extra
-    for name in start_names:
-        entry = fit_problem.parse_start_name(name, len(walks), entries)
-        known_values[name] = first_states[entry]
-    first = np.array([float(known_values.get(name, 0.0)) for name in unknown_names])
+    first = np.array([float(known_values.get(name, 0.0)) for name in (*free, *extra)])
+    if start_names:
+        first = np.append(first, first_states[:, : len(entries)])
     lower, upper = _collect_bounds(unknown_names, bounds, domains, first)
     prior_means, prior_weights = np.zeros(len(first)), np.zeros(len(first))
     for name, prior in priors.items():
@@ -243,32 +220,27 @@ def make_fit_problem(
             "give start= or fewer free parameters."
         )
     widths = [priors[x][1] if x in priors else _guess_scale(x, domains) for x in unknown_names]
-    scale = np.where(first == 0.0, widths, np.abs(first))
-    times = table.labels.get("time")
-    if times is not None and window is None:
-        window = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
+    as_array = lambda x: None if x is None else jnp.asarray(x)
     problem = FitProblem(
-        walker=None if system is not None else model,
         finder=finder,
         base_values=tuple(map(jnp.asarray, base_values)),
-        conditions=_arrange_conditions(table, row_walks, row_steps, n_steps, len(walks)),
+        conditions=_arrange_conditions(table, model, row_walks, row_steps, n_steps, len(walks)),
         row_walks=jnp.asarray(row_walks),
-        row_steps=None if row_steps is None else jnp.asarray(row_steps),
-        times=None if times is None else jnp.asarray(times),
-        window=None if times is None else jnp.asarray(check_real("window", window)),
-        starts=None if first_states is None else jnp.asarray(first_states),
+        row_steps=as_array(row_steps),
+        times=as_array(times),
+        window=None if times is None else jnp.asarray(window),
+        starts=as_array(first_states),
         whitener=jnp.asarray(table.whitener),
         lower=lower,
         upper=upper,
-        scale=scale,
+        scale=np.where(first == 0.0, widths, np.abs(first)),
         options=options,
         names=table.names,
         unknown_names=unknown_names,
         extra_names=tuple(extra),
         kind=table.kind,
-        system=system,
-        params_structure=structure,
         n_steps=n_steps,
+        n_start_entries=len(entries) if start_names else 0,
         starts_from_gait=starts_from_gait,
         observe=observe,
     )
@@ -279,73 +251,65 @@ def make_fit_problem(
         prior_weights[None],
     )
     starts = _make_search_starts(first, lower, upper, bounds, unknown_names, free, n_starts)
-    unknown_units = tuple(
-        domains[name.removesuffix("_offset")].unit
-        if name.removesuffix("_offset") in domains
-        else "s"
-        if name == fit_problem.TIME_OFFSET
-        else units.get(name.removeprefix(fit_problem.START_PREFIX).partition("[")[0], "1")
+    quantities = [
+        name.removesuffix("_offset").removeprefix(fit_problem.START_PREFIX).partition("[")[0]
         for name in unknown_names
+    ]
+    unknown_units = tuple(
+        "s" if name == "time" else domains[name].unit if name in domains else units.get(name, "1")
+        for name in quantities
     )
-    return problem, targets, starts, table, unknown_units, system or model
+    arguments = table, unknown_units, params, problem.unpack(problem.base_values)[0]
+    if not table.is_batch:
+        return make_result(problem, targets, starts, *arguments, is_batch=False)
+    mean_targets = targets._replace(values=targets.values.mean(0, keepdims=True))
+    mean_fit = make_result(problem, mean_targets, starts, *arguments, is_batch=False)
+    starts = np.tile(mean_fit.values, (len(table.values), 1))
+    return make_result(problem, targets, starts, *arguments, is_batch=True)
 
 
-def _make_starts(
-    table: fit_data.FitData,
-    params: Any,
-    model: Any,
-    system: HybridSystem | None,
-    cycle: Any,
-    start: Any,
-    walks: np.ndarray,
-) -> np.ndarray:
-    """Return the section state at the start of each walk, or a first guess of it."""
+def _find_first_states(
+    kind: str, params: Any, finder: Any, start: Any, n_walks: int
+) -> np.ndarray | None:
+    """Return the section state at the start of each walk, or a guess of it or of the gait."""
     if start is not None and not isinstance(start, str):
         states = np.atleast_2d(check_numpy_reals("start", start))
-        if states.shape[0] not in (1, len(walks)):
+        if states.shape[0] not in (1, n_walks):
             raise ValueError(
-                f"start has shape {states.shape}, but there are {len(walks)} walks: give one "
+                f"start has shape {states.shape}, but there are {n_walks} walks: give one "
                 "section state, or one for each walk."
             )
-    elif system is not None:
-        raise ValueError(
-            "start is None, but a HybridSystem has no start of its own: give section coordinates."
-        )
+    elif finder.model.is_wheel:
+        if kind == "gaits" and finder.supports_cold_start:
+            return None
+        cycle: Any = limit_cycle(params, model=finder.model)
+        default_start = finder.model.compute_default_start(params)
+        states = np.asarray(cycle.section_state if bool(cycle.found) else default_start)[None]
     else:
-        found = bool(cycle.found)
-        states = np.asarray(cycle.section_state if found else model.compute_default_start(params))[
-            None
-        ]
-    if system is None:
-        states = np.stack(
-            [np.asarray(model.complete_section_state(params, jnp.asarray(x))) for x in states]
-        )
-    return np.broadcast_to(states, (len(walks), states.shape[1])).astype(float)
+        if kind == "gaits":
+            return None
+        gait: Any = finder.find_cycle(params)
+        states = np.atleast_2d(finder.model.walker.starts(params))[:1]
+        states = np.asarray(gait.section_state)[None] if bool(gait.found) else np.asarray(states)
+    return np.broadcast_to(states, (n_walks, states.shape[1])).astype(float)
 
 
-def _require_measures(
-    table: fit_data.FitData, finder: Any, system: Any, observe: Any, units: Mapping[str, str]
-) -> None:
-    """Raise a `ValueError` if a measured column is not a quantity that the walker predicts."""
-    if observe is not None:
-        return
-    if table.kind == "gaits":
-        known = finder.cycle_measures
-    elif table.kind == "series":
-        known = fit_problem.SERIES_NAMES
-    elif system is not None:
-        known = ("period", "touchdown_time", *(f"duration_{mode}" for mode in system.modes))
-        known += tuple(f"section_{i}" for i in range(len(system.state)))
-    else:
-        durations = (
-            fit_problem.CONTACT_DURATION_NAMES
-            if finder.model.reports_contacts
-            else fit_problem.PHASE_DURATION_NAMES
-        )
-        known = (*durations, *fit_problem.START_NAMES, "period", "dls_fraction", "step_length")
-        known += ("touchdown_time", "takeoff_time")
-    for name in table.names:
-        require_known_name(name, known, f"measure of {table.kind}")
+def _count_steps(
+    finder: Any, params: Any, first_states: np.ndarray, last_time: float, options: StepOptions
+) -> int:
+    """Return a number of steps that takes longer than a series, also for slightly faster walks."""
+    walker = finder.model if finder.model.is_wheel else finder.model.walker
+    n_needed = 1
+    for x in jnp.asarray(first_states):
+        x = walker.complete_section_state(params, x) if walker.is_wheel else x
+        time, n_steps = 0.0, 0
+        while time < DURATION_MARGIN * last_time and n_steps < MAX_STEPS:
+            step = walker.advance(params, x, options)
+            if int(step.outcome) != Outcome.STEPPED:
+                break
+            x, time, n_steps = step.section_state, time + float(step.duration), n_steps + 1
+        n_needed = max(n_needed, n_steps)
+    return n_needed
 
 
 def _collect_bounds(
@@ -375,34 +339,33 @@ def _guess_scale(name: str, domains: Mapping[str, Any]) -> float:
 
 
 def _arrange_conditions(
-    table: fit_data.FitData, row_walks: Any, row_steps: Any, n_steps: int, n_walks: int
+    table: fit_data.FitData,
+    model: Any,
+    row_walks: Any,
+    row_steps: Any,
+    n_steps: int,
+    n_walks: int,
 ) -> dict[str, Any]:
     """Return the conditions of each row of gaits, or of each walk and its steps."""
-    conditions = {name: np.asarray(x, float) for name, x in table.conditions.items()}
     if table.kind == "gaits":
-        return {name: jnp.asarray(x) for name, x in conditions.items()}
+        return {name: jnp.asarray(x) for name, x in table.conditions.items()}
     arranged = {}
-    for name, column in conditions.items():
+    for name, column in table.conditions.items():
         by_walk = [column[row_walks == walk] for walk in range(n_walks)]
-        is_constant = all(np.ptp(x) == 0.0 for x in by_walk)
-        if name == fit_problem.HEIGHT_NAME or (not is_constant and name == "slope"):
-            if table.kind != "steps":
-                raise ValueError(
-                    f"{name} varies in a time series, which needs even ground: fit the steps."
-                )
-            # The ground goes on with the last value where a walk has fewer steps.
-            values = np.tile([[x[-1]] for x in by_walk], (1, n_steps))
-            values[row_walks, row_steps] = column
-            if name == fit_problem.HEIGHT_NAME:
-                values = np.concatenate([np.zeros((n_walks, 1)), values], 1)
-            arranged[name] = jnp.asarray(values)
-        elif is_constant:
+        if name != fit_data.HEIGHT_COLUMN and all(np.ptp(x) == 0.0 for x in by_walk):
             arranged[name] = jnp.asarray([x[0] for x in by_walk])
-        else:
+            continue
+        if row_steps is None or (model.is_wheel and name not in ("slope", fit_data.HEIGHT_COLUMN)):
             raise ValueError(
-                f"{name} varies within a walk, but only slopes and heights may: give one value "
-                "for each walk."
+                f"{name} varies within a walk, but only the ground may, from step to step: give "
+                "one value for each walk, or number the steps in a column 'step'."
             )
+        # The ground goes on with the last value where a walk has fewer steps.
+        values = np.tile([[x[-1]] for x in by_walk], (1, n_steps))
+        values[row_walks, row_steps] = column
+        if name == fit_data.HEIGHT_COLUMN:
+            values = np.concatenate([np.zeros((n_walks, 1)), values], 1)
+        arranged[name] = jnp.asarray(values)
     return arranged
 
 

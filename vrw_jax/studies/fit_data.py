@@ -108,7 +108,9 @@ def read_data(
     label_names = (WALK_COLUMN, STEP_COLUMN, TIME_COLUMN)
     repeat = lambda column: np.broadcast_to(column, (*column.shape[:-1], n_rows))
     labels = {name: repeat(table.pop(name)) for name in label_names if name in table}
-    condition_names = (*conditions, HEIGHT_COLUMN)
+    # A height with an error is measured, and one without is that of a foothold.
+    is_ground = HEIGHT_COLUMN + ERROR_SUFFIX not in table
+    condition_names = (*conditions, *(HEIGHT_COLUMN,) * is_ground)
     row_conditions = {name: repeat(table.pop(name)) for name in condition_names if name in table}
     names = tuple(name for name in table if not name.endswith(ERROR_SUFFIX))
     if not names:

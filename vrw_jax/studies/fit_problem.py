@@ -16,13 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vrw_jax.base.checks import require_known_name
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.parameters import list_tree_parameters
-from vrw_jax.flow.hybrid_system import HybridSystem
-from vrw_jax.lanes.batching import map_in_batches
+from vrw_jax.base.outcomes import Outcome
+from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 
-FIT_BATCH_SIZES = (8, 64, 512)
-"""Numbers of fits that one call computes. A batch runs until its slowest fit ends."""
+FIT_BATCH_SIZES = (8, 256)
+"""Numbers of fits that one call computes."""
+ITERATIONS_PER_CALL = 8
+"""Iterations of a batch, which runs until its slowest fit ends. Most fits need fewer. The others
+continue in a smaller batch."""
+MAX_CALLS = 8
 MISSING_GAIT_RESIDUAL = 1e6
 """Residual of each number if the walker has no gait, or falls. It is larger than that of any useful
 wheel, so that the fit rejects this trial and shortens its next change."""
@@ -30,29 +34,30 @@ TOLERANCE = 1e-7
 """Relative and absolute tolerance of the scaled unknowns and residuals: a thousandth of a standard
 error for data of 0.01 %, and above the errors of gaits, which are 1e-9."""
 NEGLIGIBLE_REDUCTION = 1e-6
-"""Predicted decrease of chi2 at which a fit ends: a distance of 1e-3 standard errors. Predictions
-of time series have kinks, where the method makes smaller and smaller changes."""
-MAX_ITERATIONS = 60
+"""Predicted decrease of chi2 at which a fit ends: a distance of 1e-3 standard errors."""
 SAMPLES_PER_PHASE = 24
 """Number of samples of each phase, between which polynomials of degree 5 interpolate. The value is
 chosen because errors of forces are then below 1e-5 of the weight."""
 STENCIL_SIZE = 6
+DIFFERENCE_STEP = 1e-4
+"""Relative change of unknowns for derivatives of samples with unilateral contact, which machine
+code computes without derivatives. The errors of the motion, 1e-9, are divided by it."""
 SLOPE_NAME, HEIGHT_NAME = "slope", "height"
 OFFSET_SUFFIX = "_offset"
 TIME_OFFSET = "time_offset"
 START_PREFIX = "start."
 START_NAMES = ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
-"""Entries of a start before its first touchdown, as in the table of measures."""
+"""Entries of a start of the wheel before its first touchdown, as in the table of measures."""
 SERIES_NAMES = (
     "theta", "L1", "L2", "dtheta", "dL1", "dL2", "lambda_1", "lambda_2", "lambda_3", "lambda_4",
 )  # fmt: skip
-"""Columns of a time series, as in `vrw.simulate`."""
+"""Columns of a time series of the wheel, as in `vrw.simulate`."""
 PHASE_DURATION_NAMES = ("duration_dls", "duration_sls1", "duration_sls2")
 CONTACT_DURATION_NAMES = ("duration_dls", "duration_single", "duration_flight")
 
 
-ParameterValues = Sequence[Array]
-"""Values of all parameters of the walker, each as one number."""
+ParameterValues = Sequence[Any]
+"""Values of all parameters of the walker, each as one number, or as one for each step."""
 
 
 class Prediction(NamedTuple):
@@ -97,27 +102,40 @@ class FitTarget(NamedTuple):
 class _GaitMeasures(dict):
     """Measures of one gait, computed when they are read."""
 
-    def __init__(self, cycle: Any) -> None:
+    def __init__(self, finder: Any, params: Any, guess: Any) -> None:
         super().__init__()
-        self.cycle = cycle
+        self.finder, self.params = finder, params
+        self.cycle = finder.find_cycle(params, guess)
+
+    @functools.cached_property
+    def step(self) -> Any:
+        model = self.finder.model
+        start = self.cycle.section_state
+        return (
+            model.take_step(self.params, start, self.finder.step_options)
+            if model.is_wheel
+            else None  # Measures of other walkers are known to the gait.
+        )
 
     def __missing__(self, name: str) -> Any:
-        return self.cycle.measure(name)
+        require_known_name(name, self.finder.differentiable_measures, "measure of gaits")
+        if name in self.finder.cycle_measures:
+            return self.cycle.measure(name)
+        return self.finder.measure_reader(name, self.cycle, self.step)
 
 
 class FitProblem(eqx.Module):
     """What is measured, what is unknown, and the walker that predicts it.
 
-    - `walker`: model of the wheel, or a `HybridSystem`;
-    - `finder`: finder of gaits, or None if no gait is measured;
+    - `finder`: finder of the gaits of the walker, with its model;
     - `base_values`: values of all parameters of the walker;
-    - `conditions`: parameters of each row, or of each walk, shape (rows,) or (walks, ...);
+    - `conditions`: parameters of each row, or of each walk and its steps;
     - `row_walks`, `row_steps`: walk and step of each row, for sequences of steps;
     - `times`: time of each row, s, for time series, and `window`, over which a sample is a mean;
-    - `starts`: section state at the start of each walk, shape (walks, n).
+    - `starts`: section state at the start of each walk, or near the gait, shape (walks, n);
+    - `n_start_entries`: number of their entries that are unknown.
     """
 
-    walker: Any
     finder: Any
     base_values: tuple[Array, ...]
     conditions: dict[str, Array]
@@ -135,22 +153,10 @@ class FitProblem(eqx.Module):
     unknown_names: tuple[str, ...] = eqx.field(static=True)
     extra_names: tuple[str, ...] = eqx.field(static=True)
     kind: str = eqx.field(static=True)
-    system: HybridSystem | None = eqx.field(static=True)
-    params_structure: Any = eqx.field(static=True)
     n_steps: int = eqx.field(static=True)
+    n_start_entries: int = eqx.field(static=True)
     starts_from_gait: bool = eqx.field(static=True)
     observe: Callable | None = eqx.field(static=True)
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Return the names of all parameters of the walker."""
-        return list_parameter_names(self.system or self.walker, self.params_structure)
-
-    def unpack(self, values: ParameterValues) -> tuple[Any, Any]:
-        """Return the walker and its parameters with the given values."""
-        if self.system is not None:
-            return self.system, jax.tree.unflatten(self.params_structure, list(values))
-        return self.walker.from_parameter_values(tuple(values), self.params_structure)
 
     def place_unknowns(self, x: Array) -> tuple[ParameterValues, dict[str, Array]]:
         """Return the values of all parameters, and the other unknowns by name.
@@ -160,61 +166,84 @@ class FitProblem(eqx.Module):
         unknowns = dict(zip(self.unknown_names, x, strict=True))
         values = [
             unknowns.pop(name, value)
-            for name, value in zip(self.parameter_names, self.base_values, strict=True)
+            for name, value in zip(self.finder.model.parameter_names, self.base_values, strict=True)
         ]
         return values, unknowns
 
+    def unpack(self, values: ParameterValues) -> tuple[Any, Any]:
+        """Return the walker and its parameters with the given values."""
+        model, params = self.finder.model.from_parameter_values(tuple(values), self.finder.n_legs)
+        return (model if model.is_wheel else model.walker), params
+
     def predict(self, x: Float[Array, " unknowns"]) -> Prediction:
         """Return the prediction of all measured numbers for the unknowns `x`, in SI units."""
+        model = self.finder.model
+        if self.kind == "series" and model.is_wheel and model.reports_contacts:
+            return Prediction(*_predict_with_differences(x, self))
+        return self.predict_exactly(x)
+
+    def predict_exactly(self, x: Float[Array, " unknowns"]) -> Prediction:
+        """Return the prediction with the derivatives of steps, events and gaits."""
         values, others = self.place_unknowns(x)
         extra = {name: others[name] for name in self.extra_names}
+        select = lambda columns: self._select_columns(columns, extra)
         if self.kind == "gaits":
-            predict_row = lambda conditions: self._predict_gait(
-                self._set_conditions(values, conditions, others), extra
-            )
+
+            def predict_row(conditions: dict[str, Array]) -> tuple[Array, Array]:
+                gait = self._find_gait(self._set_conditions(values, conditions, others), 0)
+                return select(gait), gait.cycle.found
+
             numbers, is_found = jax.vmap(predict_row, axis_size=len(self.whitener))(self.conditions)
             return Prediction(numbers, jnp.all(is_found))
-        starts = self.starts
-        for name, value in others.items():
-            if name.startswith(START_PREFIX):
-                walk, entry = parse_start_name(name, starts.shape[0], self._start_names)
-                starts = starts.at[walk, entry].set(value)
-        predict_walk = self._walk_steps if self.kind == "steps" else self._sample_walk
-        columns, is_valid = jax.vmap(functools.partial(predict_walk, values, others))(
+        starts, n_entries = self.starts, self.n_start_entries
+        if n_entries:
+            unknown_starts = x[-len(starts) * n_entries :].reshape(-1, n_entries)
+            starts = starts.at[:, :n_entries].set(unknown_starts)
+        columns, is_valid = jax.vmap(functools.partial(self._walk, values, others))(
             starts, self.conditions, jnp.arange(len(starts))
         )
-        rows = jnp.arange(len(self.row_walks)) if self.row_steps is None else self.row_steps
+        rows = self.row_steps if self.kind == "steps" else jnp.arange(len(self.row_walks))
         columns = {name: column[self.row_walks, rows] for name, column in columns.items()}
+        return Prediction(select(columns), jnp.all(is_valid))
+
+    def _select_columns(self, columns: Mapping[str, Array], extra: dict[str, Array]) -> Array:
+        """Return what the sensors report, the measured columns last."""
         if self.observe is not None:
             columns = self.observe(columns, extra)
-        return Prediction(jnp.stack([columns[name] for name in self.names], -1), jnp.all(is_valid))
-
-    @property
-    def _start_names(self) -> tuple[str, ...]:
-        return list_start_names(self.system, self.starts.shape[1])
+        if not isinstance(columns, _GaitMeasures):
+            for name in self.names:
+                require_known_name(name, tuple(columns), f"measure of {self.kind}")
+        return jnp.stack([columns[name] for name in self.names], -1)
 
     def _set_conditions(
         self, values: ParameterValues, conditions: Mapping[str, Array], others: Mapping[str, Array]
     ) -> ParameterValues:
-        values = list(values)
-        for i, name in enumerate(self.parameter_names):
-            if name in conditions and jnp.ndim(conditions[name]) == 0:
-                values[i] = conditions[name]
-            if name + OFFSET_SUFFIX in others:
-                values[i] = values[i] + others[name + OFFSET_SUFFIX]
-        return values
+        return [
+            conditions.get(name, value) + others.get(name + OFFSET_SUFFIX, 0.0)
+            for name, value in zip(self.finder.model.parameter_names, values, strict=True)
+        ]
 
-    def _predict_gait(
-        self, values: ParameterValues, extra: dict[str, Array]
-    ) -> tuple[Array, Array]:
-        guess = None if self.starts is None else self.starts[0]
-        cycle = self.finder.find_cycle_from_values(jnp.stack(values), guess)
-        measures: Any = _GaitMeasures(cycle)
-        if self.observe is not None:
-            measures = self.observe(measures, extra)
-        return jnp.stack([measures[name] for name in self.names]), cycle.found
+    def _find_gait(self, values: ParameterValues, walk: Any) -> _GaitMeasures:
+        model, params = self.finder.model.from_parameter_values(tuple(values), self.finder.n_legs)
+        finder = eqx.tree_at(lambda finder: finder.model, self.finder, model)
+        return _GaitMeasures(finder, params, None if self.starts is None else self.starts[walk])
 
-    def _walk_steps(
+    def _put_on_ground(
+        self, values: ParameterValues, conditions: Mapping[str, Array]
+    ) -> tuple[Any, Any, Any]:
+        """Return the walker, its parameters and what differs from step to step."""
+        heights = conditions.get(HEIGHT_NAME)
+        walker, params = self.unpack(values)
+        if walker.is_wheel:
+            ground = walker.split_ground_by_step(params, self.n_steps, heights)
+            slope = jnp.ravel(params.slope)[0]
+            return walker, eqx.tree_at(lambda wheel: wheel.slope, params, slope), ground
+        if heights is not None:
+            params = walker.put_on_heights(params, heights, self.n_steps)
+        ground, params = eqx.partition(params, lambda leaf: jnp.ndim(leaf) > 0)
+        return walker, params, ground if jax.tree.leaves(ground) else None
+
+    def _walk(
         self,
         values: ParameterValues,
         others: dict,
@@ -222,110 +251,82 @@ class FitProblem(eqx.Module):
         conditions: dict[str, Array],
         walk: Array,
     ) -> tuple[dict[str, Array], Array]:
-        """Return the measures of each step of one walk."""
-        is_used = jnp.arange(self.n_steps) <= jnp.max(
-            jnp.where(self.row_walks == walk, self.row_steps, -1)
-        )
+        """Return what is known of one walk at each step, or at the times of all rows."""
         values = self._set_conditions(values, conditions, others)
-        walker, params = self.unpack(values)
-        ground, heights = None, conditions.get(HEIGHT_NAME)
-        if jnp.ndim(conditions.get(SLOPE_NAME, 0.0)) or heights is not None:
-            if heights is None:
-                slopes = conditions[SLOPE_NAME] + others.get(SLOPE_NAME + OFFSET_SUFFIX, 0.0)
-                params = eqx.tree_at(lambda wheel: wheel.slope, params, slopes)
-            ground = walker.split_ground_by_step(params, self.n_steps, heights)
-            params = eqx.tree_at(lambda wheel: wheel.slope, params, jnp.ravel(params.slope)[0])
-
-        def advance(x_and_time: tuple, step_ground: Any) -> tuple:
-            x, time, has_walked = x_and_time
-            step_walker, step_params = (
-                (walker, params)
-                if step_ground is None
-                else walker.with_step_ground(params, step_ground)
-            )
-            columns, x_next, is_complete = self._take_step(step_walker, step_params, x)
-            columns["touchdown_time"] = time + columns["period"]
-            if "duration_dls" in columns:
-                columns["takeoff_time"] = time + columns["duration_dls"]
-            has_walked &= is_complete
-            next_x = jnp.where(has_walked, x_next, start)
-            return (next_x, columns["touchdown_time"], has_walked), (columns, has_walked)
-
+        walker, params, ground = self._put_on_ground(values, conditions)
+        is_valid, is_series = jnp.array(True), self.kind == "series"
         if self.starts_from_gait:
-            cycle = self.finder.find_cycle_from_values(jnp.stack(values), None)
-            start = walker.complete_section_state(params, cycle.section_state)
-        first = start, jnp.zeros(()), jnp.array(True)
-        steps: Any = jax.lax.scan(advance, first, ground, length=self.n_steps)[1]
-        columns, has_walked = steps
-        return columns, jnp.all(has_walked | ~is_used)
+            cycle = self._find_gait([jnp.ravel(value)[0] for value in values], walk).cycle
+            start, is_valid = cycle.section_state, cycle.found
+        if walker.is_wheel:
+            start = walker.complete_section_state(params, start)
 
-    def _take_step(self, walker: Any, params: Any, x: Array) -> tuple[dict, Array, Array]:
-        if self.system is not None:
-            step = self.system.step(params, x, self.options)
-            columns = {"period": step.duration}
-            columns |= {
-                f"duration_{mode}": step.mode_durations[i]
-                for i, mode in enumerate(self.system.modes)
-            }
-            return (
-                columns | dict(zip(self._start_names, step.section_state, strict=True)),
-                step.section_state,
-                step.is_complete,
+        def advance(walked: tuple, step_ground: Any) -> tuple:
+            x, time, has_walked = walked
+            step_walker, step_params = (
+                walker.with_step_ground(params, step_ground)
+                if step_ground is not None
+                else (walker, params)
             )
+            columns, durations, step = self._take_step(step_walker, step_params, x, is_series)
+            end_time = time + jnp.sum(durations)
+            if not is_series:
+                columns["touchdown_time"] = end_time
+                if "duration_dls" in columns:
+                    columns["takeoff_time"] = time + columns["duration_dls"]
+            has_walked &= step.outcome == Outcome.STEPPED
+            next_x = jnp.where(has_walked, step.section_state, start)
+            return (next_x, end_time, has_walked), (columns, durations, end_time, has_walked)
+
+        first = start, jnp.zeros(()), is_valid
+        steps: Any = jax.lax.scan(advance, first, ground, length=self.n_steps)[1]
+        columns, durations, end_times, has_walked = steps
+        is_row = self.row_walks == walk
+        if not is_series:
+            last_step = jnp.max(jnp.where(is_row, self.row_steps, -1))
+            return columns, jnp.all(has_walked | (jnp.arange(self.n_steps) > last_step))
+        times = self.times - others.get(TIME_OFFSET, 0.0)
+        last_time = jnp.max(jnp.where(is_row, times, 0.0))
+        is_used = jnp.append(True, end_times[:-1] < last_time + self.window)
+        is_valid = jnp.all(has_walked | ~is_used)
+        if not self.starts_from_gait:
+            is_valid &= last_time + self.window <= end_times[-1]
+        samples = jnp.stack([x.reshape(-1, SAMPLES_PER_PHASE) for x in columns.values()], -1)
+        means = _sample_piecewise(
+            samples, jnp.ravel(durations), times, self.window, self.starts_from_gait
+        )
+        return dict(zip(columns, means.T, strict=True)), is_valid
+
+    def _take_step(
+        self, walker: Any, params: Any, x: Array, is_series: bool
+    ) -> tuple[dict[str, Array], Array, Any]:
+        """Return measures of a step, or samples of its phases, and the durations of the phases."""
+        if is_series:
+            columns, durations, step = _sample_step(walker, params, x, self.options)
+            if self.observe is None:
+                for name in self.names:
+                    require_known_name(name, tuple(columns), "measure of series")
+                columns = {name: columns[name] for name in self.names}
+            return columns, durations, step
+        if not walker.is_wheel:
+            step = walker.take_step(params, x, self.options)
+            mode_names = getattr(walker, "modes", range(len(step.durations)))
+            columns = {f"duration_{m}": d for m, d in zip(mode_names, step.durations, strict=True)}
+            columns |= dict(zip(self.finder.coordinates, step.section_state, strict=True))
+            columns |= walker.measure_step(params, x, step, self.options)
+            return columns | {"period": step.duration}, step.duration, step
         step = walker.advance(params, x, self.options)
-        duration_names = CONTACT_DURATION_NAMES if walker.reports_contacts else PHASE_DURATION_NAMES
+        has_contacts = walker.reports_contacts
+        duration_names = CONTACT_DURATION_NAMES if has_contacts else PHASE_DURATION_NAMES
         columns = dict(zip(duration_names, step.durations, strict=True))
-        columns |= dict(zip(START_NAMES, step.section_state[:3], strict=True))
+        # A full section state begins with the same two entries as that of the paper.
+        columns |= dict(zip(START_NAMES[: 3 - has_contacts], step.section_state, strict=False))
         columns["period"] = jnp.sum(step.durations)
         columns["dls_fraction"] = step.durations[0] / jnp.where(
             columns["period"] > 0.0, columns["period"], 1.0
         )
         columns["step_length"] = walker.compute_foot_distance(params, x)
-        return columns, step.section_state, step.is_complete
-
-    def _sample_walk(
-        self,
-        values: ParameterValues,
-        others: dict,
-        start: Array,
-        conditions: dict[str, Array],
-        walk: Array,
-    ) -> tuple[dict[str, Array], Array]:
-        """Return each variable of one walk at the times of all rows."""
-        values = self._set_conditions(values, conditions, others)
-        walker, params = self.unpack(values)
-        is_valid = jnp.array(True)
-        if self.starts_from_gait:
-            cycle = self.finder.find_cycle_from_values(jnp.stack(values), None)
-            start, is_valid = cycle.section_state, cycle.found
-
-        read_names = SERIES_NAMES if self.observe is not None else self.names
-        variables = np.array([SERIES_NAMES.index(name) for name in read_names])
-
-        def advance(x_and_flag: tuple, _: None) -> tuple:
-            x, has_walked = x_and_flag
-            step = walker.sample_step(params, x, self.options, SAMPLES_PER_PHASE)
-            samples = jnp.concatenate([step.state, step.forces], -1)[..., variables]
-            has_walked &= step.is_complete
-            next_x = jnp.where(has_walked, step.section_state, start)
-            return (next_x, has_walked), (samples, step.durations, has_walked)
-
-        steps: Any = jax.lax.scan(advance, (start, is_valid), length=self.n_steps)[1]
-        samples, durations, has_walked = steps
-        samples = samples.reshape(-1, *samples.shape[2:])
-        durations = jnp.ravel(durations)
-        phase_ends = jnp.cumsum(durations)
-        times = self.times - others.get(TIME_OFFSET, 0.0)
-        is_used = self.row_walks == walk
-        is_started = phase_ends.reshape(-1, 3)[:-1, -1] < jnp.max(jnp.where(is_used, times, 0.0))
-        is_valid = is_valid & jnp.all(has_walked | ~jnp.append(True, is_started))
-        if not self.starts_from_gait:
-            is_valid &= jnp.all(~is_used | (times <= phase_ends[-1]))
-        read = functools.partial(
-            _sample_piecewise, samples, durations, phase_ends, self.starts_from_gait
-        )
-        columns = read(times, self.window)
-        return dict(zip(read_names, columns.T, strict=True)), is_valid
+        return columns, step.durations, step
 
     def transform(self, u: Array) -> Array:
         """Return the unknowns x for the variables u, which have no bounds."""
@@ -357,32 +358,24 @@ class FitProblem(eqx.Module):
         )
 
 
-def list_parameter_names(walker: Any, params_structure: Any) -> tuple[str, ...]:
-    """Return the names of the parameters of a model, or of the tree of a system's parameters."""
-    if not isinstance(walker, HybridSystem):
-        return walker.parameter_names
-    tree = jax.tree.unflatten(params_structure, [0.0] * params_structure.num_leaves)
-    return tuple(parameter.name for parameter in list_tree_parameters(tree))
-
-
-def list_start_names(system: HybridSystem | None, size: int) -> tuple[str, ...]:
-    """Return the names of the entries of a section state that may be measured or unknown."""
-    return START_NAMES if system is None else tuple(f"section_{i}" for i in range(size))
-
-
-def parse_start_name(name: str, n_walks: int, entries: tuple[str, ...]) -> tuple[int, int]:
-    """Return the walk and the entry of a name such as `start.theta_touchdown[1]`."""
-    entry, _, walk = name.removeprefix(START_PREFIX).partition("[")
-    return int(walk[:-1]) if walk else 0, entries.index(entry)
-
-
-def make_start_names(n_walks: int, entries: tuple[str, ...]) -> list[str]:
-    """Return the names of all unknown entries of the starts, one walk after the other."""
-    return [
-        f"{START_PREFIX}{entry}{f'[{walk}]' if n_walks > 1 else ''}"
-        for walk in range(n_walks)
-        for entry in entries
-    ]
+def _sample_step(
+    walker: Any, params: Any, x: Array, options: StepOptions
+) -> tuple[dict[str, Array], Array, Any]:
+    """Return samples of each phase of a step by name, the durations of the phases, and the step."""
+    if not walker.is_wheel:
+        columns, durations = walker.sample_motion(params, x, options, SAMPLES_PER_PHASE)
+        return columns, durations, walker.advance(params, x, options)
+    motion = walker.sample_step(params, x, options, SAMPLES_PER_PHASE)
+    if walker.reports_contacts:
+        n = params.n_legs
+        state = motion.state[..., np.array([2, 6, 7, 5, 6 + n, 7 + n])]
+        forces = jnp.stack([motion.tangential, motion.normal], -1)[..., :2, :]
+        variables = jnp.concatenate([state, forces.reshape(*forces.shape[:-2], 4)], -1)
+        durations = motion.duration
+    else:
+        variables = jnp.concatenate([motion.state, motion.forces], -1)
+        durations = motion.durations
+    return dict(zip(SERIES_NAMES, jnp.moveaxis(variables, -1, 0), strict=True)), durations, motion
 
 
 @functools.cache
@@ -424,83 +417,101 @@ def _interpolate(samples: Array, phase: Array, fraction: Array) -> Array:
 
 
 def _sample_piecewise(
-    samples: Array,
-    durations: Array,
-    phase_ends: Array,
-    is_periodic: bool,
-    times: Array,
-    window: Array,
+    samples: Array, durations: Array, times: Array, window: Array, is_periodic: bool
 ) -> Array:
-    """Return variables at times of a walk, each as the mean over a window of time around it.
+    """Return variables at times of a walk, each as the mean over times nearer than a window.
 
-    A sensor whose filter removes what is faster than its sampling rate reports such means. They are
-    continuous functions of the parameters, also where a variable jumps at a landing.
+    The weights of the mean fall linearly to zero, as those of a filter that removes what is faster
+    than the sampling rate. The means have continuous derivatives by the parameters, also where a
+    variable jumps at a landing. They are second differences of the second integral.
 
     - `samples`: equidistant samples of each phase, shape (phases, samples, variables);
     - `is_periodic`: whether the phases repeat.
     """
+    phase_ends = jnp.cumsum(durations)
     phase_starts = phase_ends - durations
     total = phase_ends[-1]
-    has_occurred = durations > 0.0
-    safe_durations = jnp.where(has_occurred, durations, 1.0)
+    safe_durations = jnp.where(durations > 0.0, durations, 1.0)
     spacing = durations / (SAMPLES_PER_PHASE - 1)
-    integrals = spacing[:, None, None] * jnp.einsum(
-        "ij,pjv->piv", _make_integration_matrix(), samples
-    )
-    integral_ends = jnp.cumsum(integrals[:, -1], axis=0)
-    integral_starts = integral_ends - integrals[:, -1]
 
-    def locate(time: Array) -> tuple[Array, Array, Any]:
+    def integrate(samples: Array) -> Array:
+        inside = jnp.einsum("p,ij,pjv->piv", spacing, _make_integration_matrix(), samples)
+        return inside + (jnp.cumsum(inside[:, -1], axis=0) - inside[:, -1])[:, None]
+
+    integrals = integrate(samples)
+    second_integrals = integrate(integrals)
+    first_total, second_total = integrals[-1, -1], second_integrals[-1, -1]
+
+    def read(values: Array, time: Array) -> tuple[Array, Any, Array]:
         n_periods = jnp.floor(jax.lax.stop_gradient(time / total)) if is_periodic else 0.0
         local = time - n_periods * total
         phase = jnp.clip(jnp.sum(local > phase_ends), 0, len(durations) - 1)
-        return phase, (local - phase_starts[phase]) / safe_durations[phase], n_periods
+        fraction = (local - phase_starts[phase]) / safe_durations[phase]
+        return _interpolate(values, phase, fraction), n_periods, local
 
-    def read_value(time: Array) -> Array:
-        phase, fraction, _ = locate(time)
-        return _interpolate(samples, phase, fraction)
+    def read_second_integral(time: Array) -> Array:
+        inside, n, local = read(second_integrals, time)
+        earlier_periods = second_total + first_total * (local + 0.5 * (n - 1.0) * total)
+        return inside + n * earlier_periods
 
-    def read_integral(time: Array) -> Array:
-        phase, fraction, n_periods = locate(time)
-        inside = integral_starts[phase] + _interpolate(integrals, phase, fraction)
-        return inside + n_periods * integral_ends[-1]
-
-    safe_window = jnp.where(window > 0.0, window, 1.0)
-    mean_over = lambda time: (
-        (read_integral(time + 0.5 * safe_window) - read_integral(time - 0.5 * safe_window))
-        / safe_window
+    width = jnp.where(window > 0.0, window, 1.0)
+    compute_mean = lambda time: (
+        (
+            read_second_integral(time - width)
+            - 2.0 * read_second_integral(time)
+            + read_second_integral(time + width)
+        )
+        / (width * width)
     )
-    return jnp.where(window > 0.0, jax.vmap(mean_over)(times), jax.vmap(read_value)(times))
-
-
-def compute_residuals(
-    problem: FitProblem, target: FitTarget, x: Array
-) -> tuple[Float[Array, " residuals"], Prediction]:
-    """Return the residuals of one fit in standard errors, and the prediction."""
-    prediction = problem.predict(x)
-    whitened = jnp.einsum("rij,rj->ri", problem.whitener, target.values - prediction.values)
-    whitened = target.row_weights[:, None] * whitened
-    whitened = jnp.where(prediction.is_valid, whitened, MISSING_GAIT_RESIDUAL)
-    prior = target.prior_weights * (x - target.prior_means)
-    return jnp.append(jnp.ravel(whitened), prior), prediction
+    read_value = lambda time: read(samples, time)[0]
+    return jnp.where(window > 0.0, jax.vmap(compute_mean)(times), jax.vmap(read_value)(times))
 
 
 @eqx.filter_custom_jvp
-def _evaluate_residuals(u: Array, problem: FitProblem, target: FitTarget) -> Array:
-    return compute_residuals(problem, target, problem.transform(u))[0]
+def _predict_with_differences(x: Array, problem: FitProblem) -> tuple[Array, Array]:
+    """Return a prediction whose derivatives are central differences of fourth order."""
+    values, is_valid = problem.predict_exactly(x)
+    return values, is_valid
 
 
-@_evaluate_residuals.def_jvp
-def _differentiate_residuals(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    """Return residuals and their JVP, from one Jacobian that all uses of the derivative share."""
-    u, problem, target = primals
+@_predict_with_differences.def_jvp
+def _differentiate_by_differences(primals: tuple, tangents: tuple) -> tuple:
+    x, problem = primals
+    changes = DIFFERENCE_STEP * problem.scale
+    factors = jnp.array([1.0, -1.0, 2.0, -2.0])
+    points = x + factors[:, None, None] * jnp.diag(changes)
+    values = jax.vmap(jax.vmap(lambda x: problem.predict_exactly(x).values))(points)
+    weights = jnp.array([8.0, -8.0, -1.0, 1.0]) / 12.0
+    jacobian = jnp.einsum("k,kurc,u->rcu", weights, values, 1.0 / changes)
+    prediction = tuple(problem.predict_exactly(x))
+    return prediction, (jacobian @ tangents[0], None)
 
-    def evaluate(u: Array) -> tuple[Array, Array]:
-        residuals, _ = compute_residuals(problem, target, problem.transform(u))
-        return residuals, residuals
 
-    jacobian, residuals = jax.jacfwd(evaluate, has_aux=True)(u)
-    return residuals, jacobian @ tangents[0]
+def compute_residuals(
+    problem: FitProblem, target: FitTarget, x: Array, prediction: Prediction
+) -> Float[Array, " residuals"]:
+    """Return the residuals of one fit in standard errors, those of the priors last."""
+    whitened = jnp.einsum("rij,rj->ri", problem.whitener, target.values - prediction.values)
+    whitened = target.row_weights[:, None] * whitened
+    whitened = jnp.where(prediction.is_valid, whitened, MISSING_GAIT_RESIDUAL)
+    return jnp.append(jnp.ravel(whitened), target.prior_weights * (x - target.prior_means))
+
+
+def _linearize_residuals(
+    u: Array, problem_and_target: tuple[FitProblem, FitTarget]
+) -> tuple[Array, tuple[Array, Prediction, Array]]:
+    """Return residuals whose derivatives are those of one Jacobian, with that Jacobian."""
+    problem, target = problem_and_target
+    x = problem.transform(u)
+    fixed_x = jax.lax.stop_gradient(x)
+
+    def predict(x: Array) -> tuple[Array, Prediction]:
+        prediction = problem.predict(x)
+        return prediction.values, prediction
+
+    jacobian, prediction = jax.jacfwd(predict, has_aux=True)(fixed_x)
+    linear = prediction._replace(values=prediction.values + jacobian @ (x - fixed_x))
+    return compute_residuals(problem, target, x, linear), (fixed_x, prediction, jacobian)
 
 
 @functools.cache
@@ -518,6 +529,11 @@ def _make_solver() -> Any:
         search: Any = optimistix.ClassicalTrustRegion()
         verbose: Callable = lambda **_: None
 
+        def init(self, fn: Any, y: Any, args: Any, options: Any, *arguments: Any) -> Any:
+            state = super().init(fn, y, args, options, *arguments)
+            read_size = lambda state: state.search_state.step_size
+            return eqx.tree_at(read_size, state, options["step_size"])
+
         def step(self, fn: Any, y: Any, *arguments: Any) -> tuple[Any, Any, Any]:
             y, state, aux = super().step(fn, y, *arguments)
             reduction = self.search.predict_reduction(state.y_eval - y, state.f_info)
@@ -528,38 +544,55 @@ def _make_solver() -> Any:
 
 
 @eqx.filter_jit
-def _fit_batch(problem: FitProblem, targets: FitTarget, starts: Array) -> FitSolution:
+def _improve_fits(
+    problem: FitProblem, targets: FitTarget, searches: tuple[Any, Any]
+) -> tuple[tuple[Any, Any], FitSolution]:
+    """Return a batch of searches and their solutions after some iterations.
+
+    - `searches`: variables u of each fit, and the step size of its trust region.
+    """
     import optimistix
 
-    solver = _make_solver()
+    evaluate: Any = _linearize_residuals
 
-    def fit_element(target: FitTarget, start: Array) -> FitSolution:
+    def improve(target: FitTarget, search: tuple) -> tuple[tuple, FitSolution]:
+        variables, step_size = search
         solution: Any = optimistix.least_squares(
-            lambda u, arguments: _evaluate_residuals(u, *arguments),
-            solver,
-            start,
+            evaluate,
+            _make_solver(),
+            variables,
             (problem, target),
-            max_steps=MAX_ITERATIONS,
+            {"step_size": step_size},
+            has_aux=True,
+            max_steps=ITERATIONS_PER_CALL,
             throw=False,
         )
-        x = problem.transform(solution.value)
+        state = solution.state
+        x, prediction, jacobian = state.aux  # of the last accepted iteration
+        has_ended = state.terminate | (solution.stats["num_steps"] < ITERATIONS_PER_CALL)
+        return (
+            (solution.value, state.search_state.step_size),
+            FitSolution(x, prediction.values, jacobian, prediction.is_valid, has_ended),
+        )
 
-        def predict(x: Array) -> tuple[Array, Prediction]:
-            prediction = problem.predict(x)
-            return prediction.values, prediction
-
-        jacobian, prediction = jax.jacfwd(predict, has_aux=True)(x)
-        has_ended = solution.stats["num_steps"] < MAX_ITERATIONS
-        return FitSolution(x, prediction.values, jacobian, prediction.is_valid, has_ended)
-
-    return jax.vmap(fit_element)(targets, starts)
+    return jax.vmap(improve)(targets, searches)
 
 
 def solve_fits(problem: FitProblem, targets: FitTarget, starts: np.ndarray) -> FitSolution:
     """Return the fits of a batch of targets, each from its start x, as NumPy arrays."""
     n = len(starts)
     targets = FitTarget(*(np.broadcast_to(x, (n, *np.shape(x)[1:])) for x in targets))
-    solution = map_in_batches(
-        functools.partial(_fit_batch, problem), FIT_BATCH_SIZES, targets, problem.invert(starts)
-    )
-    return jax.tree.map(np.asarray, solution)
+    running, results = np.arange(n), None
+    searches = problem.invert(starts), np.ones(n)
+    for _ in range(MAX_CALLS):
+        arguments = select_tree_rows((targets, searches), running)
+        improve = functools.partial(_improve_fits, problem)
+        improved = jax.tree.map(np.array, map_in_batches(improve, FIT_BATCH_SIZES, *arguments))
+        results = improved if results is None else results
+        for stored, rows in zip(jax.tree.leaves(results), jax.tree.leaves(improved), strict=True):
+            stored[running] = rows
+        searches, solution = results
+        running = running[~solution.has_ended[running]]
+        if not running.size:
+            break
+    return solution

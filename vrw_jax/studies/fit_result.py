@@ -181,9 +181,10 @@ class FitResult:
             One number.
         """
         self._require_single("a likelihood")
-        residuals, prediction = compute_residuals(
-            self.problem, jax.tree.map(jnp.asarray, self.target), jnp.asarray(values)
-        )
+        values = jnp.asarray(values)
+        prediction = self.problem.predict(values)
+        target = jax.tree.map(jnp.asarray, self.target)
+        residuals = compute_residuals(self.problem, target, values, prediction)
         log_determinant = jnp.sum(jnp.log(jnp.diagonal(self.problem.whitener, axis1=-2, axis2=-1)))
         constant = log_determinant - 0.5 * jnp.log(2.0 * jnp.pi) * self.target.values.size
         return jnp.where(prediction.is_valid, constant - 0.5 * jnp.sum(residuals**2), -jnp.inf)
