@@ -51,7 +51,6 @@ from vrw_jax.studies.fit import compare_laws, fit
 from vrw_jax.studies.fit_result import FitResult
 from vrw_jax.studies.multifidelity import MultifidelityMean, multifidelity_mean
 from vrw_jax.studies.optimum_curve import ActiveSetChange, OptimumCurve
-from vrw_jax.studies.phase_response import PhaseResponse, phase_response
 from vrw_jax.studies.robustness import (
     GaitSensitivity,
     gait_sensitivity,
@@ -59,10 +58,14 @@ from vrw_jax.studies.robustness import (
     measure_gait_sensitivity,
 )
 from vrw_jax.studies.scan_design import grid, saltelli, samples, sobol, sobol_indices, uniform
-from vrw_jax.studies.scan_execution import scan
+from vrw_jax.studies.scan_execution import SpecialPointMap, map_special_points, scan
 from vrw_jax.studies.scan_store import open_scan
-from vrw_jax.studies.smallest_disturbance import SmallestDisturbance, smallest_disturbance
-from vrw_jax.studies.special_point_map import SpecialPointMap, map_special_points
+from vrw_jax.studies.stride_pushes import (
+    PhaseResponse,
+    SmallestDisturbance,
+    phase_response,
+    smallest_disturbance,
+)
 from vrw_jax.studies.tolerance_request import MeasureResult, measure_to_tolerance
 from vrw_jax.studies.tune_objective import WheelObjective
 from vrw_jax.studies.tune_problem import tune

@@ -1,10 +1,9 @@
 """Figures of labeled results. Only the package `app` imports matplotlib."""
 
 from vrw_jax.app import figure_style as style
-from vrw_jax.app._branch_figures import basin_figure, branch_figure
 from vrw_jax.app._fit_figures import fit_figure
+from vrw_jax.app._gait_figures import basin_figure, branch_figure, tornado_figure, tuning_figure
 from vrw_jax.app._scan_figures import map_figure, scan_figures
-from vrw_jax.app._tuning_figures import tornado_figure, tuning_figure
 from vrw_jax.app._walk_figures import (
     foot_height,
     gait_panels,

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax import plot as plots
-from vrw_jax.app._branch_figures import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
+from vrw_jax.app._gait_figures import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
 from vrw_jax.app.figure_style import draw_markers, format_axis_label
 from vrw_jax.gaits.attractors import (
     PeriodicWalkEnds,

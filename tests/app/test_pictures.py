@@ -12,10 +12,9 @@ from PIL import Image
 
 import vrw_jax as vrw
 from experiments.shared.color_vision import simulate_color_vision
-from vrw_jax.app import _branch_figures as branch
+from vrw_jax.app import _gait_figures as branch
 from vrw_jax.app import figure_style as style
-from vrw_jax.app._branch_figures import basin_figure
-from vrw_jax.app._tuning_figures import tuning_figure
+from vrw_jax.app._gait_figures import basin_figure, tuning_figure
 from vrw_jax.app._walk_figures import indicators, save_animation
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.studies import TrialKind

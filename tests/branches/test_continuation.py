@@ -9,7 +9,7 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.app._branch_figures import branch_figure
+from vrw_jax.app._gait_figures import branch_figure
 from vrw_jax.app.config import FigureConfig
 from vrw_jax.app.reports import write_branch_report
 from vrw_jax.branches.arclength import ArclengthDriver, run_together

@@ -126,7 +126,7 @@ def test_a_map_scans_what_the_curves_need_and_follows_them(monkeypatch):
         followed.update(scan=scan, base=base, model=model)
         return (curve,), ()
 
-    monkeypatch.setattr("vrw_jax.studies.special_point_map.trace_special_points", trace)
+    monkeypatch.setattr("vrw_jax.studies.scan_execution.trace_special_points", trace)
     stages, base = [], vrw.WheelParams(slope=0.29)
     grid = vrw.grid(damping=[150.0, 160.0], stiffness=[495.0, 505.0])
     special_points = vrw.map_special_points(grid, "speed", base=base, on_stage=stages.append)

@@ -8,8 +8,7 @@ from scipy.special import ndtr
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.studies.first_passage import PassageStatus
-from vrw_jax.studies.passage_gradient import differentiate_log_mean_steps
+from vrw_jax.studies.first_passage import PassageStatus, differentiate_log_mean_steps
 from vrw_jax.studies.sampled_passage import (
     MIN_SAMPLING_ROUNDS,
     WalkerGroups,

@@ -450,7 +450,6 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
 
 
 def _list_shown_measures(scan: xr.Dataset) -> list[str]:
-    """Return the names of the measures that figures show for this scan."""
     return [measure_name for measure_name in SHOWN_MEASURE_NAMES if measure_name in scan]
 
 
@@ -554,7 +553,6 @@ def _add_scan_legend(
     legend_lines: Mapping[str, Line2D],
     n_panel_columns: int,
 ) -> None:
-    """Add a legend of outcomes and of margin curves below a figure."""
     margin_names = sorted(legend_lines, key=DRAWN_MARGIN_NAMES.index)
     margin_lines = [legend_lines[margin_name] for margin_name in margin_names]
     add_figure_legend(

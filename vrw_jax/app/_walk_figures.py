@@ -64,7 +64,6 @@ NO_PAPER_WALK_REMEDY = (
 
 
 def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
-    """Raise an error unless `walk` is a trajectory with at least one sample."""
     required_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
     require_dataset_variables(argument_name, walk, required_names, NO_WALK_REMEDY)
     if not walk.sizes["time"]:
@@ -116,7 +115,6 @@ def ground_forces(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
 
 
 def _make_gait_panels(gait: xr.Dataset, width: FigureWidth, forces_only: bool) -> Figure:
-    """Return the figure of `gait_panels`, or only its panels of forces."""
     _require_nonempty_walk("gait", gait)
     width_inches = find_width_inches(width, 0.8 * PAGE_FIGURE_WIDTH_INCHES)
     if reports_contact_modes(gait):

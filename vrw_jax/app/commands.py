@@ -48,8 +48,7 @@ from vrw_jax.models.registry import list_model_config_names
 from vrw_jax.models.stepping import step
 from vrw_jax.studies.first_passage import first_passage
 from vrw_jax.studies.robustness import gait_sensitivity
-from vrw_jax.studies.scan_execution import forecast_scan
-from vrw_jax.studies.special_point_map import follow_special_points, require_map_grid
+from vrw_jax.studies.scan_execution import follow_special_points, forecast_scan, require_map_grid
 from vrw_jax.studies.tune_problem import tune
 from vrw_jax.wheel.params import WheelParams
 
@@ -111,7 +110,6 @@ def _handle_first_interrupt(_signal: int, _frame: object) -> None:
 
 
 def _print_version_and_exit(is_version_requested: bool) -> None:
-    """Print the version and exit if the option `--version` is given."""
     if is_version_requested:
         print(f"vrw {find_library_version('vrw-jax')}")
         raise typer.Exit
@@ -350,7 +348,6 @@ def _require_writable_folder(folder: Path, draws_figure: bool = False) -> None:
 def _require_writable_output(
     command_config: Config, folder: Path, draws_figure: bool, tests_backend: bool = True
 ) -> None:
-    """Raise a ValueError if the folder or the file of the figure cannot be written."""
     _require_writable_folder(folder, draws_figure and tests_backend)
     if (figure_file := command_config.figures.file) is not None:
         if not draws_figure:

@@ -379,7 +379,6 @@ def parse_config(config_text: str, file_name: str = "config") -> Config:
 
 
 def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name: str) -> Config:
-    """Validate the parsed tables of a file. Raise a ValueError if a table is invalid."""
     _require_known_keys(config_tables, CONFIG_TABLE_NAMES, "the file", "tables")
     for name, table in config_tables.items():
         remedy = f"a table: write [{name}] on a line of its own and its settings below"
@@ -460,7 +459,6 @@ def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
 
 
 def _parse_wheel_table(table: ConfigTable) -> dict[str, float | int]:
-    """Return the parameters in the table `[wheel]`, by name."""
     _require_known_keys(
         table, (*PARAMETER_NAMES, "n_legs", PARAMETER_SET_KEY), "[wheel]", "parameters"
     )
@@ -527,13 +525,11 @@ def _read_like_defaults(table: ConfigTable, defaults: ConfigTable) -> dict[str, 
 
 
 def _read_table(kind: Any, table: ConfigTable, location: str) -> Any:
-    """Return the settings of a table as an object of a class."""
     _require_known_keys(table, kind.__dataclass_fields__, location, "settings")
     return _read(kind, table)
 
 
 def _read_branch(table: ConfigTable, allowed_parameter_names: tuple[str, ...]) -> BranchConfig:
-    """Return the settings of the table `[branch]`, along an allowed parameter."""
     _require_known_keys(table, BranchConfig.__dataclass_fields__, "[branch]", "settings")
     name = table.get("parameter")
     check_parameter_name(
@@ -617,7 +613,6 @@ def _require_known_keys(
     table_location: str,
     key_kind: str,
 ) -> None:
-    """Raise a ValueError if a table contains a key that is not allowed."""
     allowed_keys = tuple(allowed_keys)
     for config_key in config_table:
         raise_for_parameter_symbol(config_key, allowed_keys)

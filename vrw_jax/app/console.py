@@ -74,7 +74,6 @@ def _handle_encoding_error(encoding_error: UnicodeError) -> tuple[str, int]:
 
 
 def _replace_with_ascii(unencodable_character: str) -> str:
-    """Return an ASCII text for a character: its replacement, or replacements of its components."""
     if unencodable_character.isascii() or unencodable_character in ASCII_REPLACEMENTS:
         return ASCII_REPLACEMENTS.get(unencodable_character, unencodable_character)
     decomposed_characters = unicodedata.normalize("NFKD", unencodable_character)
@@ -281,7 +280,6 @@ def make_scan_progress_reporter(
     times_and_counts: list[tuple[float, int]] = []
 
     def report_progress(scan_progress: ScanProgress) -> None:
-        """Update the progress bar from the progress of the scan."""
         current_seconds, n_samples_done = time.monotonic(), scan_progress.n_done
         progress_bar_note = (
             f"{scan_progress.n_reused:,} from an earlier run" if scan_progress.n_reused else ""

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vrw_jax.app import paper_printed as printed
 from vrw_jax.app.paper_evidence import (
     INDEPENDENT_CODE_LABEL,
     MAX_SETTLED_STATE_CHANGE,
+    MISPRINT_CLAIMS,
     SIGN_TOLERANCE_REASON,
     STEP_ERROR_TOLERANCE,
     ClaimValues,
@@ -22,10 +22,10 @@ from vrw_jax.app.paper_evidence import (
     PaperClaimGroup,
     PaperEvidence,
     PaperFact,
+    compute_printed_landing,
     make_agreement_test,
     split_trajectory_by_phase,
 )
-from vrw_jax.app.paper_printed import MISPRINT_CLAIMS
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import format_markdown_table
 from vrw_jax.models.measures import PHASE_NAMES
@@ -198,7 +198,7 @@ def _compute_indicator_values(paper_evidence: PaperEvidence) -> ClaimValues:
     branch_landing_impulses = gaits_to_damping_219.lambda_I4.values
     landing_impulses = np.array(
         [
-            printed.compute_printed_landing(paper_evidence.params, x).corrected_impulse
+            compute_printed_landing(paper_evidence.params, x).corrected_impulse
             for x in gaits_to_damping_219.section_state.values
         ]
     )
@@ -306,7 +306,7 @@ def _compute_assumption_values(paper_evidence: PaperEvidence) -> ClaimValues:
         paper_evidence.params.leg_mass
     )
     separation_speeds = np.sort(stopper_impulses_per_mass[stopper_impulses_per_mass < 0.0])
-    landing_impulse = printed.compute_printed_landing(
+    landing_impulse = compute_printed_landing(
         paper_evidence.params, table_1_gait.section_state.values
     ).corrected_impulse
     required_friction = np.abs(

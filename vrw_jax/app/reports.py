@@ -15,7 +15,7 @@ from vrw_jax.base.printing import format_markdown_table
 from vrw_jax.branches.branch import Branch
 from vrw_jax.models.measures import MEASURES, describe_violation, get_measure
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
-from vrw_jax.studies.special_point_map import SpecialPointMap
+from vrw_jax.studies.scan_execution import SpecialPointMap
 from vrw_jax.studies.tune_result import TuneResult
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, PARAMETER_NAMES
 
@@ -138,7 +138,6 @@ def write_special_point_map(
 def _write_dataset_and_texts(
     folder: Path, store_name: str, dataset: xr.Dataset, text_by_file_name: Mapping[str, str]
 ) -> list[Path]:
-    """Write a dataset and text files into `folder`, and return the paths."""
     folder.mkdir(parents=True, exist_ok=True)
     dataset.to_zarr(folder / store_name, mode="w", zarr_format=2)
     for file_name, file_name_text in text_by_file_name.items():

@@ -365,7 +365,6 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
 @jax.jit
 @jax.vmap
 def _compute_rigid_gaits(params: WheelParams) -> tuple:
-    """Return section states of the gaits of rigid wheels, step quantities and their Jacobians."""
     model = RigidWheel(stop_at_lift_off=False)
 
     def compute_quantities(x: jax.Array) -> jax.Array:

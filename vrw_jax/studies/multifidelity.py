@@ -12,7 +12,8 @@ Its bias is then inversely proportional to the number of sampled wheels.
 """
 
 import math
-from typing import Any, NamedTuple
+import operator
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -46,20 +47,13 @@ from vrw_jax.studies.tolerance_request import (
 )
 from vrw_jax.wheel.params import WheelParams
 
-
-class _ControlVariate(NamedTuple):
-    """Name of a control variate, and its cost per wheel in steps with unilateral contact."""
-
-    control_variate_name: str
-    cost_in_steps: float
-
-
-CONTROL_VARIATES = (
-    _ControlVariate("no control", 0.0),
-    _ControlVariate("the paper's gaits", 1.0),
-    _ControlVariate("the paper's gaits with one contact step", 2.0),
-)
-"""Control variates. The sampling uses the control variate whose plan has the lowest cost.
+CONTROL_VARIATES = {
+    "no control": 0.0,
+    "the paper's gaits": 1.0,
+    "the paper's gaits with one contact step": 2.0,
+}
+"""Costs per wheel of the control variates, in steps with unilateral contact, by name. The sampling
+uses the control variate whose plan has the lowest cost.
 
 In batches, the paper's gait costs as much as one walking step with unilateral contact.
 """
@@ -117,15 +111,6 @@ class MultifidelityMean(AbstractPrintable):
             ("control", f"{self.control}, weight {self.weight:.3g}"),
             ("contact steps", f"{self.cost:.3g}, alone {self.cost_high_fidelity_only:.3g}"),
         ]
-
-
-class _SamplingPlan(NamedTuple):
-    """Plan of the sampling for a mean with one of the control variates."""
-
-    expected_cost_in_steps: float  # expected cost, walking steps
-    n_drawn_wheels: int  # number of further wheels to compute with unilateral contact
-    control_weights: np.ndarray  # (2,): weights of the two control columns
-    control_index: int  # index in `CONTROL_VARIATES`
 
 
 # Number of standard errors in the reported error of a mean.
@@ -190,140 +175,92 @@ def multifidelity_mean(
             f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels "
             "than its pilot: give a batch, params.damping of shape (1000,), say."
         )
-    measured_wheels = _MeasuredWheels(measure, params, friction_by_wheel, stoppers)
-    wheel_permutation = np.random.default_rng(seed).permutation(n_wheels)
-    pilot_wheel_indices, remaining_wheel_indices = np.split(wheel_permutation, [pilot])
-    gait_measure_tolerance = GAIT_ERROR_FRACTION * tol
-    pilot_measure_results = measured_wheels.measure_selected_wheels(
-        pilot_wheel_indices, gait_measure_tolerance
+
+    def measure_wheels(indices: np.ndarray) -> MeasureResult:
+        return measure_to_tolerance(
+            measure,
+            select_wheels(params, indices),
+            GAIT_ERROR_FRACTION * tol,
+            friction=friction_by_wheel[indices],
+            stoppers=stoppers,
+        )
+
+    def evaluate_control(indices: np.ndarray, control: str) -> np.ndarray:
+        wheels = select_wheels(params, indices)
+        return _evaluate_control(measure, wheels, friction_by_wheel[indices], stoppers, control)
+
+    pilot_wheels, other_wheels = np.split(
+        np.random.default_rng(seed).permutation(n_wheels), [pilot]
     )
-    has_pilot_gait = pilot_measure_results.found
+    pilot_results = measure_wheels(pilot_wheels)
+    has_pilot_gait = pilot_results.found
     if np.sum(has_pilot_gait) < MIN_PILOT_GAITS:
         raise ValueError(
             f"{np.sum(has_pilot_gait)} of the pilot's {pilot} wheels have a gait with contact, but "
             f"a mean needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
         )
-    pilot_sample = _SampledMeasures.from_results(pilot_measure_results)
-    sampling_plans = [
-        _plan_sampling(
-            control_index,
-            pilot_sample,
-            measured_wheels.evaluate_control_regressors(pilot_wheel_indices, control_index),
-            tol,
-            len(remaining_wheel_indices),
+    pilot_values, mean_steps = _zero_missing(pilot_results), float(np.mean(pilot_results.n_steps))
+    plans = []
+    for name, cost in CONTROL_VARIATES.items():
+        n_drawn, weights = _plan_sampling(
+            *pilot_values, evaluate_control(pilot_wheels, name), tol, len(other_wheels)
         )
-        for control_index in range(len(CONTROL_VARIATES))
-    ]
-    sampling_plan = min(
-        sampling_plans, key=lambda sampling_plan: sampling_plan.expected_cost_in_steps
+        plans.append((n_drawn * mean_steps + cost * len(other_wheels), n_drawn, weights, name))
+    _, n_drawn, weights, control = min(plans, key=operator.itemgetter(0))
+    drawn_results = measure_wheels(other_wheels[:n_drawn])
+    mean, standard_error = _estimate_mean(
+        *pilot_values,
+        *_zero_missing(drawn_results),
+        evaluate_control(other_wheels, control) @ weights,
     )
-    drawn_measure_results = measured_wheels.measure_selected_wheels(
-        remaining_wheel_indices[: sampling_plan.n_drawn_wheels], gait_measure_tolerance
-    )
-    estimated_mean, standard_error = _estimate_mean(
-        sampling_plan,
-        pilot_sample,
-        _SampledMeasures.from_results(drawn_measure_results),
-        measured_wheels.evaluate_control_regressors(
-            remaining_wheel_indices, sampling_plan.control_index
-        ),
-    )
-    gait_error_bounds = np.concatenate(
-        [
-            pilot_measure_results.error[has_pilot_gait],
-            drawn_measure_results.error[drawn_measure_results.found],
-        ]
-    )
+    gait_error_bounds = np.concatenate([x.error[x.found] for x in (pilot_results, drawn_results)])
+    n_steps = float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
     return MultifidelityMean(
-        value=estimated_mean,
+        value=mean,
         error=N_STANDARD_ERRORS * standard_error + float(np.mean(gait_error_bounds)),
         n_gaits=float(len(gait_error_bounds)),
-        n_high_fidelity=float(pilot + sampling_plan.n_drawn_wheels),
-        weight=float(sampling_plan.control_weights[0]),
-        cost=float(np.sum(pilot_measure_results.n_steps) + np.sum(drawn_measure_results.n_steps))
-        + CONTROL_VARIATES[sampling_plan.control_index].cost_in_steps * n_wheels,
-        cost_high_fidelity_only=pilot_sample.mean_steps_per_wheel * pilot
-        + sampling_plans[0].expected_cost_in_steps,
+        n_high_fidelity=float(pilot + n_drawn),
+        weight=float(weights[0]),
+        cost=n_steps + CONTROL_VARIATES[control] * n_wheels,
+        cost_high_fidelity_only=mean_steps * pilot + plans[0][0],
         measure=measure,
-        control=CONTROL_VARIATES[sampling_plan.control_index].control_variate_name,
+        control=control,
     )
 
 
-class _SampledMeasures(NamedTuple):
-    """Measures with unilateral contact for the wheels in a sample."""
-
-    measure_values: np.ndarray  # measure of each wheel, zero if the wheel has no gait
-    has_gait: np.ndarray  # whether the wheel has a gait
-    mean_steps_per_wheel: float  # mean number of walking steps per wheel
-
-    @classmethod
-    def from_results(cls, measure_results: MeasureResult) -> "_SampledMeasures":
-        """Return the sampled measures from the result of `measure_to_tolerance`."""
-        return cls(
-            np.where(measure_results.found, measure_results.value, 0.0),
-            measure_results.found.astype(float),
-            float(np.mean(measure_results.n_steps)),
-        )
+def _zero_missing(results: MeasureResult) -> tuple[np.ndarray, np.ndarray]:
+    """Return the measure of each wheel, zero if it has no gait, and whether it has one, 1 or 0."""
+    return np.where(results.found, results.value, 0.0), results.found.astype(float)
 
 
-class _MeasuredWheels(NamedTuple):
-    """All wheels of a mean, and the name of the averaged measure."""
+def _evaluate_control(
+    measure: str, params: WheelParams, friction: np.ndarray, stoppers: str, control: str
+) -> np.ndarray:
+    """Return the two regressors for the regression on a control variate, shape (wheels, 2).
 
-    measure_name: str
-    params: WheelParams
-    friction_coefficients: np.ndarray
-    stoppers: str
-
-    def measure_selected_wheels(
-        self, wheel_indices: np.ndarray, measure_tolerance: float
-    ) -> MeasureResult:
-        """Return the measure with unilateral contact for the selected wheels."""
-        return measure_to_tolerance(
-            self.measure_name,
-            select_wheels(self.params, wheel_indices),
-            measure_tolerance,
-            friction=self.friction_coefficients[wheel_indices],
-            stoppers=self.stoppers,
-        )
-
-    def evaluate_control_regressors(
-        self, wheel_indices: np.ndarray, control_index: int
-    ) -> np.ndarray:
-        """Return the two regressors for the regression on a control variate, shape (wheels, 2).
-
-        The first column is the control variate, or zero for a wheel for which the paper's model has
-        no gait. The second column is 1 for a wheel with a finite control variate and 0 otherwise.
-        `control_index` is an index in `CONTROL_VARIATES`.
-        """
-        control_values = np.full(len(wheel_indices), np.nan)
-        if control_index:
-            step_options = StepOptions()
-            paper_gaits = find_paper_gaits(select_wheels(self.params, wheel_indices), step_options)
-            (found_wheel_indices,) = np.nonzero(paper_gaits.model_index != ModelIndex.NONE)
-            paper_gaits = select_tree_rows(paper_gaits, found_wheel_indices)
-            measure_values = evaluate_measures([self.measure_name], paper_gaits.step_quantities)
-            if control_index == len(CONTROL_VARIATES) - 1:
-                wheel_indices_of_gaits = wheel_indices[found_wheel_indices]
-                wheel_batch = ContactWheelBatch.from_params(
-                    select_wheels(self.params, wheel_indices_of_gaits),
-                    self.friction_coefficients[wheel_indices_of_gaits],
-                    self.stoppers,
-                    step_options,
-                )
-                gait_indices = np.arange(len(wheel_indices_of_gaits))
-                *_, measure_estimates = estimate_measures_from_lower_gaits(
-                    wheel_batch, gait_indices, paper_gaits, [self.measure_name]
-                )
-                measure_values = np.where(
-                    measure_estimates.has_same_leg_codes[:, None],
-                    measure_estimates.measure_values,
-                    measure_values,
-                )
-            control_values[found_wheel_indices] = measure_values[:, 0]
-        is_control_finite = np.isfinite(control_values)
-        return np.column_stack(
-            [np.where(is_control_finite, control_values, 0.0), is_control_finite]
-        )
+    The first column is the control variate, or zero for a wheel for which the paper's model has no
+    gait. The second column is 1 for a wheel with a finite control variate and 0 otherwise.
+    """
+    control_values = np.full(len(friction), np.nan)
+    no_control, _, one_step = CONTROL_VARIATES
+    if control != no_control:
+        options = StepOptions()
+        gaits = find_paper_gaits(params, options)
+        (found,) = np.nonzero(gaits.model_index != ModelIndex.NONE)
+        gaits = select_tree_rows(gaits, found)
+        values = evaluate_measures([measure], gaits.step_quantities)
+        if control == one_step:
+            wheel_batch = ContactWheelBatch.from_params(
+                select_wheels(params, found), friction[found], stoppers, options
+            )
+            *_, estimates = estimate_measures_from_lower_gaits(
+                wheel_batch, np.arange(len(found)), gaits, [measure]
+            )
+            has_same_codes = estimates.has_same_leg_codes[:, None]
+            values = np.where(has_same_codes, estimates.measure_values, values)
+        control_values[found] = values[:, 0]
+    is_finite = np.isfinite(control_values)
+    return np.column_stack([np.where(is_finite, control_values, 0.0), is_finite])
 
 
 # Fraction of the largest singular value below which a singular value of the control columns is
@@ -332,105 +269,64 @@ SINGULAR_VALUE_TOLERANCE = 1e-12
 
 
 def _plan_sampling(
-    control_index: int,
-    pilot_sample: _SampledMeasures,
-    control_regressors: np.ndarray,
-    mean_tolerance: float,
-    n_remaining_wheels: int,
-) -> _SamplingPlan:
-    """Return the sampling plan for a mean to within `mean_tolerance`, with one control variate.
+    pilot_values: np.ndarray,
+    has_gait: np.ndarray,
+    regressors: np.ndarray,
+    tolerance: float,
+    n_remaining: int,
+) -> tuple[int, np.ndarray]:
+    """Return the number of further wheels for a mean to within `tolerance`, and the weights of the
+    two control columns.
 
-    The pilot sample determines the weights of the control columns and the number of further wheels.
-    The mean M over the wheels with a gait is a ratio of two sums. The controlled quantity is the
-    wheel's measure minus M, or zero for a wheel without a gait. The sum of this quantity over all
-    wheels is zero.
+    The pilot sample determines both. The mean M over the wheels with a gait is a ratio of two sums.
+    The controlled quantity is the wheel's measure minus M, or zero for a wheel without a gait. The
+    sum of this quantity over all wheels is zero.
     """
-    fraction_of_wheels_with_gait = float(np.mean(pilot_sample.has_gait))
-    centered_measure_values = (
-        pilot_sample.measure_values
-        - np.mean(pilot_sample.measure_values)
-        / fraction_of_wheels_with_gait
-        * pilot_sample.has_gait
+    gait_fraction = float(np.mean(has_gait))
+    centered_values = pilot_values - np.mean(pilot_values) / gait_fraction * has_gait
+    centered_regressors = regressors - np.mean(regressors, axis=0)
+    weights, _, rank, _ = np.linalg.lstsq(
+        centered_regressors, centered_values, rcond=SINGULAR_VALUE_TOLERANCE
     )
-    centered_control_regressors = control_regressors - np.mean(control_regressors, axis=0)
-    control_weights, _, matrix_rank, _ = np.linalg.lstsq(
-        centered_control_regressors,
-        centered_measure_values,
-        rcond=SINGULAR_VALUE_TOLERANCE,
-    )
-    residual_sum_of_squares = float(
-        np.sum((centered_measure_values - centered_control_regressors @ control_weights) ** 2)
-    ) + _compute_unseen_wheel_variance(pilot_sample, centered_measure_values)
-    residual_variance = residual_sum_of_squares / (
-        len(centered_measure_values) - 1 - int(matrix_rank)
-    )
-    sampling_tolerance = (1.0 - GAIT_ERROR_FRACTION) * mean_tolerance
-    n_required_wheels = (
-        residual_variance
-        * (N_STANDARD_ERRORS / (sampling_tolerance * fraction_of_wheels_with_gait)) ** 2
-    )
-    n_drawn_wheels = min(
-        n_remaining_wheels,
-        max(
-            MIN_PILOT_GAITS,
-            math.ceil(n_required_wheels / (1.0 + n_required_wheels / n_remaining_wheels)),
-        ),
-    )
-    return _SamplingPlan(
-        n_drawn_wheels * pilot_sample.mean_steps_per_wheel
-        + CONTROL_VARIATES[control_index].cost_in_steps * n_remaining_wheels,
-        n_drawn_wheels,
-        control_weights,
-        control_index,
-    )
+    squared_residuals = float(np.sum((centered_values - centered_regressors @ weights) ** 2))
+    squared_residuals += _compute_unseen_wheel_variance(has_gait, centered_values)
+    variance = squared_residuals / (len(centered_values) - 1 - int(rank))
+    sampling_tolerance = (1.0 - GAIT_ERROR_FRACTION) * tolerance
+    n_required = variance * (N_STANDARD_ERRORS / (sampling_tolerance * gait_fraction)) ** 2
+    n_drawn = math.ceil(n_required / (1.0 + n_required / n_remaining))
+    return min(n_remaining, max(MIN_PILOT_GAITS, n_drawn)), weights
 
 
 def _estimate_mean(
-    sampling_plan: _SamplingPlan,
-    pilot_sample: _SampledMeasures,
-    drawn_sample: _SampledMeasures,
-    control_regressors: np.ndarray,
+    pilot_values: np.ndarray,
+    pilot_has_gait: np.ndarray,
+    drawn_values: np.ndarray,
+    drawn_has_gait: np.ndarray,
+    control_values: np.ndarray,
 ) -> tuple[float, float]:
     """Return the mean of a measure and its standard error.
 
-    - `control_regressors`: control columns of all wheels outside the pilot sample. The drawn wheels
-      come first.
+    - `control_values`: weighted control variates of all wheels outside the pilot sample. The drawn
+      wheels come first.
     """
-    n_remaining_wheels = len(control_regressors)
-    control_values = control_regressors @ sampling_plan.control_weights
-    estimated_gait_count = np.sum(pilot_sample.has_gait) + n_remaining_wheels * np.mean(
-        drawn_sample.has_gait
+    n_remaining, n_drawn = len(control_values), len(drawn_values)
+    n_gaits = np.sum(pilot_has_gait) + n_remaining * np.mean(drawn_has_gait)
+    differences = drawn_values - control_values[:n_drawn]
+    mean = (
+        np.sum(pilot_values) + n_remaining * (np.mean(control_values) + np.mean(differences))
+    ) / n_gaits
+    squared_residuals = n_drawn * np.var(differences - mean * drawn_has_gait)
+    squared_residuals += _compute_unseen_wheel_variance(
+        pilot_has_gait, pilot_values - mean * pilot_has_gait
     )
-    control_value_differences = (
-        drawn_sample.measure_values - control_values[: sampling_plan.n_drawn_wheels]
-    )
-    measure_mean = (
-        np.sum(pilot_sample.measure_values)
-        + n_remaining_wheels * (np.mean(control_values) + np.mean(control_value_differences))
-    ) / estimated_gait_count
-    residual_sum_of_squares = sampling_plan.n_drawn_wheels * np.var(
-        control_value_differences - measure_mean * drawn_sample.has_gait
-    )
-    residual_sum_of_squares += _compute_unseen_wheel_variance(
-        pilot_sample, pilot_sample.measure_values - measure_mean * pilot_sample.has_gait
-    )
-    mean_variance = (
-        residual_sum_of_squares
-        / (sampling_plan.n_drawn_wheels - 1)
-        / sampling_plan.n_drawn_wheels
-        * (1.0 - sampling_plan.n_drawn_wheels / n_remaining_wheels)
-    )
-    return float(measure_mean), float(
-        n_remaining_wheels / estimated_gait_count * math.sqrt(mean_variance)
-    )
+    variance = squared_residuals / (n_drawn - 1) / n_drawn * (1.0 - n_drawn / n_remaining)
+    return float(mean), float(n_remaining / n_gaits * math.sqrt(variance))
 
 
-def _compute_unseen_wheel_variance(
-    pilot_sample: _SampledMeasures, centered_measure_values: np.ndarray
-) -> float:
+def _compute_unseen_wheel_variance(has_gait: np.ndarray, centered_values: np.ndarray) -> float:
     """Return the variance due to one more wheel whose control variate is wrong.
 
     A wheel may have a gait in the paper's model and no gait with unilateral contact. A small sample
     may contain no such wheel. The result is zero if all wheels in the pilot sample have a gait.
     """
-    return 0.0 if np.all(pilot_sample.has_gait) else float(np.var(centered_measure_values))
+    return 0.0 if np.all(has_gait) else float(np.var(centered_values))

@@ -14,12 +14,14 @@ contact codes of the legs change.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
+from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET
 from vrw_jax.studies.fidelity import (
     QUANTITY_NAMES,
@@ -369,82 +371,98 @@ def refine_gaits(
 
     Newton's corrections of a gait end when the remaining error is below the allowed error.
     """
-    n_gaits, n_coordinates = section_states.shape
-    values, error_bounds, numerical_bounds = np.full((3, n_gaits, len(measure_names)), np.inf)
-    values[:] = np.nan
-    is_found, is_compared, n_steps = np.zeros((3, n_gaits), int)
-    is_found, is_compared = is_found.astype(bool), is_compared.astype(bool)
-    section_states, speeds = section_states.copy(), np.full(n_gaits, np.nan)
-    inverses = np.zeros((n_gaits, n_coordinates, n_coordinates))
-    quantity_jacobians = np.zeros((n_gaits, len(QUANTITY_NAMES), n_coordinates))
+    refinement = _Refinement(
+        wheel_batch, wheel_indices, section_states.copy(), measure_names, compute_error_goal
+    )
+    remaining = np.arange(len(section_states))
+    for _ in range(MAX_JACOBIANS_PER_GAIT):
+        if len(remaining):
+            remaining = refinement.correct(remaining)
+    refinement.compare_tolerances(
+        refinement.is_found & (is_every_gait_compared | refinement.has_large_presumed_error)
+    )
+    error_bounds = refinement.error_bounds + refinement.numerical_bounds
+    # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
+    # above a half.
+    eigenvalues = np.linalg.eigvals(np.nan_to_num(refinement.inverses, posinf=0.0, neginf=0.0))
+    return RefinedGaits(
+        refinement.is_found & np.isfinite(error_bounds).all(1),
+        eigenvalues.real.min(-1) > 0.5,
+        refinement.values,
+        error_bounds,
+        refinement.n_steps,
+        refinement.section_states,
+        refinement.speeds,
+    )
 
-    def take_steps(batch: ContactWheelBatch, gaits: np.ndarray) -> StepQuantities:
-        n_steps[gaits] += 1
-        return batch.take_steps(wheel_indices[gaits], section_states[gaits])
+
+@dataclass
+class _Refinement:
+    """Gaits during their refinement, with a leading axis over the gaits in every array."""
+
+    wheel_batch: ContactWheelBatch
+    wheel_indices: np.ndarray
+    section_states: np.ndarray
+    measure_names: Sequence[str]
+    compute_error_goal: Callable[[np.ndarray], np.ndarray]
+
+    def __post_init__(self) -> None:
+        n_gaits, n_coordinates = self.section_states.shape
+        self.values = np.full((n_gaits, len(self.measure_names)), np.nan)
+        self.error_bounds, self.numerical_bounds = np.full((2, *self.values.shape), np.inf)
+        self.is_found, self.has_large_presumed_error = np.zeros((2, n_gaits), bool)
+        self.n_steps, self.speeds = np.zeros(n_gaits, int), np.full(n_gaits, np.nan)
+        self.inverses = np.zeros((n_gaits, n_coordinates, n_coordinates))
+        self.quantity_jacobians = np.zeros((n_gaits, len(QUANTITY_NAMES), n_coordinates))
+
+    def take_steps(self, batch: ContactWheelBatch, gaits: np.ndarray) -> StepQuantities:
+        self.n_steps[gaits] += 1
+        return batch.take_steps(self.wheel_indices[gaits], self.section_states[gaits])
 
     def estimate(
-        batch: ContactWheelBatch, gaits: np.ndarray, step: StepQuantities
+        self, batch: ContactWheelBatch, gaits: np.ndarray, step: StepQuantities
     ) -> MeasureEstimates:
         return estimate_measures(
             batch,
-            wheel_indices[gaits],
-            section_states[gaits],
+            self.wheel_indices[gaits],
+            self.section_states[gaits],
             step,
-            inverses[gaits],
-            quantity_jacobians[gaits],
-            measure_names,
+            self.inverses[gaits],
+            self.quantity_jacobians[gaits],
+            self.measure_names,
         )
 
-    remaining = np.arange(n_gaits)
-    for _ in range(MAX_JACOBIANS_PER_GAIT):
-        if not len(remaining):
-            break
-        gaits, remaining = remaining, remaining[:0]
-        step, jacobian, quantity_jacobians[gaits] = wheel_batch.linearize_steps(
-            wheel_indices[gaits], section_states[gaits]
+    def correct(self, gaits: np.ndarray) -> np.ndarray:
+        """Correct gaits with one Jacobian, and return the indices of those that need another."""
+        batch, remaining = self.wheel_batch, gaits[:0]
+        step, jacobian, self.quantity_jacobians[gaits] = batch.linearize_steps(
+            self.wheel_indices[gaits], self.section_states[gaits]
         )
-        identity = np.eye(n_coordinates)
-        inverses[gaits] = solve_linear_systems(
+        identity = np.eye(jacobian.shape[-1])
+        self.inverses[gaits] = solve_linear_systems(
             identity - jacobian, np.broadcast_to(identity, jacobian.shape)
         )
-        n_steps[gaits] += JACOBIAN_COST_IN_STEPS
+        self.n_steps[gaits] += JACOBIAN_COST_IN_STEPS
         last_length = np.full(len(gaits), np.inf)
         for n_corrections in range(MAX_CORRECTIONS_PER_JACOBIAN):
-            estimates = estimate(wheel_batch, gaits, step)
+            estimates = self.estimate(batch, gaits, step)
             has_same_codes = estimates.has_same_leg_codes
             length = np.linalg.norm(estimates.newton_correction, axis=1)
             contraction = length / np.maximum(last_length, np.finfo(float).tiny)
             is_slow = contraction > MAX_CONTRACTION_RATE
-            goal = compute_error_goal(estimates.measure_values)
-            remaining_bound = REFINEMENT_SAFETY_FACTOR * estimates.correction_effect_on_measures
-            step_bound, missed_bound = (
-                estimates.numerical_error_bound,
-                estimates.missed_contact_error_bound,
-            )
-            is_accurate = (n_corrections > 0) & np.all(
-                remaining_bound <= np.maximum(goal - step_bound, step_bound), axis=1
-            )
-            is_stalled = length <= STALL_LENGTH_IN_TOLERANCES * float(wheel_batch.step_options.rtol)
+            is_stalled = length <= STALL_LENGTH_IN_TOLERANCES * float(batch.step_options.rtol)
+            is_accurate = self._find_accurate_gaits(estimates) & (n_corrections > 0)
             is_finished = has_same_codes & np.where(is_slow, is_stalled, is_accurate)
-            finished = gaits[is_finished]
-            is_found[finished] = True
-            values[finished] = estimates.measure_values[is_finished]
-            error_bounds[finished] = remaining_bound[is_finished]
-            numerical_bounds[finished] = (step_bound + missed_bound)[is_finished]
-            speeds[finished] = evaluate_measures(("speed",), step.step_quantities)[is_finished, 0]
-            is_presumed_error_large = missed_bound > MAX_PRESUMED_ERROR_FRACTION * goal
-            is_compared[finished] = is_every_gait_compared | np.any(
-                is_presumed_error_large[is_finished], axis=1
-            )
+            self._record(gaits[is_finished], *select_tree_rows((estimates, step), is_finished))
             is_continued = (
                 ~is_finished
                 & (step.step_outcomes == Outcome.STEPPED)
                 & (length <= MAX_CORRECTION_LENGTH)
                 & (contraction < 1.0)
             )
-            section_states[gaits[is_continued]] = np.where(
+            self.section_states[gaits[is_continued]] = np.where(
                 has_same_codes[:, None],
-                section_states[gaits] + estimates.newton_correction,
+                self.section_states[gaits] + estimates.newton_correction,
                 step.section_states,
             )[is_continued]
             needs_jacobian = is_continued & (is_slow | ~has_same_codes)
@@ -453,27 +471,42 @@ def refine_gaits(
             gaits, last_length = gaits[is_continued], length[is_continued]
             if not len(gaits):
                 break
-            step = take_steps(wheel_batch, gaits)
-    compared = np.flatnonzero(is_compared)
-    compared_bounds = [np.zeros((len(compared), len(measure_names)))]
-    for batch in wheel_batch.make_comparison_batches():
-        # The duration of the shortest resolved contact depends on the tolerance.
-        estimates = estimate(batch, compared, take_steps(batch, compared))
-        bound = REFINEMENT_SAFETY_FACTOR * np.abs(estimates.measure_values - values[compared])
-        bound += np.minimum(estimates.numerical_error_bound, numerical_bounds[compared])
-        # A step that changes the legs' codes gives no bound.
-        compared_bounds.append(np.where(estimates.has_same_leg_codes[:, None], bound, np.inf))
-    numerical_bounds[compared] = np.max(compared_bounds, axis=0)
-    error_bounds = error_bounds + numerical_bounds
-    # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
-    # above a half.
-    eigenvalues = np.linalg.eigvals(np.nan_to_num(inverses, posinf=0.0, neginf=0.0))
-    return RefinedGaits(
-        is_found & np.isfinite(error_bounds).all(1),
-        eigenvalues.real.min(-1) > 0.5,
-        values,
-        error_bounds,
-        n_steps,
-        section_states,
-        speeds,
-    )
+            step = self.take_steps(batch, gaits)
+        return remaining
+
+    def _find_accurate_gaits(self, estimates: MeasureEstimates) -> np.ndarray:
+        """Return whether the remaining error of each gait is within the allowed error."""
+        goal, step_bound = (
+            self.compute_error_goal(estimates.measure_values),
+            estimates.numerical_error_bound,
+        )
+        remaining_bound = REFINEMENT_SAFETY_FACTOR * estimates.correction_effect_on_measures
+        return np.all(remaining_bound <= np.maximum(goal - step_bound, step_bound), axis=1)
+
+    def _record(self, gaits: np.ndarray, estimates: MeasureEstimates, step: StepQuantities) -> None:
+        """Store the measures of gaits whose corrections have ended."""
+        missed_bound = estimates.missed_contact_error_bound
+        goal = self.compute_error_goal(estimates.measure_values)
+        self.is_found[gaits] = True
+        self.values[gaits] = estimates.measure_values
+        self.error_bounds[gaits] = (
+            REFINEMENT_SAFETY_FACTOR * estimates.correction_effect_on_measures
+        )
+        self.numerical_bounds[gaits] = estimates.numerical_error_bound + missed_bound
+        self.speeds[gaits] = evaluate_measures(("speed",), step.step_quantities)[:, 0]
+        self.has_large_presumed_error[gaits] = np.any(
+            missed_bound > MAX_PRESUMED_ERROR_FRACTION * goal, axis=1
+        )
+
+    def compare_tolerances(self, is_compared: np.ndarray) -> None:
+        """Replace the numerical errors of gaits by bounds from steps at other tolerances."""
+        gaits = np.flatnonzero(is_compared)
+        bounds = [np.zeros((len(gaits), len(self.measure_names)))]
+        for batch in self.wheel_batch.make_comparison_batches():
+            # The duration of the shortest resolved contact depends on the tolerance.
+            estimates = self.estimate(batch, gaits, self.take_steps(batch, gaits))
+            bound = REFINEMENT_SAFETY_FACTOR * np.abs(estimates.measure_values - self.values[gaits])
+            bound += np.minimum(estimates.numerical_error_bound, self.numerical_bounds[gaits])
+            # A step that changes the legs' codes gives no bound.
+            bounds.append(np.where(estimates.has_same_leg_codes[:, None], bound, np.inf))
+        self.numerical_bounds[gaits] = np.max(bounds, axis=0)

@@ -79,60 +79,44 @@ def analyze_survival_operator(
 def _compute_leading_eigenvector(nonnegative_matrix: Array) -> Array:
     """Return the leading eigenvector of a nonnegative matrix, scaled so that its sum is 1.
 
-    The method is power iteration. The sums contain only nonnegative terms, so that no cancellation
-    occurs and small components are relatively accurate.
+    The sums contain only nonnegative terms, so that no cancellation occurs and small components are
+    relatively accurate.
     """
 
-    def has_not_converged(loop_state: tuple) -> Array:
-        iteration_index, _, eigenvector_change = loop_state
-        return (iteration_index < MAX_POWER_ITERATIONS) & (
-            eigenvector_change > POWER_ITERATION_TOLERANCE
-        )
-
-    def apply_matrix(loop_state: tuple) -> tuple:
-        iteration_index, normalized_eigenvector, _ = loop_state
-        next_eigenvector = nonnegative_matrix @ normalized_eigenvector
-        next_eigenvector = next_eigenvector / jnp.sum(next_eigenvector)
-        return (
-            iteration_index + 1,
-            next_eigenvector,
-            jnp.max(jnp.abs(next_eigenvector - normalized_eigenvector))
-            / jnp.max(jnp.abs(next_eigenvector)),
-        )
+    def apply(vector: Array) -> tuple[Array, Array]:
+        following = nonnegative_matrix @ vector
+        following = following / jnp.sum(following)
+        return following, jnp.max(jnp.abs(following - vector)) / jnp.max(jnp.abs(following))
 
     n = nonnegative_matrix.shape[0]
-    initial_eigenvector = jnp.full(n, 1.0 / n, nonnegative_matrix.dtype)
-    return lax.while_loop(
-        has_not_converged,
-        apply_matrix,
-        (0, initial_eigenvector, jnp.ones((), nonnegative_matrix.dtype)),
-    )[1]
+    start = jnp.full(n, 1.0 / n, nonnegative_matrix.dtype)
+    return _iterate(apply, POWER_ITERATION_TOLERANCE, start)[0]
 
 
 def _compute_second_eigenvalue(K: Array, q: Array, u: Array) -> Scalar:
-    """Return the modulus of the second eigenvalue, by power iteration without the leading
-    eigenvectors q and u, which have q.u = 1.
+    """Return the modulus of the second eigenvalue, by iteration without the leading eigenvectors q
+    and u, which have q.u = 1.
     """
 
-    def has_not_converged(loop_state: tuple) -> Array:
-        iteration_index, _, modulus, previous_modulus = loop_state
-        return (iteration_index < MAX_POWER_ITERATIONS) & (
-            jnp.abs(modulus - previous_modulus) > SECOND_EIGENVALUE_TOLERANCE
-        )
-
-    def apply_deflated_matrix(loop_state: tuple) -> tuple:
-        iteration_index, vector, modulus, _ = loop_state
+    def apply(vector: Array, modulus: Array) -> tuple[Array, Array, Array]:
         vector = K @ vector
         vector = vector - (q @ vector) * u
         norm = jnp.linalg.norm(vector)
-        return iteration_index + 1, vector / norm, norm, modulus
+        return vector / norm, norm, jnp.abs(norm - modulus)
 
-    initial_vector = jnp.cos(jnp.arange(len(u), dtype=u.dtype))
-    return lax.while_loop(
-        has_not_converged,
-        apply_deflated_matrix,
-        (0, initial_vector, jnp.inf * q[0], jnp.zeros_like(q[0])),
-    )[2]
+    start = jnp.cos(jnp.arange(len(u), dtype=u.dtype))
+    return _iterate(apply, SECOND_EIGENVALUE_TOLERANCE, start, jnp.inf * q[0])[1]
+
+
+def _iterate(apply: Callable[..., tuple], tolerance: float, *start: Array) -> tuple[Array, ...]:
+    """Return the state of a power iteration whose change, which `apply` adds, is small."""
+    first_loop: Any = (0, *start, jnp.ones((), start[0].dtype))
+    _, *state, _ = lax.while_loop(
+        lambda loop: (loop[0] < MAX_POWER_ITERATIONS) & (loop[-1] > tolerance),
+        lambda loop: (loop[0] + 1, *apply(*loop[1:-1])),
+        first_loop,
+    )
+    return tuple(state)
 
 
 def compute_mean_steps(
@@ -151,11 +135,7 @@ def compute_mean_steps(
     - `start_survival_row`: row of the survival operator for the start;
     - `start_failure_probability`: probability that the first step fails.
     """
-    p, u, q = (
-        survival_analysis.failure_probability,
-        survival_analysis.survival_eigenvector,
-        survival_analysis.quasi_stationary_weights,
-    )
+    p, _, q, u = survival_analysis
     n = len(u)
     bounded_remainder = jnp.linalg.solve(jnp.eye(n) - survival_matrix + jnp.outer(u, q), 1.0 - u)
     survival_factor = (1.0 - start_failure_probability + start_survival_row @ (u - 1.0)) / (1.0 - p)

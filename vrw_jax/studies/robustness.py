@@ -43,7 +43,7 @@ from vrw_jax.models.measures import (
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.studies.basins import StableGait, StartBox, compute_basin_share, parse_start_box
-from vrw_jax.studies.smallest_disturbance import compute_smallest_disturbance
+from vrw_jax.studies.stride_pushes import compute_smallest_disturbance
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 

@@ -444,7 +444,6 @@ def _scale_unit_points_to_box(
 
 
 def _make_random_generator(seed: int) -> np.random.Generator:
-    """Return a generator of random numbers. Raise an error if the seed is not an integer."""
     return np.random.default_rng(check_int("seed", seed, 0))
 
 

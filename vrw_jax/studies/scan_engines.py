@@ -302,7 +302,6 @@ def _evaluate_blocks(
     blocks: Iterable[np.ndarray],
     n_threads: int,
 ) -> ValuesByVariable:
-    """Return the values of each variable for blocks of samples, computed in threads."""
     first_block, *other_blocks = blocks
     first_results = evaluate(first_block)  # This call compiles for all threads.
     return concatenate_tree_rows(first_results, *map_in_threads(evaluate, other_blocks, n_threads))
@@ -365,7 +364,6 @@ def _evaluate_contact_block(
 def _read_gait_measures(
     measure_reader: MeasureReader, gait_batch: ReturnMapCycle
 ) -> dict[str, Array]:
-    """Return the requested measures of a batch of gaits, by name."""
     first_gait_step = jax.tree.map(lambda values_by_step: values_by_step[:, 0], gait_batch.steps)
     return eqx.filter_vmap(measure_reader)(gait_batch, first_gait_step)
 
@@ -530,7 +528,6 @@ other samples. It is small, because a walker whose functions have no machine cod
 def _evaluate_walkers(
     finder: WalkerFinder, variable_names: tuple[str, ...], rows: Any
 ) -> dict[str, Array]:
-    """Return outcomes, measures and derivatives for the gaits of some walkers, by name."""
     read, guesses = finder.measure_reader, jax.vmap(finder.make_initial_guess)(rows)
     derivatives = {name: parse_derivative(name) for name in variable_names}
     if any(derivatives.values()):

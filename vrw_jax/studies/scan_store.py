@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import abc
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -18,7 +19,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -34,10 +35,11 @@ from vrw_jax.studies.store_integrity import (
     METADATA_FILE_NAME,
     SCAN_VARIABLES_KEY,
     STORE_ATTRIBUTES_KEY,
-    ChunkChecksums,
+    ZARR_READ_ERRORS,
     JsonObject,
     StoredMetadata,
     add_attribute_seal,
+    compute_hex_digest,
     describe_store_damage,
     digest_coordinate_values,
     lock_store,
@@ -77,7 +79,6 @@ class ResultLayout:
 
     @property
     def _chunks_per_axis(self) -> tuple[int, ...]:
-        """Return the number of chunks along each sample axis."""
         n_chunks_by_axis = np.ceil(np.divide(self.sample_shape, self.chunk_shape))
         return tuple(n_chunks_by_axis.astype(int).tolist())
 
@@ -186,80 +187,131 @@ class MemoryResultStore(AbstractResultStore):
 
 
 class ZarrResultStore(AbstractResultStore):
-    """Storage of a scan's results in a folder, as a Zarr store.
+    """Storage of a scan's results in a folder, as a Zarr store, with a mark for each chunk.
 
+    The mark of a chunk is a digest of its files, so that it reveals files that have changed since.
+
+    - `layout`: layout of the result, which is needed to write; None to read only;
     - `verifies_files`: whether damaged chunks are searched for when the store is opened.
     """
 
-    def __init__(self, store_path: Path, result_layout: ResultLayout, verifies_files: bool) -> None:
-        self._store_path, self._result_layout = store_path, result_layout
-        self.store_location, self._verifies_files = str(store_path), verifies_files
+    def __init__(self, path: Path, layout: ResultLayout | None, verifies_files: bool) -> None:
+        self._path, self._layout, self._verifies_files = path, layout, verifies_files
+        self.store_location = str(path)
         self._open_arrays()
         self.damage_description = describe_store_damage(
-            store_path, self.damaged_chunks, self._damaged_coordinates, self._damaged_metadata
+            path, self.damaged_chunks, self._damaged_coordinates, self.damaged_metadata
         )
 
     def _open_arrays(self) -> None:
         """Open the arrays and find damage. Arrays with damaged metadata are not opened."""
-        stored_metadata, self._chunk_checksums = StoredMetadata(self._store_path), None
-        self._damaged_metadata = (
-            stored_metadata.find_damaged_metadata() if self._verifies_files else []
-        )
+        metadata = StoredMetadata(self._path)
+        self.damaged_metadata = metadata.find_damaged_metadata() if self._verifies_files else []
         self.damaged_chunks: list[int] = []
         self._damaged_coordinates: list[str] = []
+        self.group: zarr.Group | None = None
         try:
-            self._zarr_group = _open_zarr_group(self._store_path, "r+", stored_metadata)
-            self._chunk_checksums = ChunkChecksums(
-                self._store_path, self._zarr_group, stored_metadata
-            )
+            group = _open_zarr_group(self._path, "r+" if self._layout else "r", metadata)
+            self._marks = _select_zarr_array(group, CHECKSUM_ARRAY_NAME)
+            names = metadata.scan_variable_names
+            self._arrays = {name: _select_zarr_array(group, name) for name in names}
+            self._n_chunks_per_axis = self._arrays["outcome"].cdata_shape
+            settings = read_scan_manifest(metadata.store_attributes)
         except ZARR_METADATA_ERRORS:
-            if not self._damaged_metadata:
+            if not self.damaged_metadata:
                 raise
             return  # The metadata are written again before anything else is.
+        self._settings_digest = compute_hex_digest(json.dumps(settings, sort_keys=True).encode())
+        self.group = group
         if self._verifies_files:
-            self.damaged_chunks = self._chunk_checksums.find_damaged_chunks()
-            self._damaged_coordinates = self._chunk_checksums.find_damaged_coordinates()
+            # The marks are read once, before any file, because a running scan marks a chunk only
+            # after it has written the chunk's files.
+            marks = self._read_marks()
+            self.damaged_chunks = [
+                i
+                for i in np.flatnonzero(marks.any(1)).tolist()
+                if not np.array_equal(self._compute_mark(i), marks[i])
+            ]
+            self._damaged_coordinates = [
+                name
+                for name, digest in metadata.coordinate_digests.items()
+                if not _has_digest(group, name, digest)
+            ]
+
+    def _read_marks(self) -> np.ndarray:
+        """Return the marks of all chunks, shape (chunks, bytes of a mark), 0 without a mark.
+
+        The bytes of a mark that cannot be read are set to 255, so that its chunk counts as damaged.
+        """
+        try:
+            return np.asarray(self._marks[:]).reshape(self._marks.shape[0], -1)
+        except ZARR_READ_ERRORS:
+            marks = np.full(self._marks.shape, 255, self._marks.dtype)
+        for i in range(len(marks)):
+            with contextlib.suppress(*ZARR_READ_ERRORS):
+                marks[i] = self._marks[i]
+        return marks
+
+    def _compute_mark(self, chunk_index: int) -> np.ndarray:
+        """Return the digest of a chunk's files as an array of bytes, shape (bytes of a mark,)."""
+        digest = hashlib.blake2b(digest_size=DIGEST_SIZE_BYTES)
+        digest.update(f"{self._settings_digest} {chunk_index} ".encode())
+        indices: Any = np.unravel_index(chunk_index, self._n_chunks_per_axis)
+        for name, array in self._arrays.items():
+            key = array.metadata.encode_chunk_key((*indices, *(0,) * (array.ndim - len(indices))))
+            try:
+                content = (self._path / name / key).read_bytes()
+            except OSError:
+                content = b"none"  # Zarr writes no file if all values of a chunk are missing.
+            digest.update(f"{name} {len(content)} ".encode() + content)
+        return np.frombuffer(digest.digest(), np.uint8)
 
     def find_missing_chunks(self) -> list[int]:
-        if self._chunk_checksums is None:
-            return list(range(self._result_layout.n_chunks))
-        are_chunks_written = self._chunk_checksums.are_chunks_marked()
-        are_chunks_written[np.asarray(self.damaged_chunks, int)] = False
-        return np.flatnonzero(~are_chunks_written).tolist()
+        if self.group is None:
+            assert self._layout is not None
+            return list(range(self._layout.n_chunks))
+        is_written = np.asarray(self._read_marks().any(1))
+        is_written[np.asarray(self.damaged_chunks, int)] = False
+        return np.flatnonzero(~is_written).tolist()
 
     def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
-        chunk_slices = self._result_layout.compute_chunk_region(chunk_index)
-        for variable_name in self._result_layout.empty_variables:
-            _select_zarr_array(self._zarr_group, variable_name)[chunk_slices] = chunk_results[
-                variable_name
-            ]
-        assert self._chunk_checksums is not None
-        self._chunk_checksums.mark_chunk_as_written(chunk_index)
-        self.damaged_chunks = [
-            damaged_chunk for damaged_chunk in self.damaged_chunks if damaged_chunk != chunk_index
-        ]
+        assert self._layout is not None
+        region = self._layout.compute_chunk_region(chunk_index)
+        for name in self._layout.empty_variables:
+            self._arrays[name][region] = chunk_results[name]
+        self._marks[chunk_index] = self._compute_mark(chunk_index)
+        self.damaged_chunks = [i for i in self.damaged_chunks if i != chunk_index]
 
     def load_dataset(self) -> xr.Dataset:
-        return open_scan(self._store_path, verify=False)
+        return open_scan(self._path, verify=False)
 
     @contextlib.contextmanager
     def open_for_writing(self) -> Iterator[None]:
-        with lock_store(self._store_path):
-            for unfinished_file_path in self._store_path.rglob("*.partial"):
-                unfinished_file_path.unlink(missing_ok=True)
-            if self._damaged_metadata:
-                stored_metadata = StoredMetadata(self._store_path)
+        layout = self._layout
+        assert layout is not None
+        with lock_store(self._path):
+            for unfinished_path in self._path.rglob("*.partial"):
+                unfinished_path.unlink(missing_ok=True)
+            if self.damaged_metadata:
+                metadata = StoredMetadata(self._path)
                 with _build_temporary_store(
-                    self._store_path, self._result_layout, stored_metadata.store_attributes
+                    self._path, layout, metadata.store_attributes
                 ) as temporary_path:
-                    stored_metadata.restore_from_intact_store(StoredMetadata(temporary_path))
+                    metadata.restore_from_intact_store(StoredMetadata(temporary_path))
                 self._open_arrays()
-            for coordinate_name in self._damaged_coordinates:
-                _select_zarr_array(self._zarr_group, coordinate_name)[:] = (
-                    self._result_layout.result_coordinates[coordinate_name].values
-                )
+            assert self.group is not None
+            for name in self._damaged_coordinates:
+                values = layout.result_coordinates[name].values
+                _select_zarr_array(self.group, name)[:] = values
             self._damaged_coordinates = []
             yield
+
+
+def _has_digest(group: zarr.Group, name: str, digest: str) -> bool:
+    try:
+        return digest_coordinate_values(np.asarray(_select_zarr_array(group, name)[:])) == digest
+    except (KeyError, *ZARR_READ_ERRORS):
+        return False
 
 
 def _select_zarr_array(zarr_group: zarr.Group, array_name: str) -> zarr.Array:
@@ -297,37 +349,30 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
     """
     path = check_path("path", path, "give the folder that a scan wrote")
     verify = check_bool("verify", verify)
-    stored_metadata = _read_scan_metadata(path)
-    damaged_metadata = stored_metadata.find_damaged_metadata() if verify else []
+    stored_metadata, reason = _read_scan_metadata(path), None
     try:
-        zarr_group = _open_zarr_group(path, "r", stored_metadata)
-        chunk_checksums = ChunkChecksums(path, zarr_group, stored_metadata)
-        damage_description = verify and describe_store_damage(
-            path,
-            chunk_checksums.find_damaged_chunks(),
-            chunk_checksums.find_damaged_coordinates(),
-            damaged_metadata,
-        )
-        if not damage_description:
+        store = ZarrResultStore(path, None, verify)
+        if store.group is None:
+            reason = ", ".join(store.damaged_metadata)
+        elif not store.damage_description:
             dataset = xr.open_zarr(
                 path,
-                consolidated=zarr_group.metadata.consolidated_metadata is not None,
+                consolidated=store.group.metadata.consolidated_metadata is not None,
                 chunks=None,
                 mask_and_scale=False,
                 decode_times=False,
             )
-    except ZARR_METADATA_ERRORS as metadata_error:
-        store_damage_reason = ", ".join(damaged_metadata) or " ".join(
-            str(metadata_error).split()
-        ).rstrip(".")
+    except ZARR_METADATA_ERRORS as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+    if reason is not None:
         raise ValueError(
-            f"{path} can't be opened ({store_damage_reason}): run the scan again, which mends the "
+            f"{path} can't be opened ({reason}): run the scan again, which mends the "
             "arrays that it wrote, and delete others without dimension names."
-        ) from metadata_error
-    if damage_description:
+        )
+    if store.damage_description:
         raise ValueError(
-            f"{damage_description}: run the scan again, which computes these anew, or read the "
-            "rest with open_scan(path, verify=False)."
+            f"{store.damage_description}: run the scan again, which computes these anew, or read "
+            "the rest with open_scan(path, verify=False)."
         )
     dataset = dataset.assign_attrs(
         {
@@ -481,9 +526,6 @@ def _build_temporary_store(
 def _create_zarr_arrays(
     store_path: Path, result_layout: ResultLayout, store_attributes: JsonObject
 ) -> None:
-    """Create the Zarr group of a store, with the coordinates and with empty arrays for variables
-    and marks.
-    """
     import zarr  # This import is slow.
     from zarr.codecs import Crc32cCodec, ZstdCodec
 

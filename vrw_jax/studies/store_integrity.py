@@ -73,7 +73,7 @@ def add_attribute_seal(chunk_mark_attributes: JsonObject) -> JsonObject:
         if attribute_key != ATTRIBUTE_SEAL_KEY
     }
     return unsealed_attributes | {
-        ATTRIBUTE_SEAL_KEY: _compute_hex_digest(
+        ATTRIBUTE_SEAL_KEY: compute_hex_digest(
             json.dumps(unsealed_attributes, sort_keys=True).encode()
         )
     }
@@ -85,12 +85,12 @@ def compute_store_digest(store_path: Path) -> str:
     It changes with every setting and every result of the scan.
     """
     mark_paths = sorted(filter(Path.is_file, (store_path / CHECKSUM_ARRAY_NAME).rglob("*")))
-    return _compute_hex_digest(b"".join(map(Path.read_bytes, mark_paths)))
+    return compute_hex_digest(b"".join(map(Path.read_bytes, mark_paths)))
 
 
 def digest_coordinate_values(coordinate_values: np.ndarray) -> str:
     """Return the digest of a coordinate's type, shape and values, in hexadecimal digits."""
-    return _compute_hex_digest(
+    return compute_hex_digest(
         f"{coordinate_values.dtype.str} {coordinate_values.shape} ".encode()
         + coordinate_values.tobytes()
     )
@@ -220,107 +220,12 @@ class StoredMetadata:
                 temporary_path.replace(metadata_path)
 
     def _read_array_metadata(self, array_name: str) -> JsonObject:
-        """Return the metadata of one array or group, read from its separate file."""
         return read_metadata_file(self._store_path / array_name / METADATA_FILE_NAME)
 
 
-def _compute_hex_digest(digested_bytes: bytes) -> str:
+def compute_hex_digest(digested_bytes: bytes) -> str:
     """Return the digest of `digested_bytes` in hexadecimal digits."""
     return hashlib.blake2b(digested_bytes, digest_size=DIGEST_SIZE_BYTES).hexdigest()
-
-
-class ChunkChecksums:
-    """Marks of the chunks of a store, and methods that compare marks with files."""
-
-    def __init__(
-        self, store_path: Path, zarr_group: ZarrGroup, stored_metadata: StoredMetadata
-    ) -> None:
-        self._store_path, self._zarr_group = store_path, zarr_group
-        self._stored_metadata = stored_metadata
-        self._chunk_marks = zarr_group[CHECKSUM_ARRAY_NAME]
-        self._variable_arrays = {
-            array_name: zarr_group[array_name] for array_name in stored_metadata.scan_variable_names
-        }
-        self._n_chunks_per_axis = self._variable_arrays["outcome"].cdata_shape
-        settings_text = json.dumps(
-            read_scan_manifest(stored_metadata.store_attributes), sort_keys=True
-        )
-        self._settings_digest = _compute_hex_digest(settings_text.encode())
-
-    def are_chunks_marked(self) -> np.ndarray:
-        """Return whether each chunk has a mark, shape (chunks,)."""
-        return _are_chunk_marks_set(self._read_chunk_marks())
-
-    def _read_chunk_marks(self) -> np.ndarray:
-        """Return the marks of all chunks, shape (chunks, bytes of a mark).
-
-        The bytes of a mark that cannot be read are set to 255, so that its chunk counts as damaged.
-        """
-        try:
-            return np.asarray(self._chunk_marks[:])
-        except ZARR_READ_ERRORS:
-            chunk_marks = np.full(self._chunk_marks.shape, 255, self._chunk_marks.dtype)
-        for chunk_index in range(len(chunk_marks)):
-            with contextlib.suppress(*ZARR_READ_ERRORS):
-                chunk_marks[chunk_index] = self._chunk_marks[chunk_index]
-        return chunk_marks
-
-    def mark_chunk_as_written(self, chunk_index: int) -> None:
-        """Mark a chunk as written, with the digest of its files as the mark."""
-        self._chunk_marks[chunk_index] = self._compute_chunk_digest(chunk_index)
-
-    def find_damaged_chunks(self) -> list[int]:
-        """Return the indices of marked chunks whose files have changed since the mark was written.
-
-        The marks are read once, before any file, because a running scan marks a chunk only after it
-        has written the chunk's files.
-        """
-        chunk_marks = self._read_chunk_marks()
-        return [
-            chunk_index
-            for chunk_index in np.flatnonzero(_are_chunk_marks_set(chunk_marks)).tolist()
-            if not np.array_equal(self._compute_chunk_digest(chunk_index), chunk_marks[chunk_index])
-        ]
-
-    def find_damaged_coordinates(self) -> list[str]:
-        """Return the names of coordinates whose stored values differ from those that were
-        written.
-        """
-        return [
-            coordinate_name
-            for coordinate_name, coordinate_digest in (
-                self._stored_metadata.coordinate_digests.items()
-            )
-            if self._digest_stored_coordinate(coordinate_name) != coordinate_digest
-        ]
-
-    def _digest_stored_coordinate(self, coordinate_name: str) -> str:
-        """Return the digest of a coordinate's stored values, or "" if the values cannot be read."""
-        try:
-            return digest_coordinate_values(np.asarray(self._zarr_group[coordinate_name][:]))
-        except (KeyError, *ZARR_READ_ERRORS):
-            return ""
-
-    def _compute_chunk_digest(self, chunk_index: int) -> np.ndarray:
-        """Return the digest of a chunk's files as an array of bytes, shape (bytes of a mark,)."""
-        chunk_digest = hashlib.blake2b(digest_size=DIGEST_SIZE_BYTES)
-        chunk_digest.update(f"{self._settings_digest} {chunk_index} ".encode())
-        chunk_indices = np.unravel_index(chunk_index, self._n_chunks_per_axis)
-        for variable_name, variable_array in self._variable_arrays.items():
-            chunk_key = variable_array.metadata.encode_chunk_key(
-                (*chunk_indices, *(0,) * (variable_array.ndim - len(chunk_indices)))
-            )
-            try:
-                file_content = (self._store_path / variable_name / chunk_key).read_bytes()
-            except OSError:
-                file_content = b"none"  # Zarr writes no file if all values of a chunk are missing.
-            chunk_digest.update(f"{variable_name} {len(file_content)} ".encode() + file_content)
-        return np.frombuffer(chunk_digest.digest(), np.uint8)
-
-
-def _are_chunk_marks_set(chunk_marks: np.ndarray) -> np.ndarray:
-    """Return whether each chunk's mark is set, shape (chunks,)."""
-    return np.any(chunk_marks.reshape(len(chunk_marks), -1) != 0, axis=1)
 
 
 ZARR_READ_ERRORS = (OSError, ValueError, RuntimeError)

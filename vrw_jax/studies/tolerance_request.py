@@ -9,9 +9,10 @@ finds the gait with unilateral contact. If that gait is far from the lower model
 another gait is computed.
 """
 
+import functools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -335,8 +336,16 @@ def measure_to_tolerance(
     wheel_batch = ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options)
     measure_request = _MeasureRequest(measure_names, tol, relative, wheel_batch, params)
     if gait_rank is None:
-        measure_request.try_rigid_model()
-        measure_request.try_paper_model()
+        with np.errstate(all="ignore"):
+            contraction = compute_static_leg_contraction(params)
+        measure_request.correct_lower_gaits(
+            np.flatnonzero(REQUEST_SAFETY_FACTOR * contraction <= tol), find_rigid_gaits, False
+        )
+        measure_request.correct_lower_gaits(
+            measure_request.find_unfinished_indices(),
+            functools.partial(find_paper_gaits, step_options=step_options),
+            True,
+        )
         measure_request.walk_to_gaits()
     else:
         measure_request.select_gait_by_rank(gait_rank)
@@ -409,74 +418,41 @@ class _MeasureRequest:
     def __post_init__(self) -> None:
         n_wheels = self.wheel_batch.parameter_matrix.shape[1]
         self.lower_gaits = LowerFidelityGaits.without_gait(n_wheels)
-        make_measure_array = lambda fill_value: np.full(
-            (n_wheels, len(self.measure_names)), fill_value
-        )
+        fill = lambda value: np.full((n_wheels, len(self.measure_names)), value)
+        all_wheels = np.arange(n_wheels)
         self.result_arrays = {
-            "values": make_measure_array(np.nan),
-            "errors": make_measure_array(np.inf),
-            "model_errors": make_measure_array(np.nan),
-            "numerical_errors": make_measure_array(np.inf),
+            "values": fill(np.nan),
+            "errors": fill(np.inf),
+            "model_errors": fill(np.nan),
+            "numerical_errors": fill(np.inf),
             "models": np.full(n_wheels, ModelIndex.NONE),
             "statuses": np.full(n_wheels, int(MeasureStatus.NO_GAIT)),
             "n_steps": np.zeros(n_wheels, int),
             "outcomes": np.full(n_wheels, int(Outcome.NO_CYCLE_FOUND)),
             "n_gaits": np.zeros(n_wheels, int),
-            "states": self.wheel_batch.embed_paper_states(
-                np.arange(n_wheels), np.zeros((n_wheels, 3))
-            ),
+            "states": self.wheel_batch.embed_paper_states(all_wheels, np.zeros((n_wheels, 3))),
         }
 
-    def compute_error_goal(self, measure_values: np.ndarray) -> np.ndarray:
-        """Return the allowed absolute errors for measures with the values `measure_values`."""
-        return self.tol * (
-            np.abs(measure_values) if self.relative else np.ones_like(measure_values)
-        )
+    def compute_error_goal(self, values: np.ndarray) -> np.ndarray:
+        """Return the allowed absolute errors for measures with the given values."""
+        return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
 
     def find_unfinished_indices(self) -> np.ndarray:
-        """Return the indices of the wheels without a result."""
         return np.flatnonzero(self.result_arrays["models"] == ModelIndex.NONE)
-
-    def try_rigid_model(self) -> None:
-        """Compute rigid gaits of wheels with stiff legs, and store measures to within `tol`."""
-        with np.errstate(all="ignore"):
-            wheel_indices = np.flatnonzero(
-                REQUEST_SAFETY_FACTOR * compute_static_leg_contraction(self.params) <= self.tol
-            )
-        if len(wheel_indices):
-            rigid_gaits = find_rigid_gaits(select_wheels(self.params, wheel_indices))
-            self._correct_lower_gaits(wheel_indices, rigid_gaits, are_rejected_gaits_refined=False)
-
-    def try_paper_model(self) -> None:
-        """Compute gaits of the paper's model, and store measures to within `tol`.
-
-        If the error of a gait is larger, the gait with unilateral contact near it is computed and
-        stored.
-        """
-        wheel_indices = self.find_unfinished_indices()
-        if len(wheel_indices):
-            paper_gaits = find_paper_gaits(
-                select_wheels(self.params, wheel_indices), self.wheel_batch.step_options
-            )
-            self._correct_lower_gaits(wheel_indices, paper_gaits, are_rejected_gaits_refined=True)
 
     def walk_to_gaits(self) -> None:
         """Compute walks of wheels without a result, and store the measures of the gaits reached."""
-        wheel_indices = self.find_unfinished_indices()
-        has_lower_gait = self.lower_gaits.model_index[wheel_indices] != ModelIndex.NONE
+        unfinished = self.find_unfinished_indices()
+        has_lower_gait = self.lower_gaits.model_index[unfinished] != ModelIndex.NONE
+        wheels, unfinished = unfinished[has_lower_gait], unfinished[~has_lower_gait]
         self._walk_and_record_gaits(
-            wheel_indices[has_lower_gait],
-            self.lower_gaits.section_states[wheel_indices[has_lower_gait]],
-            MeasureStatus.REACHED_FROM_LOWER_GAIT,
+            wheels, self.lower_gaits.section_states[wheels], MeasureStatus.REACHED_FROM_LOWER_GAIT
         )
-        wheel_indices = wheel_indices[~has_lower_gait]
-        walk_starts = compute_walk_starts(select_wheels(self.params, wheel_indices))
-        for walk_start in walk_starts[:N_COLD_STARTS]:
-            is_gait_missing = self.result_arrays["models"][wheel_indices] == ModelIndex.NONE
+        walk_starts = compute_walk_starts(select_wheels(self.params, unfinished))
+        for start in walk_starts[:N_COLD_STARTS]:
+            is_missing = self.result_arrays["models"][unfinished] == ModelIndex.NONE
             self._walk_and_record_gaits(
-                wheel_indices[is_gait_missing],
-                walk_start[is_gait_missing],
-                MeasureStatus.REACHED_FROM_START,
+                unfinished[is_missing], start[is_missing], MeasureStatus.REACHED_FROM_START
             )
 
     def select_gait_by_rank(self, gait_rank: int) -> None:
@@ -484,30 +460,24 @@ class _MeasureRequest:
 
         The gaits are those that walks from all starts reach.
         """
-        wheel_indices = self.find_unfinished_indices()
-        walk_starts = compute_walk_starts(self.params)
-        wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
-            np.tile(wheel_indices, len(walk_starts)), np.concatenate(walk_starts)
+        wheels = self.find_unfinished_indices()
+        starts = compute_walk_starts(self.params)
+        gait_wheels, gaits = self._walk_and_refine_gaits(
+            np.tile(wheels, len(starts)), np.concatenate(starts)
         )
-        selected_gait_indices = []
-        for wheel_index in wheel_indices:
-            distinct_gait_indices = refined_gaits.find_distinct_gaits(
-                np.flatnonzero(wheel_indices_of_gaits == wheel_index)
-            )
-            self.result_arrays["n_gaits"][wheel_index] = len(distinct_gait_indices)
-            if -len(distinct_gait_indices) <= gait_rank < len(distinct_gait_indices):
-                selected_gait_indices.append(distinct_gait_indices[gait_rank])
+        selected = []
+        for wheel in wheels:
+            distinct = gaits.find_distinct_gaits(np.flatnonzero(gait_wheels == wheel))
+            self.result_arrays["n_gaits"][wheel] = len(distinct)
+            selected += distinct[gait_rank:][:1] if -len(distinct) <= gait_rank else []
         self._record_gaits(
-            wheel_indices_of_gaits,
-            refined_gaits,
-            np.array(selected_gait_indices, int),
-            MeasureStatus.SELECTED_BY_RANK,
+            gait_wheels, gaits, np.array(selected, int), MeasureStatus.SELECTED_BY_RANK
         )
 
-    def _correct_lower_gaits(
+    def correct_lower_gaits(
         self,
         wheel_indices: np.ndarray,
-        lower_gaits: LowerFidelityGaits,
+        find_gaits: Callable[[WheelParams], LowerFidelityGaits],
         are_rejected_gaits_refined: bool,
     ) -> None:
         """Compute one step with unilateral contact from each lower gait, and store measures.
@@ -516,83 +486,77 @@ class _MeasureRequest:
         `are_rejected_gaits_refined` is True, the other lower gaits are the initial guesses for
         gaits with unilateral contact, whose measures are stored as well.
         """
-        replace_rows(self.lower_gaits, wheel_indices, lower_gaits)
-        has_gait = np.isfinite(lower_gaits.step_quantities).all(1)
-        wheel_indices, lower_gaits = select_tree_rows((wheel_indices, lower_gaits), has_gait)
-        section_states, contact_step, measure_estimates = estimate_measures_from_lower_gaits(
-            self.wheel_batch, wheel_indices, lower_gaits, self.measure_names
+        if not len(wheel_indices):
+            return
+        gaits = find_gaits(select_wheels(self.params, wheel_indices))
+        replace_rows(self.lower_gaits, wheel_indices, gaits)
+        has_gait = np.isfinite(gaits.step_quantities).all(1)
+        wheel_indices, gaits = select_tree_rows((wheel_indices, gaits), has_gait)
+        states, step, estimates = estimate_measures_from_lower_gaits(
+            self.wheel_batch, wheel_indices, gaits, self.measure_names
         )
-        lower_measure_values = evaluate_measures(self.measure_names, lower_gaits.step_quantities)
+        values = evaluate_measures(self.measure_names, gaits.step_quantities)
         with np.errstate(all="ignore"):
-            total_measure_change = (
-                np.abs(
-                    evaluate_measures(self.measure_names, contact_step.step_quantities)
-                    - lower_measure_values
-                )
-                + measure_estimates.correction_effect_on_measures
-            )
-            model_error = lower_measure_values - measure_estimates.measure_values
-            section_state_sensitivity = np.abs(
-                measure_estimates.measure_jacobian @ lower_gaits.step_quantity_jacobian
-            )
-            lower_gait_error_effect = np.einsum(
-                "ijk,ik->ij", section_state_sensitivity, np.abs(lower_gaits.section_state_error)
-            )
+            step_change = evaluate_measures(self.measure_names, step.step_quantities) - values
+            total_change = np.abs(step_change) + estimates.correction_effect_on_measures
+            model_error = values - estimates.measure_values
+            sensitivity = np.abs(estimates.measure_jacobian @ gaits.step_quantity_jacobian)
             numerical_error = (
-                lower_gait_error_effect
-                + measure_estimates.numerical_error_bound
-                + measure_estimates.missed_contact_error_bound
+                np.einsum("ijk,ik->ij", sensitivity, np.abs(gaits.section_state_error))
+                + estimates.numerical_error_bound
+                + estimates.missed_contact_error_bound
             )
-            error_bound = (
-                np.abs(model_error)
-                + (REQUEST_SAFETY_FACTOR - 1.0) * total_measure_change
-                + numerical_error
+            error = (
+                np.abs(model_error) + (REQUEST_SAFETY_FACTOR - 1.0) * total_change + numerical_error
             )
-            is_estimate_accepted = measure_estimates.has_same_leg_codes & np.all(
-                error_bound <= self.compute_error_goal(lower_measure_values), axis=1
+            is_accepted = estimates.has_same_leg_codes & np.all(
+                error <= self.compute_error_goal(values), axis=1
             )
         self.result_arrays["n_steps"][wheel_indices] += 1
         lower_results = {
-            "models": lower_gaits.model_index,
-            "values": lower_measure_values,
-            "errors": error_bound,
+            "models": gaits.model_index,
+            "values": values,
+            "errors": error,
             "model_errors": model_error,
             "numerical_errors": numerical_error,
-            "states": section_states,
+            "states": states,
         }
         self._record_results(
-            wheel_indices[is_estimate_accepted],
-            select_tree_rows(lower_results, is_estimate_accepted),
+            wheel_indices[is_accepted],
+            select_tree_rows(lower_results, is_accepted),
             MeasureStatus.CHECKED_BY_ONE_STEP,
         )
-        is_gait_refined = (
-            are_rejected_gaits_refined
-            & ~is_estimate_accepted
-            & measure_estimates.has_same_leg_codes
+        is_refined = are_rejected_gaits_refined & ~is_accepted & estimates.has_same_leg_codes
+        wheel_indices = wheel_indices[is_refined]
+        refined = self._refine_gaits(wheel_indices, step.section_states[is_refined], False)
+        distances, correction_lengths = (
+            np.linalg.norm(x, axis=1)
+            for x in (
+                (refined.section_states - states[is_refined])[
+                    :, self.wheel_batch.list_paper_state_indices()
+                ],
+                estimates.newton_correction[is_refined],
+            )
         )
-        wheel_indices = wheel_indices[is_gait_refined]
-        refined_gaits = refine_gaits(
+        is_near = distances <= MAX_GAIT_DISTANCE_RATIO * correction_lengths
+        self._record_gaits(
+            wheel_indices, refined, refined.is_found & is_near, MeasureStatus.CONTINUES_LOWER_GAIT
+        )
+
+    def _refine_gaits(
+        self, wheel_indices: np.ndarray, states: np.ndarray, is_every_gait_compared: bool
+    ) -> RefinedGaits:
+        """Return the gaits near full section states, and add their steps to the results."""
+        gaits = refine_gaits(
             self.wheel_batch,
             wheel_indices,
-            contact_step.section_states[is_gait_refined],
+            states,
             self.measure_names,
             self.compute_error_goal,
-            is_every_gait_compared=False,
+            is_every_gait_compared,
         )
-        self.result_arrays["n_steps"][wheel_indices] += refined_gaits.n_steps
-        state_differences = refined_gaits.section_states - section_states[is_gait_refined]
-        gait_distance = np.linalg.norm(
-            state_differences[:, self.wheel_batch.list_paper_state_indices()], axis=1
-        )
-        max_gait_distance = MAX_GAIT_DISTANCE_RATIO * np.linalg.norm(
-            measure_estimates.newton_correction[is_gait_refined], axis=1
-        )
-        self._record_gaits(
-            wheel_indices,
-            refined_gaits,
-            refined_gaits.is_found & (gait_distance <= max_gait_distance),
-            MeasureStatus.CONTINUES_LOWER_GAIT,
-        )
+        np.add.at(self.result_arrays["n_steps"], wheel_indices, gaits.n_steps)
+        return gaits
 
     def _walk_and_record_gaits(
         self, wheel_indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
@@ -601,15 +565,8 @@ class _MeasureRequest:
 
         The section states have the shape (wheels, 3).
         """
-        wheel_indices_of_gaits, refined_gaits = self._walk_and_refine_gaits(
-            wheel_indices, section_states
-        )
-        self._record_gaits(
-            wheel_indices_of_gaits,
-            refined_gaits,
-            refined_gaits.is_found & refined_gaits.is_attracting,
-            status,
-        )
+        gait_wheels, gaits = self._walk_and_refine_gaits(wheel_indices, section_states)
+        self._record_gaits(gait_wheels, gaits, gaits.is_found & gaits.is_attracting, status)
 
     def _walk_and_refine_gaits(
         self, wheel_indices: np.ndarray, section_states: np.ndarray
@@ -625,49 +582,39 @@ class _MeasureRequest:
         )
         np.add.at(self.result_arrays["n_steps"], wheel_indices, walk_ends.n_steps)
         # A step cannot begin if a wheel has turned more than once in flight.
+        is_reason_unknown = np.isin(walk_ends.walk_outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT))
         self.result_arrays["outcomes"][wheel_indices] = np.where(
-            np.isin(walk_ends.walk_outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT)),
-            Outcome.NO_CYCLE_FOUND,
-            walk_ends.walk_outcomes,
+            is_reason_unknown, Outcome.NO_CYCLE_FOUND, walk_ends.walk_outcomes
         )
-        wheel_indices_of_gaits = wheel_indices[walk_ends.has_settled]
-        refined_gaits = refine_gaits(
-            self.wheel_batch,
-            wheel_indices_of_gaits,
-            walk_ends.section_states[walk_ends.has_settled],
-            self.measure_names,
-            self.compute_error_goal,
-            is_every_gait_compared=True,
-        )
-        np.add.at(self.result_arrays["n_steps"], wheel_indices_of_gaits, refined_gaits.n_steps)
-        return wheel_indices_of_gaits, refined_gaits
+        wheel_indices = wheel_indices[walk_ends.has_settled]
+        states = walk_ends.section_states[walk_ends.has_settled]
+        return wheel_indices, self._refine_gaits(wheel_indices, states, True)
 
     def _record_gaits(
         self,
-        wheel_indices_of_gaits: np.ndarray,
-        refined_gaits: RefinedGaits,
-        selected_gait_indices: np.ndarray,
+        gait_wheels: np.ndarray,
+        gaits: RefinedGaits,
+        selected_gaits: np.ndarray,
         status: MeasureStatus,
     ) -> None:
         """Store the measures of the selected gaits with unilateral contact.
 
-        - `wheel_indices_of_gaits`: index of the wheel of each gait;
-        - `selected_gait_indices`: indices or mask of the selected gaits.
+        - `gait_wheels`: index of the wheel of each gait;
+        - `selected_gaits`: indices or mask of the selected gaits.
         """
-        wheel_indices = wheel_indices_of_gaits[selected_gait_indices]
-        refined_gaits = select_tree_rows(refined_gaits, selected_gait_indices)
-        lower_measure_values = evaluate_measures(
-            self.measure_names, self.lower_gaits.step_quantities[wheel_indices]
+        wheels, gaits = gait_wheels[selected_gaits], select_tree_rows(gaits, selected_gaits)
+        lower_values = evaluate_measures(
+            self.measure_names, self.lower_gaits.step_quantities[wheels]
         )
         gait_results = {
             "models": ModelIndex.UNILATERAL,
-            "values": refined_gaits.measure_values,
-            "errors": refined_gaits.measure_error_bounds,
-            "model_errors": lower_measure_values - refined_gaits.measure_values,
-            "numerical_errors": refined_gaits.measure_error_bounds,
-            "states": refined_gaits.section_states,
+            "values": gaits.measure_values,
+            "errors": gaits.measure_error_bounds,
+            "model_errors": lower_values - gaits.measure_values,
+            "numerical_errors": gaits.measure_error_bounds,
+            "states": gaits.section_states,
         }
-        self._record_results(wheel_indices, gait_results, status)
+        self._record_results(wheels, gait_results, status)
 
     def _record_results(
         self, wheel_indices: np.ndarray, results: dict[str, Any], status: MeasureStatus
