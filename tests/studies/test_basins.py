@@ -34,6 +34,35 @@ def smallest():
     return vrw.smallest_disturbance(TABLE_1)
 
 
+class SquaredOffset(vrw.AbstractWalker):
+    """Walker whose step squares the offset from a gait, so that offsets below one decay."""
+
+    coordinates = {"offset": "m"}  # noqa: RUF012
+
+    def advance(self, params, x, options):
+        return vrw.AdvanceResult(params["gait"] + (x - params["gait"]) ** 2, jnp.ones(1))
+
+
+@pytest.mark.parametrize("gait", [0.0, 5.0])
+def test_the_share_of_an_own_walker_is_the_width_of_its_basin(gait):
+    params, walker = {"gait": gait}, SquaredOffset()
+    cycle = vrw.limit_cycle(params, model=walker, guess=[gait + 0.1])
+    box = {"offset": (gait - 2.0, gait + 3.0)}
+    result = vrw.basin_share(params, box, model=walker, cycle=cycle, n_starts=1000, max_steps=60)
+    assert abs(result.share - 2.0 / 5.0) < 3e-3  # points of a Sobol' sequence
+    assert result.walking_share[0] == 1.0
+
+
+def test_an_own_walker_gets_one_sentence_on_what_is_missing():
+    walker, cycle = SquaredOffset(), functools.partial(vrw.limit_cycle, {"gait": 0.0}, guess=[0.1])
+    with pytest.raises(ValueError, match="it must contain all of offset: give each"):
+        vrw.basin_share({"gait": 0.0}, {"x": (0.0, 1.0)}, model=walker, cycle=cycle(model=walker))
+    with pytest.raises(ValueError, match="SquaredOffset cannot begin within a step"):
+        vrw.smallest_disturbance({"gait": 0.0}, model=walker, cycle=cycle(model=walker))
+    with pytest.raises(ValueError, match="guess"):
+        vrw.basin_share({"gait": 0.0}, {"offset": (0.0, 1.0)}, model=walker)
+
+
 @pytest.mark.slow
 def test_the_share_of_the_rigid_wheel_is_that_of_its_closed_form():
     # The landing keeps cos(2 half) of the rate, which must then exceed the critical one.

@@ -27,7 +27,6 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
-    AbstractWalker,
     check_arguments,
     check_parameters,
     is_own_walker,
@@ -36,7 +35,7 @@ from vrw_jax.base.walker import (
 from vrw_jax.gaits.attractors import find_distinct_orbits, measure_orbit_steps, walk_until_periodic
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.gait_search import limit_cycle
-from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     POST_LANDING_COMPONENT_NAMES,
@@ -117,8 +116,8 @@ def basin(
     if own_walker is None:
         require_single_wheel(params, "compute one basin after the other")
         # The model is valid for any start.
-        model = wheel_model = convert_model_argument(model).fallback_model
-        require_equal_legs(wheel_model, "vrw.basin")
+        model = convert_model_argument(model).fallback_model
+        require_equal_legs(model, "vrw.basin")
     else:
         params = check_parameters(params)
     options = convert_step_options(options)
@@ -127,11 +126,7 @@ def basin(
     max_steps = check_int("max_steps", max_steps)
     max_period = check_int("max_period", max_period)
     check_type("grid", grid, Mapping, "write {'theta_touchdown': 0.09, 'dtheta_touchdown': ...}")
-    start_component_names = (
-        select_start_components("grid", grid, "a number or an axis")
-        if own_walker is None
-        else _select_own_components(own_walker, grid)
-    )
+    start_component_names = select_start_components(model, "grid", grid, "a number or an axis")
     start_component_values = {
         component_name: np.asarray(check_reals(component_name, grid[component_name]), float)
         for component_name in start_component_names
@@ -146,12 +141,9 @@ def basin(
     grid_shape = [start_component_values[axis_name].size for axis_name in axis_names]
     coordinate_grids = np.meshgrid(*start_component_values.values(), indexing="ij")
     start_states = np.stack([x.ravel() for x in coordinate_grids], -1)
-    if own_walker is None:
-        start_states = compute_section_states_of_starts(params, start_component_names, start_states)
-        start_embedder = functools.partial(wheel_model.complete_section_state, params)
-        start_states = np.asarray(jax.vmap(start_embedder)(jnp.asarray(start_states)))
-    else:
+    if own_walker is not None:
         check_arguments(own_walker, params, start_states[0], options, 1)
+    start_states = embed_starts(params, model, start_component_names, start_states)
     walk_ends = walk_until_periodic(params, start_states, model, options, max_steps, max_period)
     orbit_indices, orbit_states = find_distinct_orbits(walk_ends)
 
@@ -196,33 +188,39 @@ def basin(
     )
 
 
-def _select_own_components(walker: AbstractWalker, grid: StartGrid) -> tuple[str, ...]:
-    """Return the names of the section coordinates of a walker, all of which a grid contains."""
-    names = tuple(name_coordinates(walker, len(grid)))
-    if set(grid) != set(names):
-        raise ValueError(
-            f"the grid contains {', '.join(map(str, grid))}, but it must contain the section "
-            f"coordinates {', '.join(names)}: give each a number or an axis."
-        )
-    return names
-
-
 def select_start_components(
-    argument_name: str, values_by_component: Mapping[str, Any], value_text: str
+    model: Any, argument_name: str, values_by_component: Mapping[str, Any], value_text: str
 ) -> tuple[str, ...]:
-    """Return the names of the components of starts before touchdown or of starts after landing.
+    """Return the names of the components of starts before touchdown or of starts after landing, or
+    of the section coordinates of a walker of the user.
 
-    Raise a ValueError unless the names in `values_by_component` are either all of the former or all
-    of the latter. The message contains `argument_name`, and the form `value_text` of a value.
+    Raise a ValueError unless the names in `values_by_component` are all of one kind. The message
+    contains `argument_name`, and the form `value_text` of a value.
     """
-    for start_component_names in (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES):
-        if set(values_by_component) == set(start_component_names):
-            return start_component_names
+    kinds: tuple[tuple[str, ...], ...] = (
+        (tuple(name_coordinates(model, len(values_by_component))),)
+        if is_own_walker(model)
+        else (PRE_TOUCHDOWN_COMPONENT_NAMES, POST_LANDING_COMPONENT_NAMES)
+    )
+    for names in kinds:
+        if set(values_by_component) == set(names):
+            return names
     raise ValueError(
         f"the {argument_name} contains {', '.join(map(str, values_by_component)) or 'nothing'}, "
-        f"but it must contain all of {', '.join(PRE_TOUCHDOWN_COMPONENT_NAMES)}, or all of "
-        f"{', '.join(POST_LANDING_COMPONENT_NAMES)}: give each {value_text}."
+        f"but it must contain all of {', or all of '.join(map(', '.join, kinds))}: give each "
+        f"{value_text}."
     )
+
+
+def embed_starts(
+    params: Any, model: Any, component_names: tuple[str, ...], starts: np.ndarray
+) -> np.ndarray:
+    """Return the section states of starts, which are those of a walker of the user themselves."""
+    if is_own_walker(model):
+        return starts
+    section_states = compute_section_states_of_starts(params, component_names, starts)
+    embed = functools.partial(model.complete_section_state, params)
+    return np.asarray(jax.vmap(embed)(jnp.asarray(section_states)))
 
 
 def compute_section_states_of_starts(
@@ -263,9 +261,6 @@ def _make_orbit_variables(
     model: Any,
     options: StepOptions,
 ) -> dict[str, xr.Variable]:
-    """Return the dataset variables for the orbits: states, periods, DLS fractions and minimum
-    margins.
-    """
     n_orbits = len(orbit_states)
     has_wheel_measures = not is_own_walker(model)
     n_entries = model.count_section_entries(params) if has_wheel_measures else n_coordinates
@@ -311,10 +306,10 @@ MAX_ARRIVAL_DISTANCE = 1e-6
 
 
 class StableGait(NamedTuple):
-    """Stable gait of one wheel, with the wheel's parameters, the model and the step options."""
+    """Stable gait of one walker, with its parameters, the model and the step options."""
 
-    params: WheelParams
-    model: AbstractWheel
+    params: Any
+    model: Any
     step_options: StepOptions
     section_states: np.ndarray  # before the landing of each step, (period_n, m)
 
@@ -322,9 +317,9 @@ class StableGait(NamedTuple):
     def from_cycle(
         cls,
         caller_name: str,
-        params: WheelParams,
-        model: ModelLike | None,
-        cycle: AbstractCycle | None,
+        params: Any,
+        model: Any,
+        cycle: Any,
         options: StepOptions | None,
     ) -> "StableGait":
         """Return the stable gait of `cycle`, which is by default the result of `limit_cycle`.
@@ -335,44 +330,44 @@ class StableGait(NamedTuple):
         require_untraced_arguments(
             caller_name, "map vrw.walk over the starts", params, options, cycle
         )
-        require_single_wheel(params, f"call {caller_name} for one wheel after the other")
-        checked_model = convert_model_argument(model).fallback_model  # valid for any start
-        checked_step_options = convert_step_options(options)
-        checked_step_options.check_tolerances(np.dtype(params.damping.dtype))
-        if cycle is None:
-            cycle = limit_cycle(params, model=checked_model)
-        check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
+        is_own = is_own_walker(model)
+        if is_own:
+            params = check_parameters(params)
+        else:
+            require_single_wheel(params, f"call {caller_name} for one wheel after the other")
+            model = convert_model_argument(model).fallback_model  # valid for any start
+        options = convert_step_options(options)
+        options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
+        cycle = limit_cycle(params, model=model) if cycle is None else cycle
+        cycle_type: Any = HybridGait if is_own else AbstractCycle
+        check_type("cycle", cycle, cycle_type, "give vrw.limit_cycle(params, model=...)")
         if int(cycle.outcome) != Outcome.STEPPED:
             raise ValueError(
                 f"this wheel has no gait that could have a basin: {cycle.why} Take a wheel for "
                 "which vrw.limit_cycle finds a gait."
             )
-        spectral_radius = float(cycle.spectral_radius_value)
+        spectral_radius = float(cycle.spectral_radius if is_own else cycle.spectral_radius_value)
+        period_n = getattr(cycle, "period_n", 1)
         if not spectral_radius < 1.0:
             raise ValueError(
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable "
                 "and has no basin: take a wheel whose gait has a spectral radius below 1."
             )
         section_states = [np.asarray(cycle.section_state)[None]]
-        for _ in range(cycle.period_n):
-            section_states.append(
-                step_batch(
-                    params, section_states[-1], model=checked_model, options=checked_step_options
-                ).section_state
-            )
-        stable_gait = cls(
-            params, checked_model, checked_step_options, np.concatenate(section_states[:-1])
-        )
+        for _ in range(period_n):
+            steps = step_batch(params, section_states[-1], model=model, options=options)
+            section_states.append(steps.section_state)
+        stable_gait = cls(params, model, options, np.concatenate(section_states[:-1]))
         if not stable_gait.is_on_gait(section_states[-1])[0]:
             raise ValueError(
-                f"cycle does not repeat after {cycle.period_n} steps of this wheel with "
-                f"{type(checked_model).__name__}: give a cycle of the same wheel and model."
+                f"cycle does not repeat after {period_n} step{'s' * (period_n > 1)} with "
+                f"{type(model).__name__}: give a cycle of the same wheel and model."
             )
         return stable_gait
 
     def require_start_within_step(self, changes: str) -> None:
         """Raise a ValueError unless the gait has one step, within which its model can start."""
-        if not self.model.can_start_within_gait_step:
+        if not getattr(self.model, "can_start_within_gait_step", False):
             raise ValueError(
                 f"{type(self.model).__name__} cannot begin within a step, so that {changes} within "
                 "a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb "
@@ -388,15 +383,18 @@ class StableGait(NamedTuple):
         """Return whether each section state agrees with a section state of the gait, shape
         (states,).
 
-        Two states agree if their distance is at most `max_gait_distance`.
+        Two states agree if their distance is at most `MAX_ARRIVAL_DISTANCE`, in units of the wheel.
+        For a walker of the user, the unit is the largest section coordinate of the gait.
         """
-        state_units = self.model.collect_section_units(
-            compute_wheel_units(self.params.symbols()), self.params.n_legs
-        )
-        n_entries = self.model.count_continuous_section_entries(self.params)
-        state_differences = section_states[:, None, :n_entries] - self.section_states[:, :n_entries]
-        scaled_differences = state_differences / np.asarray(state_units)[:n_entries]
-        return np.abs(scaled_differences).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
+        if is_own_walker(self.model):
+            units, n_entries = np.abs(self.section_states).max() or 1.0, section_states.shape[1]
+        else:
+            wheel_units = compute_wheel_units(self.params.symbols())
+            n_entries = self.model.count_continuous_section_entries(self.params)
+            units = self.model.collect_section_units(wheel_units, self.params.n_legs)
+            units = np.asarray(units)[:n_entries]
+        differences = section_states[:, None, :n_entries] - self.section_states[:, :n_entries]
+        return np.abs(differences / units).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
 
 
 # Number of gait steps between two tests, chosen because more frequent tests need many calls.
@@ -413,17 +411,13 @@ def walk_until_on_gait(
     Return whether each walk arrives, its `Outcome` (STEPPED if it continues), and its number of
     gait steps up to arrival, failure or `max_steps`.
 
-    - `start_states`: section states before the first landing, shape (starts, components).
+    - `start_states`: section states, shape (starts, components).
     """
     n_starts = len(start_states)
     has_arrived = np.zeros(n_starts, bool)
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     n_steps_walked = np.zeros(n_starts, int)
-    embed_section_states: Any = jax.vmap(
-        functools.partial(stable_gait.model.complete_section_state, stable_gait.params)
-    )
-    walking_indices = np.arange(n_starts)
-    section_states = np.asarray(embed_section_states(jnp.asarray(start_states)))
+    walking_indices, section_states = np.arange(n_starts), start_states
     for first_step in range(0, max_steps, N_STEPS_PER_ARRIVAL_TEST):
         if not len(walking_indices):
             break
@@ -504,11 +498,11 @@ class BasinShare(AbstractPrintable):
 
 @announce_wait("gaits and walks", "20 s")
 def basin_share(
-    params: WheelParams,
+    params: Any,
     box: StartBox,
     *,
     model: ModelLike | None = None,
-    cycle: AbstractCycle | None = None,
+    cycle: Any = None,
     options: StepOptions | None = None,
     n_starts: int = 4096,
     max_steps: int = 200,
@@ -519,7 +513,8 @@ def basin_share(
 
     The starts are spread evenly over `box`. A walk arrives at the gait when its section state
     differs from that of the gait by less than 1e-6. The unit is that of the wheel
-    (`compute_wheel_units`). The gait must be stable, so that the walk stays on it.
+    (`compute_wheel_units`). For a walker of yours, it is the largest section coordinate of the
+    gait. The gait must be stable, so that the walk stays on it.
 
     The errors are standard errors of a binomial share. For the error, one start that arrives and
     one that does not are added. The error is therefore positive for a share of 0 or 1. The errors
@@ -527,14 +522,15 @@ def basin_share(
     errors.
 
     Args:
-        params: parameters of the wheel.
+        params: parameters of the wheel, or of a walker of yours.
         box: bounds (lower, upper) or a number for each of "theta_touchdown", "dtheta_touchdown" and
             "dL1_touchdown", in rad, rad/s, m/s; or for each of "theta_post_impact" and
             "dtheta_post_impact", in rad, rad/s. Starts to which no landing leads count as
-            BAD_INPUT.
+            BAD_INPUT. For a walker of yours, the names are those of its section coordinates.
         model: model of the wheel; by default that of the paper, `ViscoelasticWheel()`. "auto" means
-            unilateral contact, which is valid for all starts.
-        cycle: the gait; by default the result of `limit_cycle`.
+            unilateral contact, which is valid for all starts. A walker of yours may be given too.
+        cycle: the gait; by default the result of `limit_cycle`. For a walker of yours, a gait of
+            one step.
         options: numerical options of the gait steps.
         n_starts: number of starts, best a power of 2.
         max_steps: largest number of gait steps of a walk.
@@ -556,7 +552,7 @@ def basin_share(
     """
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
     check_choice("sampling", sampling, get_args(StartSamplingName))
-    seed, box_bounds = check_int("seed", seed, 0), parse_start_box(box)
+    seed, box_bounds = check_int("seed", seed, 0), parse_start_box(box, model)
     stable_gait = StableGait.from_cycle("vrw.basin_share", params, model, cycle, options)
     return compute_basin_share(stable_gait, box_bounds, n_starts, max_steps, sampling, seed)
 
@@ -585,8 +581,8 @@ def compute_basin_share(
         sobol_sampler = qmc.Sobol(n_start_components, rng=random_generator)
         unit_cube_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
     starts = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
-    start_states = compute_section_states_of_starts(
-        stable_gait.params, start_component_names, starts
+    start_states = embed_starts(
+        stable_gait.params, stable_gait.model, start_component_names, starts
     )
     is_on_gait, walk_outcomes, n_steps_walked = walk_until_on_gait(
         stable_gait, start_states, max_steps
@@ -621,14 +617,14 @@ def compute_share_error(sampled_share: Any, n_draws: int) -> Any:
     return (smoothed_share * (1.0 - smoothed_share) / n_draws) ** 0.5
 
 
-def parse_start_box(box: StartBox) -> StartBoxBounds:
+def parse_start_box(box: StartBox, model: Any) -> StartBoxBounds:
     """Return the names and bounds of the components of start states in `box`.
 
     Raise TypeError if the box is not a mapping. Raise ValueError unless the box bounds all
     components of one kind of start.
     """
     check_type("box", box, Mapping, "write {'theta_touchdown': 0.1, 'dtheta_touchdown': (1, 2)...}")
-    start_component_names = select_start_components("box", box, "a number or two bounds")
+    start_component_names = select_start_components(model, "box", box, "a number or two bounds")
     bounds_of_start_component = [
         (check_real(component_name, box[component_name]),) * 2
         if np.ndim(box[component_name]) == 0

@@ -269,7 +269,7 @@ def measure_basins(
     checked_model = convert_model_argument(model)
     checked_step_options = convert_step_options(options)
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
-    box_bounds = None if box is None else parse_start_box(box)
+    box_bounds = None if box is None else parse_start_box(box, checked_model)
     point_indices = _select_branch_points(branch, checked_model, n_points)
     can_start_within_gait_step = checked_model.can_start_within_gait_step
     variable_names = [
