@@ -76,6 +76,11 @@ def test_the_start_at_the_gait_adds_the_published_steps():
     assert abs(float(vrw.first_passage(BYL, 1.5 * DEGREE, model=RIGID).kappa_2) - 0.5) < 1e-4
 
 
+def test_a_compiled_function_of_the_unevenness_gives_the_published_steps():
+    compiled = jax.jit(lambda sd: vrw.first_passage(BYL, sd, model=RIGID).mean_steps_from_gait)
+    assert abs(float(compiled(2.5 * DEGREE)) - 412.534) < 5.1e-4  # half of the last digit
+
+
 def test_the_derivative_of_a_long_life_is_a_central_difference():
     def mean_steps(slope_sd):
         return vrw.first_passage(BYL, slope_sd, model=RIGID).mean_steps

@@ -552,15 +552,15 @@ def _solve_passage_by_quadrature(
             "RigidWheel has stop_at_lift_off=True, but the map in closed form has no lift-off: "
             "give vrw.RigidWheel(stop_at_lift_off=False)."
         )
+    has_heights, is_traced = sd_name == "height_sd", has_traced_leaf(params, ground_sd)
     if (
-        not has_traced_leaf(params)
+        not is_traced
         and not float(model.make_vertical_rate_map(params).compute_fixed_point(params.slope)) > 0
     ):
         raise ValueError(
             f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "
             "steeper one."
         )
-    has_heights, is_traced = sd_name == "height_sd", has_traced_leaf(params, ground_sd)
     relative_tolerance = relative_tolerance or (1e-6 if has_heights else 1e-8)
     solve_by_interpolation = functools.partial(
         solve_passage_by_interpolation, params, ground_sd, model, has_heights=has_heights
