@@ -21,12 +21,12 @@ from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point
 from vrw_jax.gaits.force_peaks import force_peaks
 from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles
-from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.margin_defaults import default_margins
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.sensitivity import sensitivities
+from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice

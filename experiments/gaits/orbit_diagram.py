@@ -19,7 +19,7 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax import plot as plots
 from vrw_jax.app._gait_figures import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
 from vrw_jax.app.figure_style import draw_markers, format_axis_label
-from vrw_jax.gaits.attractors import (
+from vrw_jax.gaits.gait_walks import (
     PeriodicWalkEnds,
     find_distinct_orbits,
     measure_orbit_steps,

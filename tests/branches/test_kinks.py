@@ -11,8 +11,7 @@ from vrw_jax.branches.arclength import (
     ArclengthOptions,
     NewtonStep,
 )
-from vrw_jax.branches.branch_location import continue_and_locate_special_points
-from vrw_jax.branches.jumps import find_state_jumps
+from vrw_jax.branches.branch_location import continue_and_locate_special_points, find_state_jumps
 from vrw_jax.branches.map_branch import MapContinuation
 
 TAN = float(np.tan(0.3))
@@ -35,9 +34,7 @@ def test_a_branch_passes_a_kink_at_which_no_step_is_short_enough(slope):
     """Its tangent turns there by 76 or 121 degrees; an option forbids more than 0.2 rad."""
     run = MapContinuation(Bent(slope), ArclengthOptions(), np.zeros(1), np.array([-1.0, 1.0]))
     begin = np.array([[-0.25]]), np.array([-0.5])
-    (strand,) = continue_and_locate_special_points(
-        run, *begin, np.array([True]), lambda owner, point: None
-    )
+    (strand,) = continue_and_locate_special_points(run, *begin, np.array([True]))
     p, x = np.asarray(strand.points.p), np.asarray(strand.points.z)[:, 0]
     assert p[[0, -1]].tolist() == [-1.0, 1.0]
     np.testing.assert_allclose(x, np.where(p < 0.0, 0.5 * p, slope * p), atol=1e-12)

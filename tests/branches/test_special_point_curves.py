@@ -19,7 +19,7 @@ from vrw_jax.branches.curve_problems import (
 )
 from vrw_jax.branches.map_branch import MapContinuation
 from vrw_jax.branches.special_point_curves import _check_parameter_plane, continue_special_points
-from vrw_jax.gaits.floquet import compute_bifurcation_margins
+from vrw_jax.gaits.floquet import list_jury_margins
 
 CURVE_OPTIONS = ArclengthOptions(max_points=400, max_ds=0.05)
 
@@ -50,7 +50,7 @@ def trace_curve(function, quantity, z, p, bounds, seconds, second):
     start = np.array([(second - seconds[0]) / (seconds[1] - seconds[0]), *z])
     run = MapContinuation(problem, CURVE_OPTIONS, np.zeros(1), np.array(bounds))
     (strand,) = continue_and_locate_special_points(
-        run, start[None], np.array([p]), np.array([True]), lambda owner, point: None
+        run, start[None], np.array([p]), np.array([True])
     )
     return strand.points.p, problem.compute_second_parameter(strand.points.z), strand
 
@@ -83,7 +83,7 @@ def find_fixed_point(a, b):
 
 def compute_jury_margin(place):
     offset = FOLD_MARGIN_OFFSET if place == 0 else 0.0
-    return lambda jacobian, x, p: compute_bifurcation_margins(jacobian)[place] - offset
+    return lambda jacobian, x, p: list_jury_margins(jacobian)[place] - offset
 
 
 def test_period_doublings_of_henon_are_on_their_parabola():

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.branches.special_point_map import (
+from vrw_jax.branches.special_point_curves import (
     SPECIAL_POINT_MEASURES,
     find_sign_changes_in_scan,
     find_unexplained_sign_changes,

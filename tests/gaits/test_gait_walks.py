@@ -27,7 +27,12 @@ def walk_by_linear_map(monkeypatch, multiplier, last_step=10**9):
         return end_states, np.full(len(states), int(outcome))
 
     monkeypatch.setattr(gait_walks, "_simulate_wheel_walks", take_steps)
-    finder = SimpleNamespace(model=vrw.ViscoelasticWheel(), n_legs=8, period_n=1)
+    finder = SimpleNamespace(
+        model=vrw.ViscoelasticWheel(),
+        n_legs=8,
+        period_n=1,
+        complete_section_states=lambda values, states: states,
+    )
     values = np.asarray(vrw.ViscoelasticWheel().collect_parameter_values(vrw.WheelParams()))[None]
     starts = (FIXED_POINT + 0.01 * np.ones(N_COORDINATES))[None, None]
     return gait_walks.walk_to_gaits(finder, values, lambda params: starts)

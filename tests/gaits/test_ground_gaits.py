@@ -14,9 +14,9 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.branches.arclength import ArclengthOptions
+from vrw_jax.branches.test_functions import evaluate_bifurcations
 from vrw_jax.gaits import unilateral_finder as on_ground
 from vrw_jax.gaits.floquet import (
-    compute_bifurcation_margins,
     compute_jury_margins,
     floquet_multipliers,
 )
@@ -116,7 +116,7 @@ def test_bifurcations_of_larger_maps_are_those_of_the_small_map_inside():
     small = np.array([[0.4, 0.9, 0.1], [-0.7, 0.3, 0.2], [0.1, 0.0, -0.6]])
     large = np.zeros((7, 7))
     large[2:5, 2:5] = small
-    solution = compute_bifurcation_margins(jnp.asarray(large))
+    solution = np.ravel(list(evaluate_bifurcations(large[None]).values()))
     np.testing.assert_allclose(solution, compute_jury_margins(jnp.asarray(small))[:3], atol=1e-12)
     three = np.asarray(floquet_multipliers(jnp.asarray(large)))[:3]
     exact = np.asarray(floquet_multipliers(jnp.asarray(small)))

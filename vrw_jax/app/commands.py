@@ -39,7 +39,7 @@ from vrw_jax.base.progress import PROGRESS_VARIABLE
 from vrw_jax.base.start import start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.continuation import continue_branch
-from vrw_jax.branches.special_point_map import SPECIAL_POINT_MEASURES
+from vrw_jax.branches.special_point_curves import SPECIAL_POINT_MEASURES
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.gait_search import limit_cycle, resolve_model_with_reason
 from vrw_jax.lanes.disk_cache import find_library_version

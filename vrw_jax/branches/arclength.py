@@ -150,6 +150,12 @@ class ContinuationPoint(NamedTuple):
     return_map_jacobian: np.ndarray
     is_admissible: Any
 
+    def reverse(self) -> "ContinuationPoint":
+        """Return the point with the rates in the opposite direction."""
+        return self._replace(
+            arclength_tangent=-self.arclength_tangent, fraction_rate=-self.fraction_rate
+        )
+
 
 class Track(NamedTuple):
     """Points of a branch in one direction, and why the continuation ended."""

@@ -7,9 +7,11 @@ Special points are therefore as accurate as the gaits.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,32 +30,40 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import is_own_walker
-from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
-from vrw_jax.branches.branch import Branch, SpecialPoint
-from vrw_jax.branches.branch_location import (
+from vrw_jax.branches.abstract_continuation import (
     BORDER_COLLISION,
     EVENT_ORDER,
     EVENT_ORDER_CHANGE,
     AbstractContinuation,
-    BranchData,
     PointTable,
     QuantitiesByName,
-    continue_and_locate_special_points,
 )
-from vrw_jax.branches.branch_starts import BranchRequest, find_branch_starts
-from vrw_jax.branches.continuation_problems import FRICTION_SURPLUS, BranchWheel
-from vrw_jax.branches.hybrid_branch import continue_hybrid_branch
-from vrw_jax.branches.map_branch import check_arclength_options, make_stability_variables
+from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
+from vrw_jax.branches.branch import Branch, SpecialPoint
+from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
+from vrw_jax.branches.continuation_problems import (
+    FRICTION_SURPLUS,
+    AbstractGaitProblem,
+    BranchWheel,
+    CollocationProblem,
+    ContactGaitProblem,
+    ReturnMapProblem,
+)
+from vrw_jax.branches.map_branch import (
+    check_arclength_options,
+    continue_hybrid_branch,
+    make_stability_variables,
+)
 from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
+from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.gait_search import resolve_model
-from vrw_jax.gaits.hybrid_gait import HybridGait
-from vrw_jax.gaits.limit_cycle_result import LimitCycle
+from vrw_jax.gaits.gait_search import limit_cycles, resolve_model
+from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
+from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import (
     FORCE_PEAK_MEASURES,
     MARGIN_MEASURES,
@@ -70,8 +80,149 @@ from vrw_jax.models.stepping import (
     convert_model_argument,
     convert_step_options,
     require_single_wheel,
+    start_walk_toward_gait,
 )
 from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, check_parameter_name
+
+
+class BranchStart(NamedTuple):
+    """First gaits of branches, and the wheels and equations of the continuation."""
+
+    problem: AbstractGaitProblem
+    wheels: BranchWheel
+    z: np.ndarray
+    outcomes: np.ndarray  # outcomes of the first gaits
+    # function of (wheel index, point) that returns a function, which finds the gait at the point
+    make_cycle_finder: Callable | None = None
+    cycles: Any = None  # the first gaits
+    # None for a problem without a mesh
+    finer_cycle_options: CycleOptions | None = None
+
+
+def find_branch_starts(
+    params: WheelParams,
+    parameter_values: Array,
+    cycle: Any,
+    cycle_options: CycleOptions | None,
+    problem_fields: Mapping[str, Any],
+) -> BranchStart:
+    """Return the starts of branches of any model.
+
+    If no start gaits are given, each branch with unilateral contact starts from the slowest
+    attracting gait, and that of another return map from the last state of a walk.
+
+    - `params`: wheels with one leading axis;
+    - `parameter_values`: values of the continued parameter at the starts;
+    - `problem_fields`: fields of an `AbstractGaitProblem`.
+    """
+    model, n_legs, step_options = (
+        problem_fields[name] for name in ("model", "n_legs", "step_options")
+    )
+    gait_finder: Any = make_finder(
+        model, n_legs, step_options=step_options, period_n=problem_fields["period_n"]
+    )
+    if gait_finder.supports_cold_start:
+        return _find_collocation_starts(params, cycle, cycle_options, problem_fields)
+    wheels = BranchWheel(model.collect_batch_parameter_values(params))
+    problem_class = ContactGaitProblem if gait_finder.is_multistable else ReturnMapProblem
+    n_coordinates = model.count_continuous_section_entries(params)
+    problem = problem_class(**problem_fields, n_coordinates=n_coordinates)
+
+    def walk_to_gait(params: WheelParams, p: Array) -> tuple[Array, Array]:
+        model_at_p, params = model.with_parameter(params, problem.parameter_name, p)
+        walk = start_walk_toward_gait(model_at_p, params, step_options)
+        return walk.steps.section_state[-1], walk.outcome
+
+    if cycle is None and gait_finder.is_multistable:
+        values = problem.replace_parameter(wheels, parameter_values)
+        cycle = gait_finder.find_cycles_near(
+            values, gait_finder.make_initial_guesses(jnp.asarray(values))
+        )
+    if cycle is None:
+        z, outcomes = jax.vmap(walk_to_gait)(params, parameter_values)
+    else:
+        z, outcomes = cycle.section_state, cycle.outcome
+    return BranchStart(problem, wheels, np.asarray(z), np.asarray(outcomes))
+
+
+def find_special_cycle(
+    gait_finder: Any, parameter_name: str, params: WheelParams, guess: CollocationState, p: float
+) -> LimitCycle:
+    """Find the limit cycle at a special point, from the collocation state at the point next to it.
+
+    - `gait_finder`: finder of the branch's gaits;
+    - `parameter_name`: name of the continued parameter;
+    - `params`: wheel at the start of the branch.
+    """
+    params, guess, p = jax.device_put((params, guess, p))
+    _, params = gait_finder.model.with_parameter(params, parameter_name, p)
+    return gait_finder.find_cycle(params, guess)
+
+
+def _find_collocation_starts(
+    params: WheelParams,
+    cycle: Any,
+    cycle_options: CycleOptions | None,
+    problem_fields: Mapping[str, Any],
+) -> BranchStart:
+    """Return the starts of branches that are continued by collocation.
+
+    If `cycle` is None, the limit cycles at the starts are searched for. Without cycle options, the
+    mesh of the branch is not coarser than that of the limit cycles.
+    """
+    model, period_n = problem_fields["model"], problem_fields["period_n"]
+    if cycle is None:
+        cycle = limit_cycles(params, period_n=period_n, model=model)
+    if not isinstance(cycle, LimitCycle):
+        raise TypeError(
+            f"cycle is a {type(cycle).__name__}, but the paper's branch starts from a "
+            "LimitCycle: give vrw.limit_cycle(params)."
+        )
+    if cycle_options is None:
+        # The start may have a coarser mesh and larger errors than the branch.
+        tight = CycleOptions.tight()
+        meshes = tight.mesh_intervals, cycle.system.cycle_options.mesh_intervals
+        n_dls_intervals, n_sls1_intervals, n_sls2_intervals = map(max, *meshes)
+        cycle_options = dataclasses.replace(
+            tight, mesh_intervals=(n_dls_intervals, n_sls1_intervals, n_sls2_intervals)
+        )
+    gait_finder: Any = make_finder(
+        model, params.n_legs, period_n=period_n, cycle_options=cycle_options
+    )
+    system = gait_finder.collocation_system
+    transfer_to_mesh = functools.partial(transfer_solution_to_mesh, cycle.system, system)
+    solution = jax.vmap(transfer_to_mesh)(cycle.collocation_state.solution)
+    problem = CollocationProblem(
+        **problem_fields,
+        collocation_system=system,
+        shapes=tuple(x.shape[1:] for x in jax.tree.leaves(solution)),
+    )
+
+    def make_cycle_finder(wheel_index: int, point: ContinuationPoint) -> Callable[[], LimitCycle]:
+        wheel, state = select_tree_rows((params, cycle.collocation_state), wheel_index)
+        # A partial call can be pickled.
+        return functools.partial(
+            find_special_cycle,
+            gait_finder,
+            problem.parameter_name,
+            wheel,
+            state._replace(solution=problem.unpack(point.z)),
+            float(point.p),
+        )
+
+    return BranchStart(
+        problem,
+        BranchWheel(
+            model.collect_batch_parameter_values(params),
+            np.asarray(cycle.collocation_state.is_phase_active),
+        ),
+        problem.pack(solution),
+        np.asarray(cycle.outcome),
+        make_cycle_finder,
+        cycle,
+        cycle_options.refine_mesh(),
+    )
+
 
 DOUBLE_SUPPORT_INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
 BRANCH_ENDING_QUANTITIES = (
@@ -114,6 +265,8 @@ DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 """Advice in the error message for a caller who differentiates a branch."""
 
 
+# Largest number of mesh refinements of a gait on a branch or a curve.
+MAX_BRANCH_MESH_REFINEMENTS = 3
 # Largest relative change of period and step length at a jump of the section state within one
 # branch. The value is chosen because a change in the order of two impacts changes period and step
 # length by 1e-4.
@@ -134,6 +287,8 @@ def split_legs(quantities: QuantitiesByName, n_legs: int) -> QuantitiesByName:
 class GaitContinuation(AbstractContinuation):
     """Continuation of gaits."""
 
+    cycle_finder: Callable | None  # see `BranchStart.make_cycle_finder`
+
     test_functions: ClassVar[Mapping[str, TestFunction]] = GAIT_TEST_FUNCTIONS
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = {
         "clearance_sls1": "takeoff_acceleration"
@@ -144,6 +299,9 @@ class GaitContinuation(AbstractContinuation):
     A foot that takes off less steeply descends less deeply, until it rises immediately. A solver
     cannot resolve the shallowest descents, but the linear quantity changes its sign.
     """
+
+    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable | None:
+        return self.cycle_finder and self.cycle_finder(owner, point)
 
     def evaluate_point_quantities(
         self, wheels: BranchWheel, points: ContinuationPoint
@@ -280,7 +438,7 @@ def continue_branches(
     *,
     cycle: LimitCycle | ReturnMapCycle | None = None,
     period_n: int = 1,
-    model: AbstractWheel | None = None,
+    model: Any = None,
     options: ArclengthOptions | None = None,
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
@@ -322,131 +480,127 @@ def continue_branches(
         convert_model_argument(model),
         convert_step_options(step_options or StepOptions.tight()),
     )
+    params = model.attach_laws(params)
+    problem_fields = {
+        "model": model,
+        "step_options": step_options,
+        "n_legs": params.n_legs,
+        "parameter_name": name,
+        "period_n": period_n,
+        "measures_force_peaks": force_peaks,
+    }
+    n_wheels = _check_branches(params, cycle, cycle_options, **problem_fields)
+    limits, options = np.array(check_range("bounds", bounds)), check_arclength_options(options)
+    if n_wheels == 0:
+        return ()
+    # The batch is padded to a power of two, because each size compiles programs.
+    indices = np.minimum(np.arange(1 << (n_wheels - 1).bit_length()), n_wheels - 1)
+    pad = lambda x: np.broadcast_to(np.asarray(x), (n_wheels,))[indices]
+    parameter_values = np.clip(pad(model.get_parameter(params, name)), *limits)
+    params, parameter_values = jax.device_put((jax.tree.map(pad, params), parameter_values))
+    if isinstance(cycle, AbstractCycle) and len(indices) > n_wheels:
+        cycle = jax.device_put(select_tree_rows(cycle, indices))
+    if name != FRICTION_NAME:
+        _, params = model.with_parameter(params, name, parameter_values)
+    start_outcomes, branch_data = _continue_gait_branches(
+        params, parameter_values, cycle, cycle_options, problem_fields, options, limits, n_wheels
+    )
+    return tuple(
+        _make_labeled_gait_branch(
+            data, jax.device_put(select_tree_rows(params, i)), name, model, step_options, outcome
+        )
+        for i, (data, outcome) in enumerate(
+            zip(branch_data[:n_wheels], start_outcomes.tolist(), strict=False)
+        )
+    )
+
+
+def _check_branches(
+    params: WheelParams,
+    cycle: Any,
+    cycle_options: CycleOptions | None,
+    *,
+    model: Any,
+    parameter_name: str,
+    period_n: int,
+    step_options: StepOptions,
+    measures_force_peaks: bool,
+    n_legs: int,
+) -> int:
+    """Return the number of wheels, or raise an error if an argument is invalid."""
     if model.fallback_model is not model:
         raise TypeError(
             "the ladder can't be followed, since its gaits jump where the model changes: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
-    check_parameter_name(name, model.parameter_names, "parameter")
-    params = model.attach_laws(params)
+    check_parameter_name(parameter_name, model.parameter_names, "parameter")
     if check_int("period_n", period_n) > model.leg_period and cycle is None:
         raise ValueError(
             f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
             "many beside the gait of one step: give cycle=vrw.limit_cycle(..., guess=...)."
         )
-    (lower_bound, upper_bound), options = (
-        check_range("bounds", bounds),
-        check_arclength_options(options),
-    )
     gait_finder = make_finder(
-        model,
-        params.n_legs,
-        period_n=period_n,
-        cycle_options=cycle_options,
-        step_options=step_options,
+        model, n_legs, period_n=period_n, cycle_options=cycle_options, step_options=step_options
     )
     has_force_peaks = FORCE_PEAK_MEASURES.keys() <= set(gait_finder.differentiable_measures)
-    if check_bool("force_peaks", force_peaks) and not has_force_peaks:
+    if check_bool("force_peaks", measures_force_peaks) and not has_force_peaks:
         raise ValueError(
             f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
             "the force: take vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
-    batch_shape = np.broadcast_shapes(
-        *(parameter_values_of_field.shape for parameter_values_of_field in jax.tree.leaves(params))
-    )
+    batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))
     if len(batch_shape) != 1:
         raise ValueError(f"the wheels' batch has shape {batch_shape}, but it must have one axis.")
-    (n_wheels,) = batch_shape
-    if n_wheels == 0:
-        return ()
-    # The batch is padded to a power of two, because each size compiles programs.
-    padded_batch_size = 1 << (n_wheels - 1).bit_length()
-    wheel_indices = np.minimum(np.arange(padded_batch_size), n_wheels - 1)
-    batch_padder = lambda parameter_values_of_field: np.broadcast_to(
-        np.asarray(parameter_values_of_field), batch_shape
-    )[wheel_indices]
-    start_parameter_values = batch_padder(model.get_parameter(params, name))
-    params, parameter_values = jax.device_put(
-        (
-            jax.tree.map(batch_padder, params),
-            np.clip(start_parameter_values, lower_bound, upper_bound),
-        )
-    )
-    if isinstance(cycle, AbstractCycle) and padded_batch_size > n_wheels:
-        cycle = jax.device_put(select_tree_rows(cycle, wheel_indices))
-    if name != FRICTION_NAME:
-        _, params = model.with_parameter(params, name, parameter_values)
-    branch_request = BranchRequest(
-        params, model, name, parameter_values, period_n, cycle_options, step_options, force_peaks
-    )
-    start_outcomes, branch_data = _continue_gait_branches(
-        branch_request, cycle, options, np.array([lower_bound, upper_bound]), n_wheels
-    )
-    return tuple(
-        _make_labeled_gait_branch(
-            branch_data[wheel_index],
-            jax.device_put(select_tree_rows(params, wheel_index)),
-            name,
-            model,
-            step_options,
-            int(start_outcomes[wheel_index]),
-        )
-        for wheel_index in range(n_wheels)
-    )
-
-
-# Largest number of mesh refinements of a gait on a branch or a curve.
-MAX_BRANCH_MESH_REFINEMENTS = 3
+    return batch_shape[0]
 
 
 def _continue_gait_branches(
-    branch_request: BranchRequest,
-    start_cycle: Any,
-    arclength_options: ArclengthOptions,
-    parameter_bounds: np.ndarray,
+    params: WheelParams,
+    parameter_values: Array,
+    cycle: Any,
+    cycle_options: CycleOptions | None,
+    problem_fields: Mapping[str, Any],
+    options: ArclengthOptions,
+    bounds: np.ndarray,
     n_wheels: int,
 ) -> tuple[np.ndarray, list[BranchData | None]]:
     """Continue the branches of the first `n_wheels` wheels from their start gaits.
 
     Return the outcomes of the starts, and the data of the branches. Any further wheels only pad the
-    batch. The mesh is that of the cycle options. Without cycle options the mesh is refined until it
-    limits no branch.
+    batch. See `find_branch_starts`.
     """
-    can_refine_mesh = branch_request.cycle_options is None
-    for refinement_index in range(1 + MAX_BRANCH_MESH_REFINEMENTS):
-        branch_start = find_branch_starts(branch_request, start_cycle)
-        branch_continuation = GaitContinuation(
-            branch_start.continuation_problem,
-            arclength_options,
-            branch_start.wheels,
-            parameter_bounds,
-        )
-        has_branch_start = branch_start.start_outcomes == Outcome.STEPPED
-        has_branch_start &= np.arange(len(has_branch_start)) < n_wheels
+    can_refine_mesh = cycle_options is None
+    # Without cycle options, the mesh is refined until it limits no branch.
+    for n_refinements_left in range(MAX_BRANCH_MESH_REFINEMENTS, -1, -1):
+        start = find_branch_starts(params, parameter_values, cycle, cycle_options, problem_fields)
         is_finest_mesh = (
-            not can_refine_mesh
-            or branch_start.finer_cycle_options is None
-            or refinement_index == MAX_BRANCH_MESH_REFINEMENTS
+            not can_refine_mesh or start.finer_cycle_options is None or not n_refinements_left
         )
-        branch_data_by_wheel = continue_and_locate_special_points(
-            branch_continuation,
-            branch_start.start_unknowns,
-            np.asarray(branch_request.parameter_values),
-            has_branch_start,
-            branch_start.make_cycle_finder,
+        has_start = start.outcomes == Outcome.STEPPED
+        has_start &= np.arange(len(has_start)) < n_wheels
+        branch_data = continue_and_locate_special_points(
+            GaitContinuation(
+                start.problem,
+                options,
+                start.wheels,
+                bounds,
+                start.make_cycle_finder,
+            ),
+            start.z,
+            np.asarray(parameter_values),
+            has_start,
             is_finest_mesh,
         )
         # If a gait exists but no branch starts from it, its step does not repeat on this mesh.
         needs_finer_mesh = (
-            gait_exists if branch_data is None else branch_data.is_mesh_limited
-            for gait_exists, branch_data in zip(has_branch_start, branch_data_by_wheel, strict=True)
+            gait_exists if data is None else data.is_mesh_limited
+            for gait_exists, data in zip(has_start, branch_data, strict=True)
         )
         if is_finest_mesh or not any(needs_finer_mesh):
             break
-        branch_request = branch_request._replace(cycle_options=branch_start.finer_cycle_options)
-        start_cycle = branch_start.start_cycles
-    return branch_start.start_outcomes, branch_data_by_wheel
+        cycle_options, cycle = start.finer_cycle_options, start.cycles
+    return start.outcomes, branch_data
 
 
 MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
@@ -457,7 +611,7 @@ def _make_labeled_gait_branch(
     branch_data: BranchData | None,
     params: WheelParams,
     parameter_name: str,
-    model: AbstractWheel,
+    model: Any,
     step_options: StepOptions,
     start_outcome: int,
 ) -> Branch:

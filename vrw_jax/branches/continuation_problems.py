@@ -22,8 +22,8 @@ from jaxtyping import Array
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.branches.abstract_continuation import EVENT_ORDER, QuantitiesByName
 from vrw_jax.branches.arclength import AbstractContinuationProblem, ContinuationPoint, NewtonStep
-from vrw_jax.branches.branch_location import EVENT_ORDER, QuantitiesByName
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.force_peaks import locate_force_peaks
 from vrw_jax.gaits.phase_collocation import CollocationSolution
@@ -32,7 +32,6 @@ from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_numpy_batches
 from vrw_jax.lanes.lane_function import compile_batch_function
-from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
 from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.wheel.params import FRICTION_NAME
@@ -137,7 +136,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
     class defines others.
     """
 
-    model: AbstractWheel
+    model: Any
     step_options: StepOptions
     n_legs: int
     parameter_name: str
@@ -408,7 +407,7 @@ class ReturnMapProblem(AbstractGaitProblem, AbstractStateProblem):
 
 
 def _advance_period(
-    model: AbstractWheel,
+    model: Any,
     options: StepOptions,
     n_legs: int,
     period_n: int,
@@ -440,9 +439,8 @@ class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
         n, is_continued = self.n_coordinates, np.arange(wheels.values.shape[1])
         is_continued = is_continued == self.parameter_index
         period = self._evaluate_period(self.replace_parameter(wheels, p), z, is_continued)
-        defects = period.end_states - z
-        defects[~period.is_period_complete] = np.nan
-        jacobian = period.return_map_jacobian[:, :n, :n]
+        defects, jacobian = period.defects, period.return_map_jacobian[:, :n, :n]
+        defects[~period.is_complete] = np.nan
         right_sides = np.concatenate(
             [defects[:, :n, None], period.parameter_jacobian[:, :n, is_continued]], -1
         )
@@ -455,7 +453,7 @@ class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
         )
 
     def take_steps(self, values: np.ndarray, states: np.ndarray) -> Any:
-        evaluate = lambda *rows: self._evaluate_period(*rows, False, False).gait_steps_of_period
+        evaluate = lambda *rows: self._evaluate_period(*rows, False, False).gait_steps
         return map_in_numpy_batches(evaluate, batch_sizes.LOCATION_BATCH_SIZES, values, states)
 
     def measure_steps(
@@ -497,7 +495,7 @@ class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
 @eqx.filter_jit
 @eqx.filter_vmap(in_axes=(None, None, None, 0, 0, 0))
 def _measure_contact_force_peaks(
-    model: AbstractWheel,
+    model: Any,
     n_legs: int,
     options: StepOptions,
     values: Array,
@@ -542,26 +540,20 @@ def _combine_period_measures(step_results: AbstractStep, section_states: Array) 
     `closure` is the largest change of the section state over the period.
     """
     step_measures = jax.vmap(lambda step_result: step_result.measures())(step_results)
-    period_measures = {}
-    for measure_name, values_by_step in step_measures.items():
-        if measure_name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or measure_name.startswith(
-            "lambda_"
-        ):
-            period_measures[measure_name] = jnp.min(values_by_step, 0)
-        elif measure_name.endswith("_touchdown"):
-            period_measures[measure_name] = values_by_step[-1]
-        elif measure_name.endswith("_post_impact"):
-            period_measures[measure_name] = values_by_step[0]
-        elif measure_name == "outcome":
-            period_measures[measure_name] = values_by_step[
-                jnp.argmax(values_by_step != Outcome.STEPPED)
-            ]
-        elif MEASURES[measure_name].is_averaged_over_steps:
-            period_measures[measure_name] = jnp.mean(values_by_step, 0)
-        elif MEASURES[measure_name].is_largest_over_steps:
-            period_measures[measure_name] = jnp.max(values_by_step, 0)
-        else:
-            period_measures[measure_name] = jnp.sum(values_by_step, 0)
+    first_failure = jnp.argmax(step_measures["outcome"] != Outcome.STEPPED)
+
+    def combine(name: str, values: Array) -> Array:
+        margins = MARGIN_MEASURES | STOPPER_MARGIN_MEASURES
+        if name in margins or name.startswith("lambda_"):
+            return jnp.min(values, 0)
+        for suffix, index in (("_touchdown", -1), ("_post_impact", 0), ("outcome", first_failure)):
+            if name.endswith(suffix):
+                return values[index]
+        if MEASURES[name].is_averaged_over_steps:
+            return jnp.mean(values, 0)
+        return (jnp.max if MEASURES[name].is_largest_over_steps else jnp.sum)(values, 0)
+
+    period_measures = {name: combine(name, values) for name, values in step_measures.items()}
     positive_period = jnp.where(period_measures["period"] > 0.0, period_measures["period"], 1.0)
     period_measures["dls_fraction"] = period_measures["duration_dls"] / positive_period
     period_measures["speed"] = period_measures["step_length"] / positive_period

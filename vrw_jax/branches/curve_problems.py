@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from vrw_jax.branches.abstract_continuation import QuantitiesByName
 from vrw_jax.branches.arclength import (
     AbstractContinuationProblem,
     ContinuationPoint,
     NewtonStep,
 )
-from vrw_jax.branches.branch_location import QuantitiesByName
 from vrw_jax.branches.continuation import (
     DOUBLE_SUPPORT_INDICATOR_NAMES,
     SECOND_PEAK_RATE_NAME,

@@ -19,14 +19,10 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.branches.abstract_continuation import AbstractContinuation, QuantitiesByName
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
-from vrw_jax.branches.branch_location import (
-    AbstractContinuation,
-    BranchData,
-    QuantitiesByName,
-    continue_and_locate_special_points,
-)
+from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation import (
     GAIT_TEST_FUNCTIONS,
     MAX_BRANCH_MESH_REFINEMENTS,
@@ -83,6 +79,9 @@ class CurveContinuation(AbstractContinuation):
         INITIAL_FORCE_FALL_NAME: TestFunction("lost", "The force begins to rise.", True),
     }
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
+
+    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable:
+        return lambda: point
 
     def evaluate_point_quantities(
         self, wheels: CurveWheel, points: ContinuationPoint
@@ -152,6 +151,13 @@ class CurveSeed(NamedTuple):
     branch_wheel: BranchWheel
     z: CollocationSolution
 
+    def transfer(self, system: CollocationSystem) -> "CurveSeed":
+        """Return the seed on the mesh of another system."""
+        if self.collocation_system == system:
+            return self
+        z = transfer_solution_to_mesh(self.collocation_system, system, self.z)
+        return self._replace(collocation_system=system, z=jax.tree.map(np.asarray, z))
+
 
 # Largest distance from a curve, in arc length, at which a point is treated as a point of the curve.
 MAX_DISTANCE_ON_SAME_CURVE = 2e-3
@@ -176,6 +182,11 @@ class TracedCurve(NamedTuple):
         distances = compute_distances_to_polyline(scaled_points, self.scaled_vertices)
         return bool(np.max(distances) < MAX_DISTANCE_ON_SAME_CURVE)
 
+    def is_on_any(self, curves: Iterable["TracedCurve"]) -> bool:
+        """Return whether this curve is one of several curves, or a part of it."""
+        name = self.special_point_curve.name
+        return any(curve.contains_points(name, self.scaled_vertices) for curve in curves)
+
 
 # Arc length beyond a point of codimension two at which the continuation of the second curve through
 # that point starts.
@@ -195,13 +206,8 @@ class CurveTracer(NamedTuple):
     model: ViscoelasticWheel
     arclength_options: ArclengthOptions
     step_options: StepOptions
-    stage_reporter: Callable[[str], None] | None = None
+    report_stage: Callable[[str], Any] | None = None
     measures_force_peaks: bool = False  # whether branches measure the peaks of the gait's force
-
-    def report_stage(self, stage_description: str) -> None:
-        """Pass a description of the next stage to `stage_reporter`, unless it is None."""
-        if self.stage_reporter is not None:
-            self.stage_reporter(stage_description)
 
     def with_parameters(
         self, params: WheelParams, parameter_values: Iterable[float]
@@ -210,9 +216,10 @@ class CurveTracer(NamedTuple):
         get_values = lambda params: [getattr(params, name) for name in self.parameter_names]
         return eqx.tree_at(get_values, params, [jnp.asarray(value) for value in parameter_values])
 
-    def compute_parameter_fractions(self, parameter_values: np.ndarray) -> np.ndarray:
+    def compute_parameter_fractions(self, parameter_values: Any) -> np.ndarray:
         """Return the two parameters as fractions of their ranges, on the last axis."""
-        return (parameter_values - self.parameter_ranges[:, 0]) / np.ptp(self.parameter_ranges, 1)
+        lower_bounds = self.parameter_ranges[:, 0]
+        return (np.asarray(parameter_values) - lower_bounds) / np.ptp(self.parameter_ranges, 1)
 
     def find_seeds(
         self, parameter_index: int, params: WheelParams, start_cycles: LimitCycle | None = None
@@ -224,7 +231,8 @@ class CurveTracer(NamedTuple):
         """
         parameter_name = self.parameter_names[parameter_index]
         lower_bound, upper_bound = self.parameter_ranges[parameter_index]
-        self.report_stage(f"following {len(params.damping)} branches along {parameter_name}")
+        if self.report_stage:
+            self.report_stage(f"following {len(params.damping)} branches along {parameter_name}")
         branches = continue_branches(
             params,
             parameter_name,
@@ -233,83 +241,50 @@ class CurveTracer(NamedTuple):
             model=self.model,
             force_peaks=self.measures_force_peaks,
         )
-        curve_seeds = []
+        seeds = []
         for special_point in itertools.chain(*(branch.special_points for branch in branches)):
             if not can_continue_special_point(special_point.name):
                 continue
-            limit_cycle = special_point.cycle
+            cycle = special_point.cycle
             parameters, state = jax.tree.map(
-                np.asarray, (limit_cycle.parameters, limit_cycle.collocation_state)
+                np.asarray, (cycle.parameters, cycle.collocation_state)
             )
             branch_wheel, z = BranchWheel(parameters, state.is_phase_active), state.solution
-            curve_seeds.append(
-                CurveSeed(
-                    choose_continued_special_point_name(special_point.name, branch_wheel, z),
-                    tuple(
-                        float(parameters[self.model.parameter_names.index(name)])
-                        for name in self.parameter_names
-                    ),
-                    limit_cycle.system,
-                    branch_wheel,
-                    z,
-                )
-            )
-        return curve_seeds
+            name = choose_continued_special_point_name(special_point.name, branch_wheel, z)
+            indices = map(self.model.parameter_names.index, self.parameter_names)
+            values = tuple(float(parameters[index]) for index in indices)
+            seeds.append(CurveSeed(name, values, cycle.system, branch_wheel, z))
+        return seeds
 
     def trace_curves(
         self, curve_seeds: Sequence[CurveSeed], known_curves: Sequence[TracedCurve]
     ) -> list[TracedCurve]:
         """Trace the curves through all seeds that lie on no known curve."""
-        new_curves: list[TracedCurve] = []
+        curves = list(known_curves)
         seeds_by_group: dict[tuple[str, ...], list[CurveSeed]] = {}
-        for curve_seed in curve_seeds:
-            if not any(self._is_on_curve(curve_seed, known_curve) for known_curve in known_curves):
-                quantity_group = find_test_quantity_group(
-                    curve_seed.special_point_name, curve_seed.collocation_system.n_legs
-                )
-                seeds_by_group.setdefault(quantity_group, []).append(curve_seed)
-        for quantity_group in sorted(seeds_by_group):
-            remaining_seeds = seeds_by_group[quantity_group]
-            while remaining_seeds:
+        for seed in curve_seeds:
+            group = find_test_quantity_group(
+                seed.special_point_name, seed.collocation_system.n_legs
+            )
+            seeds_by_group.setdefault(group, []).append(seed)
+        for group in sorted(seeds_by_group):
+            remaining = seeds_by_group[group]
+            while remaining := [seed for seed in remaining if not self._is_on_any(seed, curves)]:
                 # A batch has one seed per name, because seeds of one name may lie on one curve.
-                first_seed_by_name: dict[str, CurveSeed] = {}
-                for curve_seed in remaining_seeds:
-                    first_seed_by_name.setdefault(curve_seed.special_point_name, curve_seed)
-                batch_seeds = [*first_seed_by_name.values()][: batch_sizes.CURVE_BATCH_SIZE]
-                for candidate_curve in self._trace_curves_of_batch(quantity_group, batch_seeds):
-                    if not any(
-                        self.are_same_curve(candidate_curve, compared_curve)
-                        for compared_curve in (*known_curves, *new_curves)
-                    ):
-                        new_curves.append(candidate_curve)
-                remaining_seeds = [
-                    curve_seed
-                    for curve_seed in remaining_seeds
-                    if not any(curve_seed is batch_seed for batch_seed in batch_seeds)
-                    and not any(
-                        self._is_on_curve(curve_seed, new_curve) for new_curve in new_curves
-                    )
-                ]
-        return new_curves
+                first_by_name = {seed.special_point_name: seed for seed in reversed(remaining)}
+                names = dict.fromkeys(seed.special_point_name for seed in remaining)
+                batch = [first_by_name[name] for name in names][: batch_sizes.CURVE_BATCH_SIZE]
+                for curve in self._trace_curves_of_batch(group, batch):
+                    if not curve.is_on_any(curves):
+                        curves.append(curve)
+                remaining = [seed for seed in remaining if not any(seed is x for x in batch)]
+        return curves[len(known_curves) :]
 
-    def _is_on_curve(self, curve_seed: CurveSeed, traced_curve: TracedCurve) -> bool:
+    def _is_on_any(self, seed: CurveSeed, curves: Sequence[TracedCurve]) -> bool:
         """Return whether a seed lies on a curve of the same special point."""
-        seed_point = np.append(
-            curve_seed.z.section_state,
-            self.compute_parameter_fractions(np.array(curve_seed.parameter_values)),
-        )
-        return traced_curve.contains_points(curve_seed.special_point_name, seed_point[None])
-
-    @staticmethod
-    def are_same_curve(traced_curve: TracedCurve, compared_curve: TracedCurve) -> bool:
-        """Return whether two curves are the same curve.
-
-        The special points must have the same name, and all points of the first curve must lie on
-        the second curve.
-        """
-        return compared_curve.contains_points(
-            traced_curve.special_point_curve.name, traced_curve.scaled_vertices
-        )
+        fractions = self.compute_parameter_fractions(seed.parameter_values)
+        point = np.append(seed.z.section_state, fractions)[None]
+        return any(curve.contains_points(seed.special_point_name, point) for curve in curves)
 
     def _trace_curves_of_batch(
         self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed]
@@ -320,97 +295,64 @@ class CurveTracer(NamedTuple):
 
         - `quantity_group`: names of the quantities that are evaluated together.
         """
+        names = ", ".join(sorted({seed.special_point_name for seed in curve_seeds}))
+        if self.report_stage:
+            self.report_stage(f"following special points: {names}")
         traced_curves = []
-        special_point_names = ", ".join(
-            sorted({curve_seed.special_point_name for curve_seed in curve_seeds})
-        )
-        self.report_stage(f"following special points: {special_point_names}")
-        for refinement_index in range(1 + MAX_BRANCH_MESH_REFINEMENTS):
-            is_finest_mesh = refinement_index == MAX_BRANCH_MESH_REFINEMENTS
-            branch_data_by_seed, collocation_system = self._continue_curves_of_batch(
-                quantity_group, curve_seeds, is_finest_mesh
+        for n_refinements_left in range(MAX_BRANCH_MESH_REFINEMENTS, -1, -1):
+            # All curves are continued on the finest mesh that any of the seeds has.
+            system = max(
+                (seed.collocation_system for seed in curve_seeds),
+                key=lambda system: system.cycle_options.mesh_intervals,
             )
-            mesh_limited_seeds = []
-            for curve_seed, branch_data in zip(curve_seeds, branch_data_by_seed, strict=True):
-                if branch_data is not None and branch_data.is_mesh_limited and not is_finest_mesh:
-                    options = collocation_system.cycle_options.refine_mesh()
-                    mesh_limited_seeds.append(
-                        self._transfer_seed(
-                            curve_seed, collocation_system._replace(cycle_options=options)
-                        )
-                    )
-                elif branch_data is not None:
-                    traced_curves.append(
-                        self._make_traced_curve(
-                            curve_seed._replace(collocation_system=collocation_system), branch_data
-                        )
-                    )
-            if not mesh_limited_seeds:
+            curve_seeds = [seed.transfer(system) for seed in curve_seeds]
+            data_by_seed = self._continue_curves_of_batch(
+                quantity_group, curve_seeds, not n_refinements_left
+            )
+            options, coarse_seeds = system.cycle_options.refine_mesh(), []
+            for seed, data in zip(curve_seeds, data_by_seed, strict=False):
+                if data is not None and data.is_mesh_limited and n_refinements_left:
+                    coarse_seeds.append(seed.transfer(system._replace(cycle_options=options)))
+                elif data is not None:
+                    traced_curves.append(self._make_traced_curve(seed, data))
+            if not coarse_seeds:
                 break
-            curve_seeds = mesh_limited_seeds
+            curve_seeds = coarse_seeds
         return traced_curves
-
-    @staticmethod
-    def _transfer_seed(curve_seed: CurveSeed, collocation_system: CollocationSystem) -> CurveSeed:
-        if curve_seed.collocation_system == collocation_system:
-            return curve_seed
-        return curve_seed._replace(
-            collocation_system=collocation_system,
-            z=jax.tree.map(
-                np.asarray,
-                transfer_solution_to_mesh(
-                    curve_seed.collocation_system, collocation_system, curve_seed.z
-                ),
-            ),
-        )
 
     def _continue_curves_of_batch(
         self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed], is_finest_mesh: bool
-    ) -> tuple[list[BranchData | None], CollocationSystem]:
-        """Continue the curve through each seed, and return its data and the collocation system.
-
-        The collocation system has the finest mesh that any of the seeds has.
-        """
-        collocation_system = max(
-            (curve_seed.collocation_system for curve_seed in curve_seeds),
-            key=lambda collocation_system: collocation_system.cycle_options.mesh_intervals,
+    ) -> list[BranchData | None]:
+        """Continue the curve through each seed, and return its data; further entries are None."""
+        n_padding = -len(curve_seeds) % batch_sizes.CURVE_BATCH_SIZE
+        padded_seeds = [*curve_seeds, *curve_seeds[-1:] * n_padding]
+        problem = self.make_problem(
+            curve_seeds[0].collocation_system, quantity_group, curve_seeds[0].z
         )
-        curve_seeds = [
-            self._transfer_seed(curve_seed, collocation_system) for curve_seed in curve_seeds
-        ]
-        padded_seeds = [
-            *curve_seeds,
-            *curve_seeds[-1:] * (-len(curve_seeds) % batch_sizes.CURVE_BATCH_SIZE),
-        ]
-        problem = self.make_problem(collocation_system, quantity_group, padded_seeds[0].z)
 
-        def make_start(curve_seed: CurveSeed) -> tuple[CurveWheel, CollocationSolution, Any, Any]:
-            has_double_support = bool(curve_seed.branch_wheel.is_phase_active[0, 0] > 0.5)
-            name = select_test_quantity(curve_seed.special_point_name, has_double_support)
-            index = np.asarray(quantity_group.index(name))
-            fraction = self.compute_parameter_fractions(np.array(curve_seed.parameter_values))[1]
-            first_value = curve_seed.parameter_values[0]
-            return CurveWheel(curve_seed.branch_wheel, index), curve_seed.z, fraction, first_value
+        def make_start(seed: CurveSeed) -> tuple[CurveWheel, CollocationSolution, Any, Any]:
+            has_double_support = bool(seed.branch_wheel.is_phase_active[0, 0] > 0.5)
+            name = select_test_quantity(seed.special_point_name, has_double_support)
+            fraction = self.compute_parameter_fractions(seed.parameter_values)[1]
+            wheel = CurveWheel(seed.branch_wheel, np.asarray(quantity_group.index(name)))
+            return wheel, seed.z, fraction, seed.parameter_values[0]
 
         wheels, z, fractions, first_values = jax.tree.map(
             lambda *leaves: np.stack(leaves), *map(make_start, padded_seeds)
         )
-        continuation = CurveContinuation(
-            problem,
-            self.arclength_options,
-            wheels,
-            self.parameter_ranges[0],
-            tuple(curve_seed.special_point_name for curve_seed in padded_seeds),
-        )
-        branch_data_by_seed = continue_and_locate_special_points(
-            continuation,
+        return continue_and_locate_special_points(
+            CurveContinuation(
+                problem,
+                self.arclength_options,
+                wheels,
+                self.parameter_ranges[0],
+                tuple(seed.special_point_name for seed in padded_seeds),
+            ),
             np.column_stack([fractions, problem.gait_problem.pack(z)]),
             first_values,
             np.arange(len(padded_seeds)) < len(curve_seeds),
-            lambda wheel_index, point: lambda: point,
             is_finest_mesh,
         )
-        return branch_data_by_seed[: len(curve_seeds)], collocation_system
 
     def make_problem(
         self,
@@ -438,132 +380,84 @@ class CurveTracer(NamedTuple):
             quantity_names=quantity_group,
         )
 
-    def _make_traced_curve(self, curve_seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
+    def _make_traced_curve(self, seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
         """Build a labeled curve, and seeds at the special points that the curve meets."""
         parameter_points = np.stack([branch_data.points.p, branch_data.quantities["second"]], -1)
-        gaits = self.make_problem(
-            curve_seed.collocation_system, tuple(BIFURCATIONS), curve_seed.z
-        ).gait_problem
-        rows = branch_data.points.z[:, 1:]
-        scaled_vertices = np.column_stack(
+        problem = self.make_problem(seed.collocation_system, CONTINUED_QUANTITIES, seed.z)
+        gaits, rows = problem.gait_problem, branch_data.points.z[:, 1:]
+        vertices = np.column_stack(
             [gaits.section_state(rows), self.compute_parameter_fractions(parameter_points)]
         )
         codim2_points, new_seeds, end_reasons = [], [], branch_data.end_reasons
         for special_point in branch_data.special_points:
             if special_point.name == RANGE_EDGE_COLUMN:
                 continue
-            point_beside_root = special_point.cycle
-            second_fraction, z = point_beside_root.z[0], gaits.unpack(point_beside_root.z[1:])
-            second_parameter_value = float(
-                self.parameter_ranges[1, 0] + np.ptp(self.parameter_ranges[1]) * second_fraction
+            beside = special_point.cycle
+            z, second = (
+                gaits.unpack(beside.z[1:]),
+                float(problem.compute_second_parameter(beside.z)),
             )
-            meeting_parameter_values = special_point.value, second_parameter_value
-            special_point_name = choose_continued_special_point_name(
-                special_point.name, curve_seed.branch_wheel, z
-            )
-            if {special_point_name, curve_seed.special_point_name} == {
-                "lambda_4_plus",
-                DLS_VANISHING_NAME,
-            }:
-                meeting_parameter_values = self._locate_jump_onset(
-                    curve_seed, z, meeting_parameter_values
+            meeting: Any = special_point.value, second
+            name = choose_continued_special_point_name(special_point.name, seed.branch_wheel, z)
+            if {name, seed.special_point_name} == {"lambda_4_plus", DLS_VANISHING_NAME}:
+                onset, last_change = locate_jump_onset(
+                    problem, seed.branch_wheel, beside.z[1:], np.array(meeting)
                 )
+                if last_change < RELATIVE_CODIM2_TOLERANCE:
+                    meeting = tuple(onset.tolist())
                 new_seeds.append(
                     self._seed_beyond_meeting(
-                        special_point_name,
-                        curve_seed,
-                        scaled_vertices,
+                        seed._replace(special_point_name=name),
+                        vertices,
                         parameter_points,
                         gaits.unpack(rows),
-                        meeting_parameter_values,
+                        meeting,
                     )
                 )
                 first_reason, last_reason = (
-                    end_reason.replace(
-                        f"{special_point.value:.9g}", f"{meeting_parameter_values[0]:.9g}"
-                    )
-                    for end_reason in end_reasons
+                    reason.replace(f"{special_point.value:.9g}", f"{meeting[0]:.9g}")
+                    for reason in end_reasons
                 )
                 end_reasons = first_reason, last_reason
-            elif can_continue_special_point(special_point_name):
+            elif can_continue_special_point(name):
+                values = float(beside.p), second
                 new_seeds.append(
-                    curve_seed._replace(
-                        special_point_name=special_point_name,
-                        parameter_values=(float(point_beside_root.p), second_parameter_value),
-                        z=z,
-                    )
+                    seed._replace(special_point_name=name, parameter_values=values, z=z)
                 )
-            codim2_points.append(
-                Codim2Point(special_point_name, meeting_parameter_values, special_point.ends_branch)
-            )
-        special_point_curve = self._make_labeled_curve(
-            curve_seed, branch_data._replace(end_reasons=end_reasons), tuple(codim2_points)
+            codim2_points.append(Codim2Point(name, meeting, special_point.ends_branch))
+        curve = self._make_labeled_curve(
+            seed, branch_data._replace(end_reasons=end_reasons), tuple(codim2_points)
         )
-        return TracedCurve(special_point_curve, scaled_vertices, tuple(new_seeds))
-
-    def _locate_jump_onset(
-        self, curve_seed: CurveSeed, z: CollocationSolution, start_parameter_values: Any
-    ) -> tuple[float, float]:
-        """Return the two parameters at the onset of the jump.
-
-        If the onset is not found, return `start_parameter_values`.
-        """
-        problem = self.make_problem(curve_seed.collocation_system, CONTINUED_QUANTITIES, z)
-        onset_parameter_values, last_relative_parameter_change = locate_jump_onset(
-            problem,
-            curve_seed.branch_wheel,
-            problem.gait_problem.pack(jax.tree.map(lambda x: x[None], z))[0],
-            np.array(start_parameter_values),
-        )
-        is_onset_found = last_relative_parameter_change < RELATIVE_CODIM2_TOLERANCE
-        first_parameter_value, second_parameter_value = (
-            onset_parameter_values if is_onset_found else start_parameter_values
-        )
-        return float(first_parameter_value), float(second_parameter_value)
+        return TracedCurve(curve, vertices, tuple(new_seeds))
 
     def _seed_beyond_meeting(
         self,
-        special_point_name: str,
-        curve_seed: CurveSeed,
-        scaled_vertices: np.ndarray,
+        seed: CurveSeed,
+        vertices: np.ndarray,
         parameter_points: np.ndarray,
         z: CollocationSolution,
-        meeting_parameter_values: Any,
+        meeting: Any,
     ) -> CurveSeed:
         """Build a seed beyond the point at which the rear foot's force starts to rise or to fall.
 
         The force is zero on the curve. Two curves cross at that point and continue in the same
-        direction. `meeting_parameter_values` contains the two parameters at the crossing.
+        direction. `meeting` contains the two parameters at the crossing.
         """
-        is_meeting_at_start = (
-            abs(parameter_points[0] - meeting_parameter_values).max()
-            < abs(parameter_points[-1] - meeting_parameter_values).max()
+        distances = abs(parameter_points[[0, -1]] - meeting).max(-1)
+        vertices, parameter_points, z = jax.tree.map(
+            lambda x: x if distances[0] < distances[1] else x[::-1],
+            (vertices, parameter_points, z),
         )
-        curve_traversal_sign = 1 if is_meeting_at_start else -1
-        scaled_vertices, parameter_points = (
-            scaled_vertices[::curve_traversal_sign],
-            parameter_points[::curve_traversal_sign],
+        distances = np.linalg.norm(vertices - vertices[0], axis=1)
+        index = int(np.argmax(distances >= min(CODIM2_OVERRUN_DISTANCE, distances[-1])))
+        extrapolate = lambda x: (
+            x[0] + CODIM2_OVERRUN_DISTANCE / distances[index] * (x[0] - x[index])
         )
-        z = jax.tree.map(lambda x: x[::curve_traversal_sign], z)
-        distances_to_meeting = np.linalg.norm(scaled_vertices - scaled_vertices[0], axis=1)
-        point_index = int(
-            np.argmax(
-                distances_to_meeting >= min(CODIM2_OVERRUN_DISTANCE, distances_to_meeting[-1])
-            )
-        )
-        extrapolate_from_meeting = lambda x: (
-            x[0]
-            + CODIM2_OVERRUN_DISTANCE / distances_to_meeting[point_index] * (x[0] - x[point_index])
-        )
-        z = jax.tree.map(extrapolate_from_meeting, z)
+        z = jax.tree.map(extrapolate, z)
         z.durations[0, 0] = (
-            0.0 if special_point_name == DLS_VANISHING_NAME else DLS_DURATION_GUESS_S
+            0.0 if seed.special_point_name == DLS_VANISHING_NAME else DLS_DURATION_GUESS_S
         )
-        return curve_seed._replace(
-            special_point_name=special_point_name,
-            parameter_values=tuple(extrapolate_from_meeting(parameter_points)),
-            z=z,
-        )
+        return seed._replace(parameter_values=tuple(extrapolate(parameter_points)), z=z)
 
     def _make_labeled_curve(
         self, curve_seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
@@ -589,13 +483,9 @@ class CurveTracer(NamedTuple):
             self.model,
             self.step_options,
         )
-        curve_axes_description = " and ".join(self.parameter_names)
-        dataset_attrs = {
-            "title": f"Curve of {curve_seed.special_point_name} over {curve_axes_description}"
-        }
-        curve_dataset = xr.Dataset(
-            curve_variables, curve_coordinates, dataset_attrs | start_provenance
-        )
+        axes = " and ".join(self.parameter_names)
+        title = {"title": f"Curve of {curve_seed.special_point_name} over {axes}"}
+        curve_dataset = xr.Dataset(curve_variables, curve_coordinates, title | start_provenance)
         return SpecialPointCurve(
             curve_seed.special_point_name,
             self.parameter_names,

@@ -4,7 +4,7 @@
 Each kind of branch adds test functions for its other quantities, such as margins.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from vrw_jax.gaits.floquet import (
     MAX_CLOSED_FORM_SIZE,
     MIN_IMAGINARY_PART,
     UNIT_CIRCLE_DISTANCE,
-    compute_characteristic_polynomial,
+    list_jury_margins,
 )
 
 
@@ -26,8 +26,7 @@ class TestFunction(NamedTuple):
     - `ends_branch`: whether the branch ends, because the order of events changes;
     - `is_stepwise`: whether the quantity has integer values, of which each change is located;
     - `explains`: kind of a change that is not reported where this quantity vanishes;
-    - `n_multipliers`: number of multipliers that cross the unit circle;
-    - `evaluate`: function of Jacobians (..., n, n), for quantities that follow from them.
+    - `n_multipliers`: number of multipliers that cross the unit circle.
     """
 
     kind: str
@@ -36,57 +35,41 @@ class TestFunction(NamedTuple):
     is_stepwise: bool = False
     explains: str = ""
     n_multipliers: int = 0
-    evaluate: Callable[[np.ndarray], np.ndarray] | None = None
-
-
-def _evaluate_polynomial(jacobians: np.ndarray, argument: float) -> np.ndarray:
-    """Return det(1 - argument * jacobian), by the characteristic polynomial if n is at most 3."""
-    n = jacobians.shape[-1]
-    if n > MAX_CLOSED_FORM_SIZE:
-        return np.linalg.det(np.eye(n) - argument * jacobians)
-    coefficients = compute_characteristic_polynomial(jacobians)
-    return 1.0 + sum(a * argument ** (n - i) for i, a in enumerate(coefficients))
-
-
-def _evaluate_pair_margin(jacobians: np.ndarray) -> np.ndarray:
-    """Return the product of 1 - z_i z_j over all pairs of multipliers, or NaN if there is none."""
-    n = jacobians.shape[-1]
-    if n == 1:
-        return np.full(jacobians.shape[:-2], np.nan)
-    if n <= MAX_CLOSED_FORM_SIZE:
-        a0, *other_coefficients = compute_characteristic_polynomial(jacobians)
-        if n == 2:
-            return 1.0 - a0
-        a1, a2 = other_coefficients
-        return 1.0 - a0 * a0 - a1 + a0 * a2
-    first, second = np.triu_indices(n, 1)
-    multipliers = compute_multipliers(jacobians)
-    return np.prod(1.0 - multipliers[..., first] * multipliers[..., second], -1).real
 
 
 FOLD, BRANCH_POINT, PERIOD_DOUBLING, NEIMARK_SACKER = (
     "fold", "branch_point", "period_doubling", "neimark_sacker",
 )  # fmt: skip
 BIFURCATIONS: Mapping[str, TestFunction] = {
-    FOLD: TestFunction(
-        FOLD, "The branch turns back, or crosses another one.", n_multipliers=1,
-        evaluate=lambda jacobians: _evaluate_polynomial(jacobians, 1.0),
-    ),
+    FOLD: TestFunction(FOLD, "The branch turns back, or crosses another one.", n_multipliers=1),
     PERIOD_DOUBLING: TestFunction(
-        PERIOD_DOUBLING, "A branch of twice the period begins.", n_multipliers=1,
-        evaluate=lambda jacobians: _evaluate_polynomial(jacobians, -1.0),
+        PERIOD_DOUBLING, "A branch of twice the period begins.", n_multipliers=1
     ),
     NEIMARK_SACKER: TestFunction(
-        NEIMARK_SACKER, "A closed curve of states begins.", n_multipliers=2,
-        evaluate=_evaluate_pair_margin,
+        NEIMARK_SACKER, "A closed curve of states begins.", n_multipliers=2
     ),
-}  # fmt: skip
-"""Bifurcations by name. The margins of the closed forms are the first three Jury margins."""
+}
+"""Bifurcations by name."""
 
 
 def evaluate_bifurcations(jacobians: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the test functions of `BIFURCATIONS` by name, each of shape (...)."""
-    return {name: test.evaluate(jacobians) for name, test in BIFURCATIONS.items() if test.evaluate}
+    """Return the test functions of `BIFURCATIONS` by name, each of shape (...).
+
+    They are det(1 - J), det(1 + J), and the product of 1 - z_i z_j over all pairs of multipliers.
+    The last is NaN if there is no pair. Up to a size of 3, they are the first Jury margins.
+    """
+    n = jacobians.shape[-1]
+    if n <= MAX_CLOSED_FORM_SIZE:
+        margins = [*list_jury_margins(jacobians), np.full(jacobians.shape[:-2], np.nan)]
+        return dict(zip(BIFURCATIONS, margins, strict=False))
+    first, second = np.triu_indices(n, 1)
+    multipliers = compute_multipliers(jacobians)
+    margins = [
+        np.linalg.det(np.eye(n) - jacobians),
+        np.linalg.det(np.eye(n) + jacobians),
+        np.prod(1.0 - multipliers[..., first] * multipliers[..., second], -1).real,
+    ]
+    return dict(zip(BIFURCATIONS, margins, strict=True))
 
 
 def compute_multipliers(jacobians: np.ndarray) -> np.ndarray:

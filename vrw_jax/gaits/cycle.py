@@ -26,7 +26,6 @@ from vrw_jax.base.printing import (
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits import floquet
 from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES
 from vrw_jax.wheel.params import WheelParams
 
@@ -154,7 +153,7 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     @abc.abstractmethod
-    def searched_wheel(self) -> tuple[AbstractWheel, WheelParams]:
+    def searched_wheel(self) -> tuple[Any, WheelParams]:
         """Return the model and the wheel whose gait was searched."""
 
     @property

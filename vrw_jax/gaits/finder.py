@@ -182,9 +182,47 @@ class AbstractGaitFinder(eqx.Module):
         """Return starts of the search for a batch of wheels."""
         return jax.vmap(self.make_initial_guess)(parameter_values)
 
-    @abc.abstractmethod
+    def complete_section_states(
+        self, parameter_values: np.ndarray, section_states: np.ndarray
+    ) -> np.ndarray:
+        """Return section states of the model for those of the paper, of each wheel."""
+        return section_states
+
+    @eqx.filter_jit
     def find_gait(self, parameter_values: ParameterValues, cycle_guess: Any) -> Gait:
         """Find the gait near `cycle_guess` and its derivatives, by compiled programs."""
+        cycle, jacobian = evaluate_with_jacobian(
+            lambda values: self.find_cycle_from_values(values, cycle_guess), parameter_values
+        )
+        return self.make_gait(cycle, move_derivative_axis_first(jacobian))
+
+    def make_gait(self, cycle: Any, derivatives: Any) -> Gait:
+        """Build a gait with the data that identify its branch.
+
+        The active phases do not identify a branch. With unilateral contact the order of events may
+        change on a branch.
+
+        - `derivatives`: derivatives of the cycle with respect to the parameters on the branch, with
+          a leading axis over the parameters.
+        """
+        step, step_derivatives = self.read_step(cycle), jax.vmap(self.read_step)(derivatives)
+        n = self.n_coordinates
+        coordinates = compute_value_and_tangents(
+            lambda x, durations: jnp.concatenate([x[:n], durations]),
+            (cycle.section_state, step.durations),
+            (derivatives.section_state, step_derivatives.durations),
+        )
+        point = GaitBranchPoint(*coordinates, jnp.ones(1), cycle.monodromy_value[:n, :n])
+        return Gait(cycle, step, derivatives, step_derivatives, point)
+
+    def read_step(self, cycle: Any) -> Any:
+        """Return the step of a cycle from which measures are read."""
+        return jax.tree.map(lambda x: x[0], cycle.steps)
+
+    @property
+    def n_coordinates(self) -> int | None:
+        """Return the number of entries of a section state that vary, or None for all."""
+        return self.model.count_continuous_section_entries(WheelParams(n_legs=self.n_legs))
 
     def find_gaits(
         self, parameter_values: Float[Array, "lanes n_parameter_values"], cycle_guess: Any
@@ -231,7 +269,8 @@ class AbstractGaitFinder(eqx.Module):
         `measure_names` is a selection of `differentiable_measures`. Derivatives of stability
         measures are second derivatives of the motion.
         """
-        if all(isinstance(x, Measure) or x in self.cycle_measures for x in measure_names):
+        is_of_cycle = lambda x: isinstance(x, Measure) or x in self.cycle_measures
+        if all(map(is_of_cycle, measure_names)) and not self.is_multistable:
             return compute_cycle_measures(self, parameter_values, cycle_guess, measure_names)
         start_state = (
             self.make_initial_guess(parameter_values)

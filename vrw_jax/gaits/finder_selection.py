@@ -16,12 +16,11 @@ from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder import AbstractGaitFinder
-from vrw_jax.gaits.hybrid_gait import HybridGait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
-from vrw_jax.gaits.walker_finder import make_walker_finder
+from vrw_jax.gaits.walker_finder import HybridGait, make_walker_finder
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,

@@ -233,44 +233,21 @@ def compute_jury_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margin
     (multiplier -1). For n > 1 the third margin vanishes when a pair of multipliers crosses the unit
     circle. For n = 3 the fourth margin completes the criterion.
     """
-    polynomial_coefficients = compute_characteristic_polynomial(matrix)
-    if len(polynomial_coefficients) == 1:
-        (a0,) = polynomial_coefficients
-        return jnp.stack([1.0 + a0, 1.0 - a0], -1)
-    if len(polynomial_coefficients) == 2:
-        a0, a1 = polynomial_coefficients
-        return jnp.stack([1.0 + a1 + a0, 1.0 - a1 + a0, 1.0 - a0], -1)
-    a0, a1, a2 = polynomial_coefficients
-    pair_margins = 1.0 - a0 * a0 - a1 + a0 * a2
-    return jnp.stack([1.0 + a2 + a1 + a0, 1.0 - a2 + a1 - a0, pair_margins, 1.0 - a0 * a0], -1)
+    return jnp.stack(list_jury_margins(matrix), -1)
 
 
-@jax.jit
-def compute_bifurcation_margins(matrix: RealSquareMatrix) -> Float[Array, "... n_margins"]:
-    """Return the margins to fold, period doubling and Neimark-Sacker bifurcation.
-
-    If n is at most 3, these are the first Jury margins. For larger matrices the first two margins
-    are det(1 - matrix) and det(1 + matrix). The third margin is the product of 1 - z_i z_j over all
-    pairs of eigenvalues z_i and z_j. For n = 1 no third margin exists.
-    """
-    n = matrix.shape[-1]
-    if n <= MAX_CLOSED_FORM_SIZE:
-        return compute_jury_margins(matrix)[..., :3]
-    identity_matrix, eigenvalues = jnp.eye(n, dtype=matrix.dtype), floquet_multipliers(matrix)
-    first_eigenvalue_indices, second_eigenvalue_indices = np.triu_indices(n, 1)
-    eigenvalue_products = jnp.prod(
-        1.0
-        - eigenvalues[..., first_eigenvalue_indices] * eigenvalues[..., second_eigenvalue_indices],
-        axis=-1,
-    ).real
-    return jnp.stack(
-        [
-            jnp.linalg.det(identity_matrix - matrix),
-            jnp.linalg.det(identity_matrix + matrix),
-            eigenvalue_products,
-        ],
-        -1,
-    )
+def list_jury_margins(matrix: Any) -> list[Any]:
+    """Return the Jury margins of NumPy or JAX matrices, each of shape (...)."""
+    a = compute_characteristic_polynomial(matrix)
+    margins = [
+        1.0 + sum(sign ** (len(a) - i) * coefficient for i, coefficient in enumerate(a))
+        for sign in (1.0, -1.0)
+    ]
+    if len(a) == 2:
+        margins.append(1.0 - a[0])
+    elif len(a) == 3:
+        margins += [1.0 - a[0] * a[0] - a[1] + a[0] * a[2], 1.0 - a[0] * a[0]]
+    return margins
 
 
 @jax.jit

@@ -29,7 +29,6 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
-from vrw_jax.gaits.attracting_gaits import find_attracting_gaits, find_slowest_gait_indices
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES
@@ -44,11 +43,12 @@ from vrw_jax.gaits.further_search import (
     search_further,
     transfer_to_mesh,
 )
-from vrw_jax.gaits.hybrid_gait import HybridGait, find_hybrid_gait, find_hybrid_gaits
+from vrw_jax.gaits.gait_walks import find_attracting_gaits, find_slowest_gait_indices
 from vrw_jax.gaits.last_gait import describe_last_gait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
+from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
@@ -170,7 +170,7 @@ def limit_cycle(
     """
     parse_gait_choice(which)
     if is_own_walker(model):
-        return find_hybrid_gait(model, params, guess, period_n, options)
+        return find_walker_gaits(model, params, guess, period_n, options)
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, period_n)
     params = gait_finder.model.attach_laws(params)
@@ -228,7 +228,7 @@ def limit_cycles(
     """
     parse_gait_choice(which)
     if is_own_walker(model):
-        return find_hybrid_gaits(model, params, guess, period_n, options)
+        return find_walker_gaits(model, params, guess, period_n, options, is_batch=True)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=...)")
     if guess is not None:
         raise ValueError(

@@ -1,15 +1,24 @@
-"""Simulate walks of many wheels from fixed starts until they settle on gaits."""
+"""Walks of many wheels from many starts, until they settle on gaits or orbits.
+
+From the ends of walks, attracting gaits are found. Walks are tested after each round of several
+steps. Only walks that have neither settled nor failed continue, so that long transients cost
+little.
+"""
 
 import math
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.models.contact_walks import embed_section_states
+from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
+from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.wheel.params import WheelParams, compute_wheel_units_of_rows
 
@@ -48,12 +57,10 @@ def compute_walk_starts(params: WheelParams) -> np.ndarray:
     wheels = jax.tree.map(np.asarray, params)
     leg_angle_sine = math.sin(wheels.leg_angle)
     leg_angle_cosine = math.cos(wheels.leg_angle)
-    weight_normal_to_slope = (
-        (wheels.hub_mass + wheels.n_legs * wheels.leg_mass) * wheels.gravity * np.cos(wheels.slope)
-    )
-    static_length_ratio = (
-        wheels.natural_length - weight_normal_to_slope / wheels.stiffness
-    ) / wheels.locked_length
+    total_mass = wheels.hub_mass + wheels.n_legs * wheels.leg_mass
+    normal_weight = total_mass * wheels.gravity * np.cos(wheels.slope)
+    static_length = wheels.natural_length - normal_weight / wheels.stiffness
+    static_length_ratio = static_length / wheels.locked_length
     contraction_shares, rate_shares = np.array(WALK_STARTS).T[..., None]
     leg_lengths = np.clip(
         1.0 + contraction_shares * (static_length_ratio - 1.0), leg_angle_cosine + 0.02, 1.0
@@ -154,10 +161,12 @@ MAX_SETTLED_DEFECT = 1e-3
 MAX_NEWTON_START_DEFECT = 0.1
 
 
+StartFunction = Callable[[WheelParams], np.ndarray]
+"""Function that maps wheels to section states, shape (starts, wheels, 3)."""
+
+
 def walk_to_gaits(
-    gait_finder: Any,
-    parameter_values: np.ndarray,
-    start_state_function: Callable[[WheelParams], np.ndarray],
+    gait_finder: Any, parameter_values: np.ndarray, compute_starts: StartFunction
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Simulate walks of each wheel, and return the distinct states at their ends.
 
@@ -171,83 +180,48 @@ def walk_to_gaits(
         gait_finder: finder of gaits, whose model computes the gait steps.
         parameter_values: parameters of each wheel, shape (wheels, n_parameter_values), in the order
             of `AbstractWheel.collect_parameter_values`.
-        start_state_function: function that maps wheels to section states, shape (starts, wheels,
-            3).
+        compute_starts: function that returns the starts of the walks.
     """
-    start_section_states = start_state_function(
-        _split_parameter_values(gait_finder, parameter_values)[1]
-    )
+    starts = compute_starts(_split_parameter_values(gait_finder, parameter_values)[1])
     n_wheels = len(parameter_values)
-    walk_wheel_indices = np.tile(np.arange(n_wheels), len(start_section_states))
-    parameter_values_by_walk = parameter_values[walk_wheel_indices]
-    section_states = np.concatenate(start_section_states)
-    if gait_finder.model.batch_kernel == "legs":
-        section_states = np.array(
-            embed_section_states(parameter_values_by_walk.T, section_states, gait_finder.n_legs)
-        )
-    period_defects = np.full(len(walk_wheel_indices), np.inf)
-    is_walk_duplicate = np.zeros(len(walk_wheel_indices), bool)
-    active_walk_indices = np.arange(len(walk_wheel_indices))
+    wheels = np.tile(np.arange(n_wheels), len(starts))
+    values = parameter_values[wheels]
+    states = gait_finder.complete_section_states(values, np.concatenate(starts))
+    defects, is_duplicate = np.full(len(wheels), np.inf), np.zeros(len(wheels), bool)
+    active = np.arange(len(wheels))
     find_duplicates = lambda max_settled_defect: _find_duplicate_walks(
-        scale_section_states(gait_finder, parameter_values_by_walk, section_states),
-        period_defects,
-        n_wheels,
-        max_settled_defect,
+        scale_section_states(gait_finder, values, states), defects, n_wheels, max_settled_defect
     )
     for n_steps in N_WALK_STEPS_BY_ROUND:
-        end_states, walk_outcomes = _simulate_wheel_walks(
-            gait_finder,
-            parameter_values_by_walk[active_walk_indices],
-            section_states[active_walk_indices],
-            n_steps,
-        )
-        is_walking = walk_outcomes == Outcome.STEPPED
-        active_walk_indices = active_walk_indices[is_walking]
-        section_states[active_walk_indices] = end_states[is_walking]
-        period_defects[active_walk_indices] = measure_period_defects(
-            gait_finder,
-            parameter_values_by_walk[active_walk_indices],
-            section_states[active_walk_indices],
-        )
-        is_walk_duplicate |= find_duplicates(MAX_SETTLED_DEFECT)
-        has_not_settled = period_defects >= MAX_SETTLED_DEFECT
-        active_walk_indices = active_walk_indices[
-            (has_not_settled & ~is_walk_duplicate)[active_walk_indices]
-        ]
-        if not len(active_walk_indices):
+        ends, outcomes = _simulate_wheel_walks(gait_finder, values[active], states[active], n_steps)
+        is_walking = outcomes == Outcome.STEPPED
+        active = active[is_walking]
+        states[active] = ends[is_walking]
+        defects[active] = measure_period_defects(gait_finder, values[active], states[active])
+        is_duplicate |= find_duplicates(MAX_SETTLED_DEFECT)
+        active = active[((defects >= MAX_SETTLED_DEFECT) & ~is_duplicate)[active]]
+        if not len(active):
             break
-    is_walk_duplicate = find_duplicates(MAX_NEWTON_START_DEFECT)
-    is_near_gait = period_defects < MAX_NEWTON_START_DEFECT
-    is_walk_selected = ~is_walk_duplicate & is_near_gait
+    is_selected = ~find_duplicates(MAX_NEWTON_START_DEFECT) & (defects < MAX_NEWTON_START_DEFECT)
     # If a wheel has no usable walk, its first start is selected.
-    is_walk_selected[np.setdiff1d(np.arange(n_wheels), walk_wheel_indices[is_walk_selected])] = True
-    selected_walk_indices = np.flatnonzero(is_walk_selected)
-    selected_walk_indices = selected_walk_indices[
-        np.argsort(walk_wheel_indices[selected_walk_indices], kind="stable")
-    ]
-    return (
-        walk_wheel_indices[selected_walk_indices],
-        section_states[selected_walk_indices],
-        period_defects[selected_walk_indices],
-    )
+    is_selected[np.setdiff1d(np.arange(n_wheels), wheels[is_selected])] = True
+    selected = np.flatnonzero(is_selected)
+    selected = selected[np.argsort(wheels[selected], kind="stable")]
+    return wheels[selected], states[selected], defects[selected]
 
 
 def measure_period_defects(
-    gait_finder: Any,
-    parameter_values: np.ndarray,
-    section_states: np.ndarray,
+    gait_finder: Any, parameter_values: np.ndarray, section_states: np.ndarray
 ) -> np.ndarray:
     """Return the largest change of each section state over one period, shape (wheels,).
 
     Changes are in units of the wheel. The result is infinite if a gait step fails.
     """
-    end_states, period_outcomes = _simulate_wheel_walks(
+    ends, outcomes = _simulate_wheel_walks(
         gait_finder, parameter_values, section_states, gait_finder.period_n
     )
-    period_defects = np.abs(
-        scale_section_states(gait_finder, parameter_values, end_states - section_states)
-    ).max(-1)
-    return np.where(period_outcomes == Outcome.STEPPED, period_defects, np.inf)
+    changes = scale_section_states(gait_finder, parameter_values, ends - section_states)
+    return np.where(outcomes == Outcome.STEPPED, np.abs(changes).max(-1), np.inf)
 
 
 # Tolerance of the Tsit5 solver in walks, which is independent of the tolerance of the gait.
@@ -255,22 +229,14 @@ WALK_STEP_TOLERANCE = 1e-8
 
 
 def _simulate_wheel_walks(
-    gait_finder: Any,
-    parameter_values: np.ndarray,
-    section_states: np.ndarray,
-    n_steps: int,
+    gait_finder: Any, parameter_values: np.ndarray, section_states: np.ndarray, n_steps: int
 ) -> tuple[np.ndarray, np.ndarray]:
     model, params = _split_parameter_values(gait_finder, parameter_values)
-    step_options = StepOptions(
-        solver="Tsit5",
-        rtol=WALK_STEP_TOLERANCE,
-        atol=WALK_STEP_TOLERANCE,
-    )
+    tolerance = WALK_STEP_TOLERANCE
     # For the stiffest wheels, the implicit solver would take minutes per walk.
-    walk_result = step_batch(
-        params, section_states, n_steps, model=model, options=step_options, engine="lanes"
-    )
-    return np.asarray(walk_result.section_state), np.asarray(walk_result.outcome)
+    options = StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)
+    walk = step_batch(params, section_states, n_steps, model=model, options=options, engine="lanes")
+    return np.asarray(walk.section_state), np.asarray(walk.outcome)
 
 
 def _split_parameter_values(
@@ -290,35 +256,300 @@ WALK_MERGE_DISTANCE = 0.02
 
 
 def _find_duplicate_walks(
-    scaled_walk_states: np.ndarray,
-    period_defects: np.ndarray,
-    n_wheels: int,
-    max_settled_defect: float,
+    scaled_states: np.ndarray, defects: np.ndarray, n_wheels: int, max_settled_defect: float
 ) -> np.ndarray:
     """Return whether each walk is a duplicate of another walk of the same wheel.
 
     A walk is a duplicate if the other walk reaches the same state with a smaller period defect. Two
-    states are the same if their distance is within `walk_merge_distance`. If the period defect of
+    states are the same if their distance is within `WALK_MERGE_DISTANCE`. If the period defect of
     the other walk is below `max_settled_defect`, a distance of three times the first walk's period
-    defect is also allowed. The axes of the arguments are starts, wheels and, for states,
+    defect is also allowed. The axes of the arguments are starts and wheels in one, and then
     coordinates.
     """
-    scaled_walk_states = scaled_walk_states.reshape(-1, n_wheels, scaled_walk_states.shape[-1])
-    period_defects = period_defects.reshape(-1, n_wheels)
-    is_walk_duplicate = np.zeros(period_defects.shape, bool)
-    for start_index, (other_states, other_defects) in enumerate(
-        zip(scaled_walk_states, period_defects, strict=True)
-    ):
-        is_later_start = np.arange(len(period_defects))[:, None] > start_index
-        has_smaller_defect = (other_defects < period_defects) | (
-            (other_defects == period_defects) & is_later_start
-        )
-        merge_distances = np.where(
+    states = scaled_states.reshape(-1, n_wheels, scaled_states.shape[-1])
+    defects = defects.reshape(-1, n_wheels)
+    is_duplicate = np.zeros(defects.shape, bool)
+    for index, (other_states, other_defects) in enumerate(zip(states, defects, strict=True)):
+        is_later = np.arange(len(defects))[:, None] > index
+        has_smaller_defect = (other_defects < defects) | ((other_defects == defects) & is_later)
+        max_distances = np.where(
             other_defects < max_settled_defect,
-            np.maximum(WALK_MERGE_DISTANCE, 3.0 * period_defects),
+            np.maximum(WALK_MERGE_DISTANCE, 3.0 * defects),
             WALK_MERGE_DISTANCE,
         )
-        is_end_state_same = np.abs(scaled_walk_states - other_states).max(-1) <= merge_distances
-        is_walk_duplicate |= has_smaller_defect & is_end_state_same
-    is_near_gait = period_defects < MAX_NEWTON_START_DEFECT
-    return (is_walk_duplicate & is_near_gait).ravel()
+        is_same = np.abs(states - other_states).max(-1) <= max_distances
+        is_duplicate |= has_smaller_defect & is_same
+    return (is_duplicate & (defects < MAX_NEWTON_START_DEFECT)).ravel()
+
+
+DUPLICATE_GAIT_DISTANCE = 1e-5
+"""Distance between section states, in units of the wheel, below which two gaits are
+treated as equal.
+"""
+
+
+def find_attracting_gaits(
+    gait_finder: Any,
+    parameter_values: Any,
+    start_functions: tuple[StartFunction, ...] = (
+        compute_walk_starts,
+        compute_fallback_walk_starts,
+    ),
+) -> tuple[np.ndarray, Any]:
+    """Find the attracting gaits of each wheel, in the order of increasing speed.
+
+    Walks begin at WALK_STARTS. If a wheel has no gait from these starts, walks also begin at
+    FALLBACK_WALK_STARTS. A wheel without an attracting gait has one cycle, whose outcome is a
+    failure.
+
+    Args:
+        gait_finder: finder of gaits with unilateral contact.
+        parameter_values: parameters of each wheel, shape (wheels, n_parameter_values), in the order
+            of `AbstractWheel.collect_parameter_values`.
+        start_functions: functions of wheels that return the starts of walks; the starts of each
+            function are for wheels without a gait from those before.
+
+    Returns:
+        Index of the wheel to which each gait belongs, shape (gaits,), and the cycles, whose leading
+        axis is (gaits,).
+    """
+    values = np.asarray(parameter_values)
+    wheels, gaits = _find_gaits_from_starts(gait_finder, values, start_functions[0])
+    missing = wheels[np.asarray(gaits.outcome) != Outcome.STEPPED]
+    if not len(missing) or not start_functions[1:]:
+        return wheels, gaits
+    new_wheels, new_gaits = find_attracting_gaits(gait_finder, values[missing], start_functions[1:])
+    is_found = np.asarray(new_gaits.outcome) == Outcome.STEPPED
+    found = missing[new_wheels[is_found]]
+    is_kept = ~np.isin(wheels, found)
+    merged_gaits = concatenate_tree_rows(
+        select_tree_rows(gaits, is_kept), select_tree_rows(new_gaits, is_found)
+    )
+    wheels = np.concatenate([wheels[is_kept], found])
+    order = np.argsort(wheels, kind="stable")
+    return wheels[order], jax.device_put(select_tree_rows(merged_gaits, order))
+
+
+def _find_gaits_from_starts(
+    gait_finder: Any, values: np.ndarray, compute_starts: StartFunction
+) -> tuple[np.ndarray, Any]:
+    """Find the attracting gaits that walks from given starts reach.
+
+    Return the index of the wheel to which each gait belongs, and the gaits. The gaits of a wheel
+    are sorted by increasing speed.
+    """
+    with ThreadPoolExecutor(1) as compile_thread:
+        compile_thread.submit(
+            with_default_jax_settings(gait_finder.precompile_newton_programs), values[:1]
+        )
+        wheels, states, _ = walk_to_gaits(gait_finder, values, compute_starts)
+    candidates = gait_finder.find_cycles_near(values[wheels], states)
+    # NumPy is used, because JAX would compile each operation for every number of wheels.
+    is_attracting = np.abs(np.linalg.eigvals(candidates.monodromy_value)).max(-1) < 1.0
+    is_valid = (np.asarray(candidates.outcome) == Outcome.STEPPED) & is_attracting
+    sum_over_steps = lambda values: np.asarray(values).reshape(len(wheels), -1).sum(-1)
+    speeds = sum_over_steps(candidates.step_length) / np.where(
+        is_valid, sum_over_steps(candidates.durations), 1.0
+    )
+    step_ends = np.asarray(candidates.steps.section_state).swapaxes(0, 1)
+    step_ends = scale_section_states(gait_finder, values[wheels], step_ends).swapaxes(0, 1)
+    # A gait that repeats after fewer steps is a gait of a shorter period.
+    distances = np.abs(step_ends[:, :-1] - step_ends[:, -1:]).max(-1)
+    is_valid &= ~(distances < DUPLICATE_GAIT_DISTANCE).any(1)
+    selected = []
+    for of_wheel in np.split(
+        np.arange(len(wheels)), find_slowest_gait_indices(wheels, len(values))[1:]
+    ):
+        valid = of_wheel[is_valid[of_wheel]]
+        gaits_of_wheel: list[int] = []
+        for candidate in valid[np.argsort(speeds[valid], kind="stable")]:
+            distances = np.abs(step_ends[gaits_of_wheel] - step_ends[candidate, -1]).max(-1)
+            if not (distances < DUPLICATE_GAIT_DISTANCE).any():
+                gaits_of_wheel.append(candidate)
+        selected += gaits_of_wheel or [of_wheel[0]]
+    # The cycle of a wheel without a valid candidate contains zeros and has a failure as outcome.
+    gaits, is_missing = select_tree_rows(candidates, selected), ~is_valid[selected]
+    clear_missing = lambda x: np.where(is_missing, np.zeros_like(x).T, x.T).T
+    outcome = np.where(
+        is_missing & (gaits.outcome == Outcome.STEPPED), Outcome.NO_CYCLE_FOUND, gaits.outcome
+    )
+    gaits = eqx.tree_at(
+        lambda gaits: (gaits.model, gaits.params, gaits.outcome),
+        jax.tree.map(clear_missing, gaits),
+        (gaits.model, gaits.params, outcome.astype(np.int32)),
+    )
+    return wheels[selected], jax.device_put(gaits)
+
+
+def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
+    """Find for each wheel the gait that a walk from a slow start reaches.
+
+    If the walk reaches no gait, the slowest attracting gait is returned. The two gaits are equal
+    for each of 1,200 random wheels.
+    """
+    start_functions = (
+        lambda params: compute_walk_starts(params)[:1],
+        compute_walk_starts,
+        compute_fallback_walk_starts,
+    )
+    wheels, gaits = find_attracting_gaits(gait_finder, parameter_values, start_functions)
+    indices = find_slowest_gait_indices(wheels, len(parameter_values))
+    return jax.device_put(select_tree_rows(gaits, indices))
+
+
+def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:
+    """Return the index of the slowest gait of each wheel, shape (wheels,).
+
+    - `gait_wheel_indices`: index of the wheel to which each gait belongs, in ascending order.
+      The gaits of a wheel are sorted by increasing speed.
+    """
+    return np.searchsorted(gait_wheel_indices, np.arange(n_wheels))
+
+
+class PeriodicWalkEnds(NamedTuple):
+    """Ends of the walks from many starts, as NumPy arrays with a leading axis over the starts."""
+
+    outcome: np.ndarray  # STEPPED if the wheel still walks
+    period: np.ndarray  # period of the orbit, in steps; 0 if not periodic
+    n_steps_to_orbit: np.ndarray  # number of steps until the orbit, or until the fall
+    orbit_states: np.ndarray
+    """Section states of the orbit, (start, max_period, m), where m is the number of entries of a
+    section state. The state with the lowest dtheta- comes first, and the array is padded with NaN.
+    """
+
+
+# Number of walking steps between two tests for periodic motion.
+N_STEPS_PER_ROUND = 10
+# Largest distance between the section states of a walk and of its orbit at which the walk has
+# arrived at the orbit.
+MAX_DISTANCE_ON_ARRIVAL = 1e-3
+
+
+def walk_until_periodic(
+    params: Any,
+    start_states: np.ndarray,
+    model: Any,
+    options: StepOptions,
+    max_steps: int,
+    max_period: int,
+) -> PeriodicWalkEnds:
+    """Simulate the walk from each start until it is periodic or has failed, and return its end.
+
+    - `params`: one wheel, or one wheel per start on the leading axis;
+    - `start_states`: section states, (starts, entries);
+    - `max_period`: longest period that is detected, in steps.
+    """
+    n_starts = len(start_states)
+    repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_starts), params)
+    n_rounds = -(-max_steps // N_STEPS_PER_ROUND)
+    state_history = np.full(
+        (n_starts, 1 + n_rounds * N_STEPS_PER_ROUND, start_states.shape[1]), np.nan
+    )
+    state_history[:, 0] = start_states
+    walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
+    orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
+    unsettled_walk_indices = np.arange(n_starts)
+    for first_step in range(0, n_rounds * N_STEPS_PER_ROUND, N_STEPS_PER_ROUND):
+        last_step = first_step + N_STEPS_PER_ROUND
+        wheels = select_tree_rows(repeated_wheels, unsettled_walk_indices)
+        section_states = state_history[unsettled_walk_indices, first_step]
+        outcomes = np.zeros(len(section_states), int)
+        for step_index in range(first_step, last_step):
+            steps = step_batch(
+                wheels, section_states, model=model, options=options, engine=options.engine
+            )
+            section_states = steps.section_state
+            state_history[unsettled_walk_indices, step_index + 1] = section_states
+            # A walk that has failed has no section state, so its outcome does not change.
+            is_walking = outcomes == Outcome.STEPPED
+            outcomes[is_walking] = steps.outcome[is_walking]
+            is_walking = outcomes == Outcome.STEPPED
+            n_steps_to_orbit[unsettled_walk_indices] += is_walking
+        walk_outcomes[unsettled_walk_indices] = outcomes
+        detected_periods = is_walking * _detect_walk_periods(
+            state_history[unsettled_walk_indices, : last_step + 1], max_period
+        )
+        orbit_periods[unsettled_walk_indices] = detected_periods
+        unsettled_walk_indices = unsettled_walk_indices[is_walking & (detected_periods == 0)]
+        if not len(unsettled_walk_indices):
+            break
+    orbit_states = np.full((n_starts, max_period, start_states.shape[1]), np.nan)
+    for i in np.flatnonzero(orbit_periods):
+        states_of_walk = state_history[i, : n_steps_to_orbit[i] + 1]
+        last_period_states = states_of_walk[-orbit_periods[i] :]
+        orbit_states[i, : orbit_periods[i]] = np.roll(
+            last_period_states,
+            -int(np.argmin(last_period_states[:, min(1, start_states.shape[1] - 1)])),
+            axis=0,
+        )
+        orbit_distances = np.linalg.norm(states_of_walk[:, None] - last_period_states, axis=-1).min(
+            1
+        )
+        distant_states = np.flatnonzero(orbit_distances > MAX_DISTANCE_ON_ARRIVAL)
+        n_steps_to_orbit[i] = distant_states[-1] + 1 if len(distant_states) else 0
+    return PeriodicWalkEnds(walk_outcomes, orbit_periods, n_steps_to_orbit, orbit_states)
+
+
+# Largest change of a section state from one period to the next for which motion counts as periodic.
+PERIODICITY_TOLERANCE = 1e-7
+
+
+def _detect_walk_periods(state_history: np.ndarray, max_period: int) -> np.ndarray:
+    """Return the shortest period that the last two periods of each walk confirm, in steps, or 0.
+
+    - `state_history`: section states, (starts, steps, entries).
+    """
+    detected_periods = np.zeros(len(state_history), int)
+    n_states = state_history.shape[1]
+    for period in range(min(max_period, (n_states - 1) // 3), 0, -1):
+        state_changes = np.abs(
+            state_history[:, n_states - 2 * period :]
+            - state_history[:, n_states - 3 * period : n_states - period]
+        )
+        is_periodic = state_changes.max((1, 2)) < PERIODICITY_TOLERANCE
+        detected_periods[is_periodic] = period
+    return detected_periods
+
+
+# Largest distance between section states of two orbits that are treated as the same orbit. The
+# value is chosen because it is far above the periodicity tolerance.
+SAME_ORBIT_DISTANCE = 1e-4
+
+
+def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the index of the orbit that each walk reaches, and the states of the distinct orbits.
+
+    The index is -1 without an orbit. The states have the shape (period, components). The orbit that
+    the most walks reach is the first. Two orbits are compared state by state, beginning with the
+    state that has the lowest dtheta-.
+    """
+    orbit_indices = np.full(len(walk_ends.period), -1)
+    distinct_orbits: list[np.ndarray] = []
+    for i in np.flatnonzero(walk_ends.period):
+        orbit_states = walk_ends.orbit_states[i, : walk_ends.period[i]]
+        for j, distinct_orbit_states in enumerate(distinct_orbits):
+            if (
+                len(distinct_orbit_states) == len(orbit_states)
+                and np.abs(distinct_orbit_states - orbit_states).max() < SAME_ORBIT_DISTANCE
+            ):
+                orbit_indices[i] = j
+                break
+        else:
+            orbit_indices[i] = len(distinct_orbits)
+            distinct_orbits.append(orbit_states)
+    n_starts_by_orbit = np.bincount(orbit_indices[orbit_indices >= 0])
+    orbit_sort_order = np.argsort(n_starts_by_orbit)[::-1]
+    rank_by_orbit = np.full(len(distinct_orbits) + 1, -1)
+    rank_by_orbit[orbit_sort_order] = np.arange(len(distinct_orbits))
+    return rank_by_orbit[orbit_indices], [distinct_orbits[j] for j in orbit_sort_order]
+
+
+def measure_orbit_steps(
+    params: Any, section_states: np.ndarray, model: Any, options: StepOptions
+) -> dict[str, np.ndarray]:
+    """Return all measures of one step from each section state, by name.
+
+    `section_states` has the shape (states, entries).
+    """
+    measures = [model.take_step(params, jnp.asarray(x), options).measures() for x in section_states]
+    return jax.tree.map(lambda *values: np.stack(values), *measures)

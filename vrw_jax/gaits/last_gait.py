@@ -13,10 +13,10 @@ import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.wheel.params import WheelParams
@@ -57,7 +57,7 @@ def describe_last_gait(
     def search_on_way(fractions: Any) -> Iterator[Any]:
         """Yield the cycle at each fraction of the way."""
         wheels = list(map(make_wheel, fractions))
-        if model.batch_kernel == "legs":
+        if make_finder(model, params.n_legs).is_multistable:
             # All wheels walk together.
             cycles = find_gaits(jax.tree.map(lambda *x: np.stack(x), *wheels), model=model)
             yield from (select_tree_rows(cycles, index) for index in range(len(wheels)))
@@ -93,7 +93,7 @@ def describe_last_gait(
     )
 
 
-def _describe_walk(model: AbstractWheel, params: WheelParams, last_gait: Any) -> str:
+def _describe_walk(model: Any, params: WheelParams, last_gait: Any) -> str:
     """Return a sentence about the walk of the next wheel, which begins at the last gait."""
     batch = jax.tree.map(lambda x: np.asarray(x)[None], params)
     section_states = np.asarray(last_gait.section_state)[None]

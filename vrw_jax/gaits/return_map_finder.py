@@ -5,6 +5,7 @@ method.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -18,19 +19,13 @@ from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
-    Gait,
-    GaitBranchPoint,
     ParameterValues,
-    compute_value_and_tangents,
-    move_derivative_axis_first,
 )
 from vrw_jax.gaits.fixed_points import (
     FixedPointResult,
     solve_fixed_point,
     solve_fixed_point_implicit,
 )
-from vrw_jax.lanes.autodiff import evaluate_with_jacobian
-from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import (
     DIFFERENTIABLE_STEP_NAMES,
     FORCE_PEAK_MEASURES,
@@ -87,10 +82,10 @@ class ReturnMapCycle(AbstractCycle):
     residual: Scalar
     n_iterations: Int[Array, ""]
     params: WheelParams
-    model: AbstractWheel
+    model: Any
 
     @property
-    def searched_wheel(self) -> tuple[AbstractWheel, WheelParams]:
+    def searched_wheel(self) -> tuple[Any, WheelParams]:
         return self.model, self.params
 
     def _drop_single_step_axis(self, tree_over_steps: Any) -> Any:
@@ -121,7 +116,7 @@ class ReturnMapCycle(AbstractCycle):
 
 
 def measure_return_map_force_peaks(
-    model: AbstractWheel,
+    model: Any,
     params: WheelParams,
     section_state: Array,
     step_ends: Array,
@@ -143,7 +138,7 @@ def measure_return_map_force_peaks(
 def find_return_map_cycle(
     params: WheelParams,
     section_state: Array,
-    model: AbstractWheel,
+    model: Any,
     options: StepOptions,
     period_n: int,
     uses_implicit_jvp: bool,
@@ -163,12 +158,17 @@ def find_return_map_cycle(
         model.collect_section_units(compute_wheel_units(params.symbols()), params.n_legs)
     )
 
-    def return_map(section_state: Array) -> Array:
-        for k in range(model.leg_period):
+    def take_steps(evaluate_step: Callable, section_state: Array, n_steps: int) -> list[Any]:
+        steps: list[Any] = []
+        for k in range(n_steps):
             step_params = model.select_params(params, k)
-            step = evaluate_step(step_params, section_state * section_units, options)
-            section_state = step.section_state / section_units
-        return section_state
+            steps.append(evaluate_step(step_params, section_state, options))
+            section_state = steps[-1].section_state
+        return steps
+
+    def return_map(section_state: Array) -> Array:
+        steps = take_steps(evaluate_step, section_state * section_units, model.leg_period)
+        return steps[-1].section_state / section_units
 
     fixed_point = find_fixed_point(
         return_map,
@@ -181,23 +181,15 @@ def find_return_map_cycle(
         x=fixed_point.x * section_units,
         jacobian=section_units[:, None] * fixed_point.jacobian / section_units,
     )
-    section_state = fixed_point.x
-    step_results = []
-    for k in range(period_n):
-        step_params = model.select_params(params, k)
-        step_results.append(model.take_step(step_params, section_state, options))
-        section_state = step_results[-1].section_state
+    steps = take_steps(model.take_step, fixed_point.x, period_n)
     return make_return_map_cycle(
-        params,
-        model,
-        fixed_point,
-        jax.tree.map(lambda *stacked_arrays: jnp.stack(stacked_arrays), *step_results),
+        params, model, fixed_point, jax.tree.map(lambda *x: jnp.stack(x), *steps)
     )
 
 
 def make_return_map_cycle(
     params: WheelParams,
-    model: AbstractWheel,
+    model: Any,
     fixed_point: FixedPointResult,
     gait_steps_of_cycle: Any,
 ) -> ReturnMapCycle:
@@ -230,7 +222,7 @@ def make_return_map_cycle(
 class AbstractReturnMapFinder(AbstractGaitFinder):
     """Finder of gaits as fixed points of the return map over `period_n` gait steps."""
 
-    model: AbstractWheel
+    model: Any
     n_legs: int = eqx.field(static=True)
     step_options: StepOptions
     period_n: int = eqx.field(static=True, default=1)
@@ -245,7 +237,7 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
 
     def prepare_search(
         self, params: WheelParams, cycle_guess: Any
-    ) -> tuple[WheelParams, Array, AbstractWheel, StepOptions]:
+    ) -> tuple[WheelParams, Array, Any, StepOptions]:
         """Return the wheel, the section state, the model and the options for a search near
         `cycle_guess`.
         """
@@ -285,43 +277,3 @@ class ReturnMapFinder(AbstractReturnMapFinder):
         measure_name for measure_name in cycle_measures if measure_name != "spectral_margin"
     )
     readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
-
-    @eqx.filter_jit
-    def find_gait(self, parameter_values: ParameterValues, cycle_guess: Array) -> Gait:
-        cycle, parameter_jacobian = evaluate_with_jacobian(
-            lambda parameter_values: self.find_cycle_from_values(parameter_values, cycle_guess),
-            parameter_values,
-        )
-        cycle_derivatives = move_derivative_axis_first(parameter_jacobian)
-        return make_return_map_gait(self.model, self.n_legs, cycle, cycle_derivatives)
-
-
-def make_return_map_gait(
-    model: AbstractWheel, n_legs: int, cycle: Any, cycle_derivatives: Any
-) -> Gait:
-    """Build a gait with the data that identify its branch.
-
-    The active phases do not identify a branch. With unilateral contact the order of events may
-    change on a branch.
-
-    - `cycle_derivatives`: derivatives of the cycle with respect to the parameters on the branch,
-      with a leading axis over the parameters.
-    """
-    gait_step = jax.tree.map(lambda x: x[0], cycle.steps)
-    step_derivatives = jax.tree.map(lambda x: x[:, 0], cycle_derivatives.steps)
-    n_coordinates = model.count_continuous_section_entries(WheelParams(n_legs=n_legs))
-    coordinates_and_derivatives = compute_value_and_tangents(
-        lambda cycle, gait_step: jnp.concatenate(
-            [cycle.section_state[:n_coordinates], gait_step.durations]
-        ),
-        (cycle, gait_step),
-        (cycle_derivatives, step_derivatives),
-    )
-    return_map_jacobian = cycle.monodromy_value[:n_coordinates, :n_coordinates]
-    return Gait(
-        cycle,
-        gait_step,
-        cycle_derivatives,
-        step_derivatives,
-        GaitBranchPoint(*coordinates_and_derivatives, jnp.ones(1), return_map_jacobian),
-    )

@@ -19,28 +19,24 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.gaits.attracting_gaits import find_slow_gaits
 from vrw_jax.gaits.finder import (
     Gait,
-    GaitMeasures,
     ParameterValues,
-    compute_gait_measures,
     compute_value_and_tangents,
     move_derivative_axis_first,
 )
 from vrw_jax.gaits.fixed_points import FixedPointResult
-from vrw_jax.gaits.gait_walks import stack_section_units
+from vrw_jax.gaits.further_search import replace_rows
+from vrw_jax.gaits.gait_walks import find_slow_gaits, stack_section_units
 from vrw_jax.gaits.return_map_finder import (
     AbstractReturnMapFinder,
     ReturnMapCycle,
     compute_newton_tolerance,
     find_return_map_cycle,
     make_return_map_cycle,
-    make_return_map_gait,
 )
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
-from vrw_jax.models.contact_walks import step_batch_with_jacobian
-from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES, UNILATERAL_DIFFERENTIABLE_NAMES
 from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.models.stepping import convert_step_arguments
@@ -94,15 +90,14 @@ class UnilateralFinder(AbstractReturnMapFinder):
     def find_cycles(self, params: WheelParams, cycle_guess: Any = None) -> Any:
         if has_traced_leaf(params, cycle_guess):
             return eqx.filter_vmap(self.find_cycle)(params, cycle_guess)
-        parameter_values = jax.vmap(self.model.collect_parameter_values)(params)
+        parameter_values = self.model.collect_batch_parameter_values(params)
         section_states = getattr(cycle_guess, "section_state", cycle_guess)
         if section_states is None:
             section_states = jax.vmap(self.model.compute_default_start)(params)
-        else:
-            section_states = jax.vmap(self.model.complete_section_state)(
-                params, jnp.asarray(section_states)
-            )
-        return self.find_cycles_near(parameter_values, section_states)
+        return self.find_cycles_near(
+            parameter_values,
+            self.complete_section_states(parameter_values, np.asarray(section_states)),
+        )
 
     def find_cycles_near(self, parameter_values: Any, section_states: Any) -> ReturnMapCycle:
         """Find one gait for each wheel near the given section states, without derivatives."""
@@ -112,6 +107,11 @@ class UnilateralFinder(AbstractReturnMapFinder):
             section_states,
             needs_parameter_derivatives=False,
         )
+
+    def complete_section_states(
+        self, parameter_values: np.ndarray, section_states: np.ndarray
+    ) -> np.ndarray:
+        return np.array(embed_section_states(parameter_values.T, section_states, self.n_legs))
 
     def precompile_newton_programs(self, parameter_values: np.ndarray) -> None:
         """Compile the programs of Newton's method while another thread computes walks toward its
@@ -168,7 +168,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
             needs_parameter_derivatives,
         )
         return map_in_batches(
-            functools.partial(evaluate_fixed_points, self.model, self.n_legs),
+            functools.partial(evaluate_fixed_points, self),
             self.gait_batch_sizes,
             parameter_values,
             *fixed_points_and_periods,
@@ -185,22 +185,12 @@ class UnilateralFinder(AbstractReturnMapFinder):
         )
         return _remove_batch_axis(steps)
 
-    def measure_gait(
-        self, parameter_values: ParameterValues, cycle_guess: Any, measure_names: tuple[str, ...]
-    ) -> GaitMeasures:
-        """Return measures of a gait and their derivatives, computed from one Jacobian of the gait
-        step.
-        """
-        section_state = getattr(cycle_guess, "section_state", cycle_guess)
-        if section_state is None:
-            section_state = self.make_initial_guess(parameter_values)
+    def refine_cycle_guess(self, parameter_values: ParameterValues, cycle_guess: Any) -> Array:
         model, params = self.model.from_parameter_values(
             tuple(jax.device_put(list(np.asarray(parameter_values)))), self.n_legs
         )
-        section_state = convert_step_arguments(params, section_state, model, self.step_options)[1]
-        return compute_gait_measures(
-            self.find_gait(parameter_values, section_state), type(self).read_measure, measure_names
-        )
+        section_state = getattr(cycle_guess, "section_state", cycle_guess)
+        return convert_step_arguments(params, section_state, model, self.step_options)[1]
 
 
 def _add_batch_axis(x: Array) -> Array:
@@ -227,11 +217,6 @@ class PeriodMap(NamedTuple):
     period_n: int
     parameter_values: np.ndarray  # (wheels, n_parameter_values)
 
-    @property
-    def section_units_by_wheel(self) -> np.ndarray:
-        """Return the units of the section state of each wheel, shape (wheels, section)."""
-        return stack_section_units(self.model, self.parameter_values, self.n_legs)
-
     def evaluate_period(
         self,
         step_options: StepOptions,
@@ -244,102 +229,72 @@ class PeriodMap(NamedTuple):
 
         The derivatives are with respect to the selected parameter values and to the section states.
         """
-        steps_and_jacobians = []
-        n_parameter_values = self.parameter_values.shape[1]
-        n_section_entries = section_states.shape[1]
-        period_jacobian = np.concatenate(
-            [np.zeros((n_section_entries, n_parameter_values)), np.eye(n_section_entries)], 1
-        )[None]
-        is_period_complete = np.ones(len(section_states), bool)
-        is_input_differentiated = np.concatenate(
-            [
-                np.broadcast_to(is_value_differentiated, n_parameter_values),
-                np.broadcast_to(is_start_differentiated, n_section_entries),
-            ]
-        )
-        input_indices = np.flatnonzero(is_input_differentiated).tolist()
-        input_columns = self.parameter_values.T.copy()
+        n_wheels, n_values = self.parameter_values.shape
+        n_entries = section_states.shape[1]
+        steps = []
+        jacobian = np.eye(n_entries, n_values + n_entries, n_values)[None]
+        is_complete = np.ones(n_wheels, bool)
+        is_differentiated = np.repeat([is_start_differentiated], n_values + n_entries)
+        is_differentiated[:n_values] = is_value_differentiated
+        input_indices = np.flatnonzero(is_differentiated).tolist()
+        columns, states = self.parameter_values.T.copy(), section_states
         for k in range(self.period_n):
             if k > 0:
-                self.model.exchange_legs(input_columns)
-            step_result, step_result_jacobians = step_batch_with_jacobian(
-                input_columns,
-                section_states,
-                self.model,
-                step_options,
-                self.n_legs,
-                input_indices,
+                self.model.exchange_legs(columns)
+            step, step_jacobians = step_batch_with_jacobian(
+                columns, states, self.model, step_options, self.n_legs, input_indices
             )
-            steps_and_jacobians.append((step_result, step_result_jacobians))
-            is_period_complete &= np.asarray(step_result.outcome) == Outcome.STEPPED
-            section_states = np.asarray(step_result.section_state)
-            step_jacobian = np.asarray(step_result_jacobians.section_state)
-            period_jacobian = step_jacobian[:, :, n_parameter_values:] @ period_jacobian
-            period_jacobian[:, :, :n_parameter_values] += step_jacobian[:, :, :n_parameter_values]
-        gait_steps_of_period, step_jacobians = jax.tree.map(
-            lambda *stacked_arrays: np.stack(stacked_arrays, 1), *steps_and_jacobians
-        )
+            steps.append((step, step_jacobians))
+            is_complete &= np.asarray(step.outcome) == Outcome.STEPPED
+            states = np.asarray(step.section_state)
+            step_jacobian = np.asarray(step_jacobians.section_state)
+            jacobian = step_jacobian[:, :, n_values:] @ jacobian
+            jacobian[:, :, :n_values] += step_jacobian[:, :, :n_values]
+        gait_steps, step_jacobians = jax.tree.map(lambda *x: np.stack(x, 1), *steps)
         return PeriodEvaluation(
-            gait_steps_of_period,
+            gait_steps,
             step_jacobians,
-            section_states,
-            period_jacobian[:, :, :n_parameter_values],
-            period_jacobian[:, :, n_parameter_values:],
-            is_period_complete,
+            states - section_states,
+            jacobian[:, :, :n_values],
+            jacobian[:, :, n_values:],
+            is_complete,
         )
 
 
 class PeriodEvaluation(NamedTuple):
-    """Gait steps of one period with their Jacobians and end states, and whether each period is
-    complete.
-    """
+    """Gait steps of one period, and whether each period is complete."""
 
-    gait_steps_of_period: Any
+    gait_steps: Any
     step_jacobians: Any
-    end_states: np.ndarray
+    defects: np.ndarray  # changes of the section states
     parameter_jacobian: np.ndarray
     return_map_jacobian: np.ndarray
-    is_period_complete: np.ndarray
+    is_complete: np.ndarray
 
-    def compute_newton_correction(
-        self, section_states: np.ndarray, return_map_jacobian: np.ndarray
-    ) -> np.ndarray:
+    def compute_newton_correction(self, return_map_jacobian: np.ndarray) -> np.ndarray:
         """Return Newton's correction of the section states, which is zero if a period
         is not complete.
         """
-        newton_correction = np.zeros_like(section_states)
-        newton_matrix = (
-            np.eye(section_states.shape[1]) - return_map_jacobian[self.is_period_complete]
-        )
-        period_defects = (self.end_states - section_states)[self.is_period_complete]
-        newton_correction[self.is_period_complete] = solve_linear_systems(
-            newton_matrix, period_defects[..., None]
+        correction, is_complete = np.zeros_like(self.defects), self.is_complete
+        correction[is_complete] = solve_linear_systems(
+            np.eye(correction.shape[1]) - return_map_jacobian[is_complete],
+            self.defects[is_complete, :, None],
         )[..., 0]
-        return newton_correction
+        return correction
 
 
-def solve_linear_systems(
-    linear_system_matrices: np.ndarray, right_hand_sides: np.ndarray
-) -> np.ndarray:
+def solve_linear_systems(matrices: np.ndarray, right_hand_sides: np.ndarray) -> np.ndarray:
     """Solve many linear systems.
 
     The solution of a singular system is NaN. The first axis of matrices and right sides is that of
     the systems.
     """
     try:
-        return np.linalg.solve(linear_system_matrices, right_hand_sides)
+        return np.linalg.solve(matrices, right_hand_sides)
     except np.linalg.LinAlgError:
-        is_matrix_regular = np.abs(np.linalg.det(linear_system_matrices)) > 0.0
-        regular_matrices = np.where(
-            is_matrix_regular[:, None, None],
-            linear_system_matrices,
-            np.eye(linear_system_matrices.shape[-1]),
-        )
-        return np.where(
-            is_matrix_regular[:, None, None],
-            np.linalg.solve(regular_matrices, right_hand_sides),
-            np.nan,
-        )
+        is_regular = (np.abs(np.linalg.det(matrices)) > 0.0)[:, None, None]
+        regular_matrices = np.where(is_regular, matrices, np.eye(matrices.shape[-1]))
+        return np.where(is_regular, np.linalg.solve(regular_matrices, right_hand_sides), np.nan)
 
 
 # Tolerance of gait steps that start far from a gait.
@@ -362,43 +317,34 @@ def find_contact_fixed_points(
     `step_options`, with the same Jacobian. One more step evaluates the gait with all derivatives.
     If loose steps move away from a state that an exact step hardly changes, all steps are exact.
     """
-    loose_step_options = replace(
-        step_options,
-        rtol=jnp.maximum(step_options.rtol, STEP_TOLERANCE_FAR_FROM_GAIT),
-        atol=jnp.maximum(step_options.atol, STEP_TOLERANCE_FAR_FROM_GAIT),
-    )
-    loose_fixed_points, loose_evaluation = _run_contact_newton(
+    loosen = lambda tolerance: jnp.maximum(tolerance, STEP_TOLERANCE_FAR_FROM_GAIT)
+    loose, loose_evaluation = _run_contact_newton(
         period_map,
-        loose_step_options,
+        replace(step_options, rtol=loosen(step_options.rtol), atol=loosen(step_options.atol)),
         start_states,
         False,
         MAX_CORRECTION_NEAR_GAIT,
         np.ones(len(start_states), bool),
     )
-    is_near_gait = np.asarray(loose_fixed_points.converged)
-    section_states = np.where(is_near_gait[:, None], loose_fixed_points.x, start_states)
-    section_units = period_map.section_units_by_wheel
+    is_near_gait = np.asarray(loose.converged)
+    section_states = np.where(is_near_gait[:, None], loose.x, start_states)
+    units = stack_section_units(period_map.model, period_map.parameter_values, period_map.n_legs)
+    is_small = lambda change: np.abs(change / units).max(-1) < MAX_CORRECTION_NEAR_GAIT
     exact_evaluation = period_map.evaluate_period(step_options, section_states, False, False)
-    newton_correction = exact_evaluation.compute_newton_correction(
-        section_states, loose_evaluation.return_map_jacobian
-    )
-    section_states[is_near_gait] += newton_correction[is_near_gait] * (
-        np.abs(newton_correction / section_units)[is_near_gait].max(-1, keepdims=True)
-        < MAX_CORRECTION_NEAR_GAIT
-    )
-    period_defects = np.abs((exact_evaluation.end_states - section_states) / section_units).max(-1)
-    exact_fixed_points, period_evaluation = _run_contact_newton(
+    correction = exact_evaluation.compute_newton_correction(loose_evaluation.return_map_jacobian)
+    correction[~(is_near_gait & is_small(correction))] = 0.0
+    is_repeating = exact_evaluation.is_complete & is_small(exact_evaluation.defects - correction)
+    exact, period_evaluation = _run_contact_newton(
         period_map,
         step_options,
-        section_states,
+        section_states + correction,
         needs_parameter_derivatives,
         float(compute_newton_tolerance(step_options)),
-        is_near_gait
-        | (exact_evaluation.is_period_complete & (period_defects < MAX_CORRECTION_NEAR_GAIT)),
+        is_near_gait | is_repeating,
         stops_at_small_correction=False,
     )
-    n_iterations = loose_fixed_points.n_iterations + 1 + exact_fixed_points.n_iterations
-    return exact_fixed_points._replace(n_iterations=n_iterations), period_evaluation
+    n_iterations = loose.n_iterations + 1 + exact.n_iterations
+    return exact._replace(n_iterations=n_iterations), period_evaluation
 
 
 # Largest number of Newton iterations.
@@ -415,7 +361,7 @@ def _run_contact_newton(
     start_states: np.ndarray,
     needs_parameter_derivatives: bool,
     newton_tolerance: float,
-    is_wheel_requested: np.ndarray,
+    is_requested: np.ndarray,
     stops_at_small_correction: bool = True,
 ) -> tuple[FixedPointResult, PeriodEvaluation]:
     """Run Newton's method on the requested wheels until corrections are small.
@@ -425,161 +371,103 @@ def _run_contact_newton(
     gait is evaluated again at the corrected state. Two small corrections in succession are then
     needed, because the map may jump between two states if a foot grazes the ground.
     """
-    n_wheels = len(start_states)
-    section_states = start_states.copy()
-    last_section_states = start_states.copy()
-    section_units = period_map.section_units_by_wheel
-    newton_residuals = np.full(n_wheels, np.inf)
-    n_iterations = np.zeros(n_wheels, np.int32)
-    n_correction_halvings = np.zeros(n_wheels, int)
-    had_small_correction = np.zeros(n_wheels, bool)
-    is_gait_found = np.zeros(n_wheels, bool)
-    period_evaluation = None
-    active_wheels = np.arange(n_wheels)
-    for _ in range(MAX_CONTACT_NEWTON_ITERATIONS + MAX_CORRECTION_HALVINGS):
-        active_states = section_states[active_wheels]
-        active_map = period_map._replace(
-            parameter_values=period_map.parameter_values[active_wheels]
+    n_wheels, values = len(start_states), period_map.parameter_values
+    x, last_x = start_states.copy(), start_states.copy()
+    units = stack_section_units(period_map.model, values, period_map.n_legs)
+    residuals = np.full(n_wheels, np.inf)
+    n_iterations, n_halvings = np.zeros(n_wheels, np.int32), np.zeros(n_wheels, int)
+    was_small, is_found = np.zeros((2, n_wheels), bool)
+    evaluation, active = None, np.arange(n_wheels)
+    while len(active):
+        new = period_map._replace(parameter_values=values[active]).evaluate_period(
+            step_options, x[active], needs_parameter_derivatives
         )
-        active_evaluation = active_map.evaluate_period(
-            step_options, active_states, needs_parameter_derivatives
-        )
-        if period_evaluation is None:
-            period_evaluation = jax.tree.map(np.array, active_evaluation)
-        for stored_array, new_array in zip(
-            jax.tree.leaves(period_evaluation), jax.tree.leaves(active_evaluation), strict=True
-        ):
-            stored_array[active_wheels] = new_array
-        newton_correction = active_evaluation.compute_newton_correction(
-            active_states, active_evaluation.return_map_jacobian
-        )
-        correction_size = np.abs(newton_correction / section_units[active_wheels]).max(-1)
-        is_correction_valid = active_evaluation.is_period_complete & np.isfinite(
-            newton_correction
-        ).all(-1)
-        newton_residuals[active_wheels] = np.abs(
-            (active_evaluation.end_states - active_states) / section_units[active_wheels]
-        ).max(-1)
-        n_iterations[active_wheels] += 1
-        has_small_correction = is_correction_valid & (correction_size <= newton_tolerance)
-        has_converged = has_small_correction & (
-            had_small_correction[active_wheels]
-            | (correction_size <= CLEAR_CONVERGENCE_FRACTION * newton_tolerance)
-        )
-        had_small_correction[active_wheels] = has_small_correction
-        is_state_moved = is_correction_valid & (stops_at_small_correction | ~has_converged)
-        moved_wheels = active_wheels[is_state_moved]
-        last_section_states[moved_wheels] = section_states[moved_wheels]
-        section_states[moved_wheels] += newton_correction[is_state_moved]
-        n_correction_halvings[moved_wheels] = 0
-        failed_wheels = active_wheels[~is_correction_valid]
-        section_states[failed_wheels] = 0.5 * (
-            section_states[failed_wheels] + last_section_states[failed_wheels]
-        )
+        # The first evaluation is that of all wheels.
+        evaluation = new if evaluation is None else replace_rows(evaluation, active, new)
+        correction = new.compute_newton_correction(new.return_map_jacobian)
+        size = np.abs(correction / units[active]).max(-1)
+        is_valid = new.is_complete & np.isfinite(correction).all(-1)
+        residuals[active] = np.abs(new.defects / units[active]).max(-1)
+        n_iterations[active] += 1
+        is_small = is_valid & (size <= newton_tolerance)
+        is_clear = was_small[active] | (size <= CLEAR_CONVERGENCE_FRACTION * newton_tolerance)
+        has_converged = is_small & (stops_at_small_correction | is_clear)
+        was_small[active] = is_small
+        is_moved = is_valid & (stops_at_small_correction | ~has_converged)
+        moved, failed = active[is_moved], active[~is_valid]
+        last_x[moved] = x[moved]
+        x[moved] += correction[is_moved]
+        n_halvings[moved] = 0
+        x[failed] = 0.5 * (x[failed] + last_x[failed])
         # Discrete codes are not halved.
-        section_states[failed_wheels, -period_map.n_legs :] = last_section_states[
-            failed_wheels, -period_map.n_legs :
-        ]
-        n_correction_halvings[failed_wheels] += 1
-        is_gait_found[active_wheels] = is_wheel_requested[active_wheels] & (
-            has_small_correction if stops_at_small_correction else has_converged
-        )
-        has_wheel_failed = (
-            (n_correction_halvings > MAX_CORRECTION_HALVINGS)
-            | (n_iterations > MAX_CONTACT_NEWTON_ITERATIONS)
-            | ~is_wheel_requested
-        )
-        active_wheels = active_wheels[~(is_gait_found | has_wheel_failed)[active_wheels]]
-        if not len(active_wheels):
-            break
-    assert period_evaluation is not None
-    fixed_points: Any = (
-        section_states,
-        period_evaluation.return_map_jacobian,
-        newton_residuals,
-        is_gait_found,
-        n_iterations,
-    )
-    return FixedPointResult(*fixed_points), period_evaluation
+        x[failed, -period_map.n_legs :] = last_x[failed, -period_map.n_legs :]
+        n_halvings[failed] += 1
+        is_found[active] = is_requested[active] & has_converged
+        is_running = is_requested & ~is_found & (n_halvings <= MAX_CORRECTION_HALVINGS)
+        active = active[(is_running & (n_iterations <= MAX_CONTACT_NEWTON_ITERATIONS))[active]]
+    assert evaluation is not None
+    results: Any = (x, evaluation.return_map_jacobian, residuals, is_found, n_iterations)
+    return FixedPointResult(*results), evaluation
 
 
 def _make_contact_cycle(
-    model: AbstractWheel,
-    n_legs: int,
+    gait_finder: UnilateralFinder,
     parameter_values: Array,
     fixed_point: FixedPointResult,
-    period_evaluation: PeriodEvaluation,
+    evaluation: PeriodEvaluation,
 ) -> ReturnMapCycle:
-    wheel_model, params = model.from_parameter_values(parameter_values, n_legs)
-    return make_return_map_cycle(
-        params, wheel_model, fixed_point, period_evaluation.gait_steps_of_period
+    wheel_model, params = gait_finder.model.from_parameter_values(
+        parameter_values, gait_finder.n_legs
     )
+    return make_return_map_cycle(params, wheel_model, fixed_point, evaluation.gait_steps)
 
 
 def _make_contact_gait(
-    model: AbstractWheel,
-    n_legs: int,
+    gait_finder: UnilateralFinder,
     parameter_values: Array,
     fixed_point: FixedPointResult,
-    period_evaluation: Any,
+    evaluation: PeriodEvaluation,
 ) -> Gait:
     """Build the gait that belongs to a fixed point, with derivatives by the implicit
     function theorem.
     """
-    n_parameter_values = len(parameter_values)
-    section_state = fixed_point.x
-    identity_matrix = jnp.eye(len(section_state), dtype=section_state.dtype)
-    newton_matrix = jnp.where(
-        fixed_point.converged,
-        identity_matrix - period_evaluation.return_map_jacobian,
-        identity_matrix,
+    jacobian = jnp.where(fixed_point.converged, evaluation.return_map_jacobian, 0.0)
+    eye = functools.partial(jnp.eye, dtype=jacobian.dtype)
+    start_derivatives = jnp.linalg.solve(
+        eye(len(jacobian)) - jacobian, evaluation.parameter_jacobian
     )
-    section_state_derivatives = jnp.linalg.solve(
-        newton_matrix, period_evaluation.parameter_jacobian
-    )
-    state_derivatives = section_state_derivatives
-    derivatives_by_step = []
-    for step_index in range(len(period_evaluation.step_jacobians.section_state)):
-        input_tangents = jnp.concatenate(
-            [jnp.eye(n_parameter_values, dtype=identity_matrix.dtype), state_derivatives]
-        )
+    state_derivatives, derivatives_by_step = start_derivatives, []
+    for k in range(len(evaluation.step_jacobians.section_state)):
+        input_tangents = jnp.concatenate([eye(len(parameter_values)), state_derivatives])
         step_tangents = jax.tree.map(
-            lambda step_jacobian, step_index=step_index, input_tangents=input_tangents: (
-                step_jacobian[step_index] @ input_tangents
-            ),
-            period_evaluation.step_jacobians,
+            lambda step_jacobian, k=k, tangents=input_tangents: step_jacobian[k] @ tangents,
+            evaluation.step_jacobians,
         )
         derivatives_by_step.append(move_derivative_axis_first(step_tangents))
         state_derivatives = step_tangents.section_state
-    step_derivatives = jax.tree.map(
-        lambda *stacked_arrays: jnp.stack(stacked_arrays, 1), *derivatives_by_step
-    )
+    step_derivatives = jax.tree.map(lambda *x: jnp.stack(x, 1), *derivatives_by_step)
 
     # The derivative of the Jacobian is unknown, so measures of the Jacobian are not in
     # `differentiable_measures`.
-    def make_cycle(parameter_values: Array, section_state: Array, gait_steps: Any) -> Any:
-        return _make_contact_cycle(
-            model,
-            n_legs,
+    def make_cycle(parameter_values: Array, x: Array, gait_steps: Any) -> Any:
+        cycle = _make_contact_cycle(
+            gait_finder,
             parameter_values,
-            fixed_point._replace(x=section_state),
-            period_evaluation._replace(gait_steps_of_period=gait_steps),
+            fixed_point._replace(x=x),
+            evaluation._replace(gait_steps=gait_steps),
         )
+        return eqx.filter(cycle, eqx.is_inexact_array)
 
     _, cycle_derivatives = compute_value_and_tangents(
-        lambda *inputs: eqx.filter(make_cycle(*inputs), eqx.is_inexact_array),
-        (parameter_values, section_state, period_evaluation.gait_steps_of_period),
-        (
-            jnp.eye(n_parameter_values, dtype=parameter_values.dtype),
-            section_state_derivatives.T,
-            step_derivatives,
-        ),
+        make_cycle,
+        (parameter_values, fixed_point.x, evaluation.gait_steps),
+        (eye(len(parameter_values)), start_derivatives.T, step_derivatives),
     )
-    cycle = _make_contact_cycle(model, n_legs, parameter_values, fixed_point, period_evaluation)
-    return make_return_map_gait(model, n_legs, cycle, cycle_derivatives)
+    cycle = _make_contact_cycle(gait_finder, parameter_values, fixed_point, evaluation)
+    return gait_finder.make_gait(cycle, cycle_derivatives)
 
 
 _make_contact_cycles, _make_contact_gaits = (
-    eqx.filter_jit(eqx.filter_vmap(make_result_of_wheel, in_axes=(None, None, 0, 0, 0)))
+    eqx.filter_jit(eqx.filter_vmap(make_result_of_wheel, in_axes=(None, 0, 0, 0)))
     for make_result_of_wheel in (_make_contact_cycle, _make_contact_gait)
 )

@@ -32,10 +32,10 @@ from vrw_jax.base.walker import (
     is_own_walker,
     name_coordinates,
 )
-from vrw_jax.gaits.attractors import find_distinct_orbits, measure_orbit_steps, walk_until_periodic
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.gait_search import limit_cycle
-from vrw_jax.gaits.hybrid_gait import HybridGait
+from vrw_jax.gaits.gait_walks import find_distinct_orbits, measure_orbit_steps, walk_until_periodic
+from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     POST_LANDING_COMPONENT_NAMES,

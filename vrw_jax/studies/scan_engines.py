@@ -32,11 +32,11 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.gaits.attracting_gaits import find_slow_gaits
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.finder import MeasureReader, confirm_outcome_by_step, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.further_search import MeshSearch, replace_rows, search_further
+from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder

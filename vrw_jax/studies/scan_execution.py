@@ -29,7 +29,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait, report_progress
 from vrw_jax.branches.branch import SpecialPointCurve
-from vrw_jax.branches.special_point_map import (
+from vrw_jax.branches.special_point_curves import (
     SPECIAL_POINT_MEASURES,
     ScanSignChange,
     trace_special_points,

@@ -25,7 +25,7 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.flow.phase_integration import sample_phase
-from vrw_jax.gaits.hybrid_gait import HybridGait
+from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import concatenate_tree_rows, map_in_batches, select_tree_rows
 from vrw_jax.models.stepping import ModelLike
