@@ -484,7 +484,7 @@ class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
         """
         names = self.model.parameter_names
         slope, friction = (values[..., names.index(name)] for name in ("slope", FRICTION_NAME))
-        return friction - np.tan(slope) * (1.0 + MIN_FRICTION_SURPLUS)
+        return np.asarray(friction - np.tan(slope) * (1.0 + MIN_FRICTION_SURPLUS))
 
     def is_admissible(self, wheel: BranchWheel, z: np.ndarray, p: float) -> bool:
         """Return whether friction can balance the component of the weight parallel to the slope."""
