@@ -379,6 +379,11 @@ def compute_event_time_tangent(
     return event_time_tangent
 
 
+def has_guard_crossed(guard_value: Array, guard_rate: Array) -> Array:
+    """Return whether a guard has fallen through zero: it is negative, or zero and not rising."""
+    return (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
+
+
 def find_first_guard(is_guard_met: Sequence[Array] | Array, index_if_none: int) -> Array:
     """Return the index of the first guard whose flag is True, or `index_if_none`."""
     first_guard = jnp.full(is_guard_met[0].shape, index_if_none, jnp.int32)
@@ -396,10 +401,8 @@ def _classify_guard_crossing(
     - `start_guard_value`: value of the guard at the start of the solver step;
     - `guard_value`, `guard_rate`: value and time derivative of the guard after `step_length`, s.
     """
-    # A guard that rises from zero has not crossed.
-    has_crossed = (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
     linear_decrease = guard_rate * step_length
-    return has_crossed, jnp.abs(
+    return has_guard_crossed(guard_value, guard_rate), jnp.abs(
         2.0 * (start_guard_value - guard_value + linear_decrease) * guard_value
     ) > 0.25 * linear_decrease * linear_decrease
 

@@ -24,6 +24,7 @@ from vrw_jax.flow.event_location import (
     IntegratorState,
     compute_event_time_tangent,
     find_first_guard,
+    has_guard_crossed,
     locate_event,
 )
 from vrw_jax.flow.minima import (
@@ -235,8 +236,7 @@ def integrate_to_event(
         phase.evaluate_with_rates(phase.evaluate_guards, start_state)
     )
     is_guard_met_at_start = phase.guards_met_at_start or tuple(
-        (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
-        for guard_value, guard_rate in zip(guard_values, guard_rates, strict=True)
+        map(has_guard_crossed, guard_values, guard_rates)
     )
     # The index is that of the first guard whose event is the start itself.
     start_event_guard_index = find_first_guard(is_guard_met_at_start, -1)
@@ -254,7 +254,7 @@ def integrate_to_event(
         straggler_count,
         phase_tangents,
     )
-    has_guard_crossed = integrator_state.has_guard_crossed
+    is_crossing = integrator_state.has_guard_crossed
     if phase.margins_include_start or phase_tangents is not None:
         # The functions are called, not inlined, because the program is already long.
         phase = _wrap_each_phase_function(phase, lanes.mark_noinline)
@@ -262,12 +262,12 @@ def integrate_to_event(
     event_search = locate_event(
         phase, solver_step_function, tableau, lax.stop_gradient(integrator_state), options
     )
-    is_crossing_event_unresolved = has_guard_crossed & event_search.is_event_unresolved
+    is_crossing_event_unresolved = is_crossing & event_search.is_event_unresolved
     duration = integrator_state.elapsed_time + jnp.where(
-        has_guard_crossed, event_search.event_step_length, 0.0
+        is_crossing, event_search.event_step_length, 0.0
     )
     end_state = select_trees_by_condition(
-        has_guard_crossed, event_search.end_state, integrator_state.state
+        is_crossing, event_search.end_state, integrator_state.state
     )
     margin_minima_state, margin_minima_result = integrator_state.margin_minima_state, None
     if margin_minima_state is not None:
@@ -277,7 +277,7 @@ def integrate_to_event(
             integrator_state.state,
             end_state,
             event_search.event_step_length,
-            has_guard_crossed,
+            is_crossing,
             integrator_state.state_tangents,
         )
         margin_minima_result = refine_margin_minima(
@@ -289,12 +289,12 @@ def integrate_to_event(
             min_iterations=3 if phase.has_exact_events else 1,
         )
     is_event_too_late = (
-        has_guard_crossed & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
+        is_crossing & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
     )
     event_guard_index = jnp.where(
         is_active & (start_event_guard_index >= 0),
         start_event_guard_index,
-        jnp.where(has_guard_crossed, event_search.guard_index, -1),
+        jnp.where(is_crossing, event_search.guard_index, -1),
     )
     phase_end = PhaseEnd(
         state=end_state,
@@ -306,7 +306,7 @@ def integrate_to_event(
         | is_event_too_late,
         is_unfinished=integrator_state.is_running,
         solver_steps=integrator_state.n_tried_steps
-        + jnp.where(has_guard_crossed, event_search.n_tried_steps, 0),
+        + jnp.where(is_crossing, event_search.n_tried_steps, 0),
         next_solver_dt=integrator_state.next_step_length,
         margin_minima=None
         if margin_minima_result is None
@@ -498,8 +498,8 @@ def _classify_solver_step(
     is_running = integrator_state.is_running
     is_valid_step = is_running & ~is_step_rejected
     is_guard_met = functools.reduce(jnp.logical_or, [value <= 0.0 for value in end_guard_values])
-    has_guard_crossed = is_valid_step & is_guard_met
-    is_accepted = is_valid_step & ~has_guard_crossed
+    is_crossing = is_valid_step & is_guard_met
+    is_accepted = is_valid_step & ~is_crossing
     step_length = integrator_state.next_step_length
     elapsed_time = integrator_state.elapsed_time
     phase_time_limit = options.max_phase_time
@@ -520,7 +520,7 @@ def _classify_solver_step(
     integration_status = jnp.where(
         has_timed_out,
         IntegrationStatus.TIMED_OUT,
-        jnp.where(has_guard_crossed, IntegrationStatus.CROSSED, integration_status),
+        jnp.where(is_crossing, IntegrationStatus.CROSSED, integration_status),
     )
     integration_status = jnp.where(
         is_running, integration_status, integrator_state.integration_status
@@ -528,9 +528,7 @@ def _classify_solver_step(
     next_state = integrator_state._replace(
         integration_status=integration_status.astype(jnp.int32),
         elapsed_time=elapsed_time,
-        next_step_length=jnp.where(
-            is_running & ~has_guard_crossed, next_step_length_limit, step_length
-        ),
+        next_step_length=jnp.where(is_running & ~is_crossing, next_step_length_limit, step_length),
     )
     return next_state, is_accepted
 

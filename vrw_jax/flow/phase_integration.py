@@ -23,7 +23,7 @@ from vrw_jax import lanes
 from vrw_jax.base.elementwise import select_entry_by_mask
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS
+from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS, has_guard_crossed
 from vrw_jax.flow.integrate import (
     PhaseEnd,
     SearchEnd,
@@ -85,7 +85,7 @@ class GuardsAndMargins(NamedTuple):
         time derivative. Only then does the event time depend on the start state.
         """
         is_guard_zero = guard_values == 0.0
-        is_guard_met = (guard_values < 0.0) | (is_guard_zero & (guard_rates <= 0.0))
+        is_guard_met = has_guard_crossed(guard_values, guard_rates)
         if self.guard_scales is not None:
             guard_roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
             is_guard_zero = guard_values >= -guard_roundoff * self.guard_scales

@@ -27,7 +27,11 @@ from jaxtyping import Array
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS, find_first_guard
+from vrw_jax.flow.event_location import (
+    GUARD_ROUNDOFF_IN_EPS,
+    find_first_guard,
+    has_guard_crossed,
+)
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
     compute_step_size_factor,
@@ -257,9 +261,7 @@ def init_contact_interval(
     is_initiating = is_initiating | (
         (guard_values <= guard_roundoff) & (guard_rates > min_initiating_guard_rate)
     )
-    is_guard_triggered = ~is_initiating & (
-        (guard_values < 0.0) | ((guard_values == 0.0) & (guard_rates <= 0.0))
-    )
+    is_guard_triggered = ~is_initiating & has_guard_crossed(guard_values, guard_rates)
     guard_offset = jnp.where(is_initiating, guard_values - 2.0 * guard_roundoff, 0.0)
     float_zero_lanes = jnp.zeros_like(motion.x)
     int_zero_lanes = jnp.zeros(motion.x.shape, jnp.int32)
@@ -537,12 +539,12 @@ def advance_running_lanes(
         & (attempted_step.guard_minimum_fraction < 1.0)
         & (start_time + h * attempted_step.guard_minimum_fraction > start_time)
     )
-    has_guard_crossed = (
+    is_crossing = (
         is_step_accurate & ~must_retry_step & jnp.any(attempted_step.guard_values <= 0.0, axis=0)
     )
-    is_accepted = is_step_accurate & ~must_retry_step & ~has_guard_crossed
+    is_accepted = is_step_accurate & ~must_retry_step & ~is_crossing
     next_bracket, search_step_size, event_time_shift, has_reached_event, event_guard = (
-        _iterate_event_search(lane_states, attempted_step, has_guard_crossed, guard_scales, options)
+        _iterate_event_search(lane_states, attempted_step, is_crossing, guard_scales, options)
     )
     step_size_ratio = jnp.where(
         must_retry_step,
@@ -558,7 +560,7 @@ def advance_running_lanes(
     )
     reached_time = jnp.where(is_accepted, end_time, start_time)
     next_step_size = jnp.where(
-        is_searching | has_guard_crossed,
+        is_searching | is_crossing,
         search_step_size,
         jnp.minimum(h * step_size_ratio, latest_event_time - reached_time),
     )
@@ -623,7 +625,7 @@ EVENT_TIME_TOLERANCE_FACTOR = 30.0
 def _iterate_event_search(
     lane_states: ContactIntervalState,
     attempted_step: AttemptedSolverStep,
-    has_guard_crossed: Array,
+    is_crossing: Array,
     guard_scales: Array,
     options: StepOptions,
 ) -> tuple[EventBracket, Array, Array, Array, Array]:
@@ -665,8 +667,8 @@ def _iterate_event_search(
     upper_step_size_bound = jnp.where(
         is_searching & is_past_event, h, event_bracket.upper_step_size_bound
     )
-    lower_step_size_bound = jnp.where(has_guard_crossed, 0.0, lower_step_size_bound)
-    upper_step_size_bound = jnp.where(has_guard_crossed, h, upper_step_size_bound)
+    lower_step_size_bound = jnp.where(is_crossing, 0.0, lower_step_size_bound)
+    upper_step_size_bound = jnp.where(is_crossing, h, upper_step_size_bound)
     time_resolution = 1e3 * jnp.finfo(h.dtype).eps * (lane_states.time_since_event + h)
     time_tolerance = jnp.maximum(EVENT_TIME_TOLERANCE_FACTOR * options.rtol * h, time_resolution)
     time_tolerance = jnp.where(is_searching, event_bracket.time_tolerance, time_tolerance)
@@ -706,7 +708,7 @@ def _iterate_event_search(
     guard_index = jnp.where(is_guard_within_roundoff, lowest_guard, guard_index)
     is_within_tolerance = is_searching & (jnp.abs(event_time_shift) <= time_tolerance)
     n_iterations = jnp.where(is_searching, event_bracket.n_iterations + 1, 0)
-    is_event_search_active = (is_searching | has_guard_crossed) & ~is_within_tolerance
+    is_event_search_active = (is_searching | is_crossing) & ~is_within_tolerance
     next_bracket = EventBracket(
         is_event_search_active,
         is_guard_crossing,
