@@ -77,6 +77,35 @@ def test_a_walk_takes_a_parameter_for_each_step_and_a_batch_walks_as_one(walker)
     assert batch.n_stepped.tolist() == [3, 3, 3]
 
 
+def test_a_walk_that_enters_a_mode_beyond_a_guard_says_so():
+    buried = dataclasses.replace(
+        BALL_SYSTEM, embed=lambda x, p: jnp.stack([jnp.where(x[0] < 1.8, -0.1, 0.0), x[0]])
+    )
+    walk = vrw.walk(BALL_PARAMS, [1.0], 2, model=buried)
+    assert walk.steps.outcome.tolist() == [vrw.Outcome.GUARD_VIOLATED] * 2
+    assert "guards" in walk.ending
+    batch = vrw.step_batch(BALL_PARAMS, np.array([[1.0], [2.0]]), model=buried)
+    assert batch.outcome.tolist() == [vrw.Outcome.GUARD_VIOLATED, vrw.Outcome.STEPPED]
+
+
+def test_section_coordinates_of_another_length_are_refused():
+    with pytest.raises(ValueError, match="x has 2 entries, but project returns"):
+        BALL_SYSTEM.step(BALL_PARAMS, [2.0, 1.0])
+
+
+def test_figures_show_the_results_of_any_walker():
+    walker = JuggledBall()
+    design = vrw.grid({"kick": [0.5, 1.0], "ball.restitution": [0.4, 0.5]})
+    scan = vrw.scan(design, ["period", "height"], base=BALL_PARAMS, model=walker)
+    (figure,) = vrw.plot.scan_figures(scan).values()
+    assert figure.axes[-1].get_ylabel() or len(figure.axes) > 3
+    assert vrw.plot.map_figure(scan, "height", []).axes[0].get_xlabel()
+    tornado = vrw.plot.tornado_figure(vrw.sensitivities(BALL_PARAMS, model=walker))
+    assert [axes.get_title() for axes in tornado.axes][1:] == ["velocity", "height"]
+    tuned = vrw.tune(BALL_PARAMS, {"height": 1.0}, ["kick"], {"kick": (0.5, 1.5)}, model=walker)
+    assert vrw.plot.tuning_figure(tuned).axes
+
+
 def test_a_simulation_shows_the_flights_of_a_ball():
     walk = vrw.simulate(BALL_PARAMS, [2.0], 2, model=BALL_SYSTEM, n_samples=3)
     half = 2.0 / GRAVITY

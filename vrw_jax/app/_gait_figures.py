@@ -448,7 +448,8 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult, label_break: st
     constraint_names = list(map(str, path_dataset.constraint.values))
     slacks = path_dataset.constraint_value.values - path_dataset.margin.values
     relative_parameter_changes = [
-        path_dataset[parameter_name].values / float(getattr(tune_result.params, parameter_name))
+        path_dataset[parameter_name].values
+        / float(tune_result.model.get_parameter(tune_result.params, parameter_name))
         - 1.0
         for parameter_name in path_dataset.attrs["free"].split()
     ]

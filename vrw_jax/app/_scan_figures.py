@@ -59,10 +59,14 @@ and the panel columns.
 def _list_swept_parameters(
     names: Iterable[Hashable], parameter_order: Iterable[str] = PARAMETER_AXIS_ORDER
 ) -> list[str]:
-    """Return the parameters among the names in an order, and then those of leg forces."""
+    """Return the parameters among the names in an order, and then those of leg forces.
+
+    The parameters of a walker of yours are all names.
+    """
     texts = list(map(str, names))
     law_names = [name for name in texts if name.startswith(LAW_PREFIXES)]
-    return [name for name in parameter_order if name in texts] + law_names
+    wheel_names = [name for name in parameter_order if name in texts] + law_names
+    return wheel_names or [name for name in texts if name != "sample"]
 
 
 DRAWN_MARGIN_NAMES = (
@@ -450,7 +454,10 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
 
 
 def _list_shown_measures(scan: xr.Dataset) -> list[str]:
-    return [measure_name for measure_name in SHOWN_MEASURE_NAMES if measure_name in scan]
+    """Return the names of the measures to be shown: of a walker of yours, the first ones."""
+    first_names = [str(name) for name in scan.data_vars if scan[name].dtype.kind == "f"]
+    shown_names = [name for name in SHOWN_MEASURE_NAMES if name in scan]
+    return shown_names or first_names[: len(SHOWN_MEASURE_NAMES)]
 
 
 def _make_color_scale(

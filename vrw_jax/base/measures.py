@@ -115,7 +115,8 @@ def measure(
     For a `HybridSystem`, the instant is the state, and the phases are the modes.
 
     Give the measure to `vrw.scan`, `vrw.tune`, `vrw.sensitivities` or `cycle.measure`, or to your
-    own walker as `measures=(cost,)`. Its value for several steps is the mean over the steps.
+    own walker as `measures=(cost,)`, whose gaits have it in `values`. Its value for several steps
+    is the mean over the steps.
 
     Args:
         name: name of the measure.

@@ -48,3 +48,6 @@ class Outcome(StatusCode):
         15, "Friction is so high that no forces can carry the motion on (Painlevé's paradox)."
     )  # fmt: skip
     CAME_TO_REST = 17, "The wheel came to rest: it neither rolls on nor falls back."
+    GUARD_VIOLATED = (
+        18, "A mode of the walker would begin beyond one of its guards, for example after a fall."
+    )  # fmt: skip

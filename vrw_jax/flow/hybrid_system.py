@@ -59,7 +59,7 @@ OUTCOME_BY_TERMINATION = np.array(
         Outcome.TOO_MANY_EVENTS,
         Outcome.NO_TOUCHDOWN_IN_TIME,
         Outcome.TOO_MANY_EVENTS,
-        Outcome.BAD_INPUT,
+        Outcome.GUARD_VIOLATED,
         Outcome.SOLVER_FAILED,
         Outcome.SOLVER_FAILED,
         Outcome.STEPPED,
@@ -482,7 +482,13 @@ class HybridSystem(AbstractWalker):
         start = jax.eval_shape(self.embed, x, params) if name == "x" else x
         self._require_shape("embed" if name == "x" else name, start, (len(self.state),))
         if name == "x":
-            self._require_shape("project", jax.eval_shape(self.project, start, params), x.shape)
+            projected: Any = jax.eval_shape(self.project, start, params)
+            if getattr(projected, "shape", None) != x.shape:
+                raise ValueError(
+                    f"x has {x.size} entries, but project returns "
+                    f"{getattr(projected, 'shape', projected)}: give one entry for each section "
+                    "coordinate, or mend project."
+                )
         for mode_name, mode in self.modes.items():
             field = jax.eval_shape(mode.field, start, params)
             self._require_shape(f"the field of {mode_name!r}", field, start.shape)

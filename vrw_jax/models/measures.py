@@ -360,12 +360,10 @@ LAW_PREFIXES = ("leg.", "hub.")
 
 
 class _MeasureTable(dict[str, Measure]):
-    """Table of measures that also describes the parameters of laws, without their units."""
+    """Table that also describes quantities of laws and of walkers of yours, without their units."""
 
     def __missing__(self, name: str) -> Measure:
-        if not name.startswith(LAW_PREFIXES):
-            raise KeyError(name)
-        return Measure(name, "1", name.rpartition(".")[2], name, "Parameter of a law.")
+        return Measure(name, "1", name.rpartition(".")[2], name, "Quantity of a law or a walker.")
 
 
 MEASURES: dict[str, Measure] = _MeasureTable(

@@ -25,6 +25,7 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.flow.phase_integration import sample_phase
+from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import concatenate_tree_rows, map_in_batches, select_tree_rows
@@ -404,7 +405,8 @@ class PhaseResponse(AbstractPrintable):
     - `section_states`: change of the section state at the end of this step and of the next ones,
       shape (steps, instants, dim, n);
     - `measures`: changes of the measures of the next complete steps by name, each of shape (steps,
-      instants, dim): the period, and for wheels also speed, step length and durations of phases.
+      instants, dim): the period, and for wheels also speed, step length and durations of phases;
+    - `coordinates`: names of the coordinates of the state.
 
     Examples:
         >>> response = vrw.phase_response(vrw.WheelParams(), n_samples=5)
@@ -419,6 +421,7 @@ class PhaseResponse(AbstractPrintable):
     period: float
     section_states: Float[np.ndarray, "steps instants dim n"]
     measures: dict[str, Float[np.ndarray, "steps instants dim"]]
+    coordinates: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def delay(self) -> Float[np.ndarray, "instants dim"]:
@@ -428,10 +431,10 @@ class PhaseResponse(AbstractPrintable):
     def summary_rows(self) -> list[LabelAndText]:
         """Return labels and texts: the period and the largest advance for each coordinate."""
         rows = [("period", f"{self.period:.6g} s")]
-        for i, advance in enumerate(self.phase_advance.T):
+        for name, advance in zip(self.coordinates, self.phase_advance.T, strict=True):
             instant = int(np.argmax(np.abs(advance)))
             text = f"{advance[instant]:.4g} periods per unit at {self.times[instant]:.4g} s"
-            rows.append((f"largest advance by coordinate {i}", text))
+            rows.append((f"largest advance by {name}", text))
         return rows
 
 
@@ -473,8 +476,7 @@ def phase_response(
 
     Args:
         params: one wheel, or the parameters of a `HybridSystem`.
-        cycle: a stable gait of one step; for a wheel by default the result of `limit_cycle`, for a
-            `HybridSystem` the `HybridGait` at `params`.
+        cycle: a stable gait of one step, by default the result of `limit_cycle`.
         model: model of the wheel, the paper's by default, or a `HybridSystem`.
         n_samples: number of instants in each phase or mode, both ends included.
         n_steps: number of steps whose changes are returned.
@@ -496,11 +498,14 @@ def phase_response(
     options = StepOptions.tight() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     if isinstance(model, HybridSystem):
+        cycle = limit_cycle(params, model=model) if cycle is None else cycle
         check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
+        coordinates = tuple(model.state)
         stride = _sample_hybrid_stride(model, params, cycle.section_state, n_samples, options)
     else:
         gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options)
         gait.require_start_within_step("pushes")
+        coordinates = ("theta", "L1", "L2", "dtheta", "dL1", "dL2")
         stride = _sample_wheel_stride(gait, n_samples)
     jacobian, samples = stride.return_map_jacobian, concatenate_tree_rows(*stride.phases)
     if not np.max(np.abs(np.linalg.eigvals(jacobian))) < 1.0:
@@ -529,6 +534,7 @@ def phase_response(
             name: np.einsum("j,kijd->kid", gradient, changes)
             for name, gradient in stride.measure_jacobians.items()
         },
+        coordinates,
     )
 
 
