@@ -57,7 +57,7 @@ def test_an_own_walker_gets_one_sentence_on_what_is_missing():
     walker, cycle = SquaredOffset(), functools.partial(vrw.limit_cycle, {"gait": 0.0}, guess=[0.1])
     with pytest.raises(ValueError, match="it must contain all of offset: give each"):
         vrw.basin_share({"gait": 0.0}, {"x": (0.0, 1.0)}, model=walker, cycle=cycle(model=walker))
-    with pytest.raises(ValueError, match="SquaredOffset cannot begin within a step"):
+    with pytest.raises(TypeError, match=r"SquaredOffset.*equations of the wheel"):
         vrw.smallest_disturbance({"gait": 0.0}, model=walker, cycle=cycle(model=walker))
     with pytest.raises(ValueError, match="guess"):
         vrw.basin_share({"gait": 0.0}, {"offset": (0.0, 1.0)}, model=walker)

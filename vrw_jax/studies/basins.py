@@ -321,21 +321,31 @@ class StableGait(NamedTuple):
         model: Any,
         cycle: Any,
         options: StepOptions | None,
+        changes_within_step: str = "",
     ) -> "StableGait":
         """Return the stable gait of `cycle`, which is by default the result of `limit_cycle`.
 
         Raise TypeError or ValueError if an argument is invalid or the gait is not stable. The
         messages contain `caller_name`, the name of the public function.
+
+        - `changes_within_step`: what changes the state within a step, for which the gait must have
+          one step, and the model must be able to start within it.
         """
         require_untraced_arguments(
             caller_name, "map vrw.walk over the starts", params, options, cycle
         )
-        is_own = is_own_walker(model)
+        is_own = is_own_walker(model) and not changes_within_step
         if is_own:
             params = check_parameters(params)
         else:
-            require_single_wheel(params, f"call {caller_name} for one wheel after the other")
             model = convert_model_argument(model).fallback_model  # valid for any start
+            require_single_wheel(params, f"call {caller_name} for one wheel after the other")
+        if changes_within_step and not model.can_start_within_gait_step:
+            raise ValueError(
+                f"{type(model).__name__} cannot begin within a step, so that {changes_within_step} "
+                "within a step are not available: take ViscoelasticWheel() or RigidWheel(), or "
+                "disturb starts by vrw.basin_share."
+            )
         options = convert_step_options(options)
         options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
         cycle = limit_cycle(params, model=model) if cycle is None else cycle
@@ -348,6 +358,11 @@ class StableGait(NamedTuple):
             )
         spectral_radius = float(cycle.spectral_radius if is_own else cycle.spectral_radius_value)
         period_n = getattr(cycle, "period_n", 1)
+        if changes_within_step and period_n > 1:
+            raise ValueError(
+                f"cycle repeats after {period_n} steps, but {changes_within_step} within a step "
+                "need a gait of one step: give a cycle with period_n=1."
+            )
         if not spectral_radius < 1.0:
             raise ValueError(
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable "
@@ -364,20 +379,6 @@ class StableGait(NamedTuple):
                 f"{type(model).__name__}: give a cycle of the same wheel and model."
             )
         return stable_gait
-
-    def require_start_within_step(self, changes: str) -> None:
-        """Raise a ValueError unless the gait has one step, within which its model can start."""
-        if not getattr(self.model, "can_start_within_gait_step", False):
-            raise ValueError(
-                f"{type(self.model).__name__} cannot begin within a step, so that {changes} within "
-                "a step are not available: take ViscoelasticWheel() or RigidWheel(), or disturb "
-                "starts by vrw.basin_share."
-            )
-        if len(self.section_states) > 1:
-            raise ValueError(
-                f"cycle repeats after {len(self.section_states)} steps, but {changes} within a "
-                "step need a gait of one step: give a cycle with period_n=1."
-            )
 
     def is_on_gait(self, section_states: np.ndarray) -> np.ndarray:
         """Return whether each section state agrees with a section state of the gait, shape

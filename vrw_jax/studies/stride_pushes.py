@@ -146,8 +146,9 @@ def smallest_disturbance(
         0.275 rad/s at 0.25 s
     """
     max_steps = check_int("max_steps", max_steps)
-    stable_gait = StableGait.from_cycle("vrw.smallest_disturbance", params, model, cycle, options)
-    stable_gait.require_start_within_step("disturbances")
+    stable_gait = StableGait.from_cycle(
+        "vrw.smallest_disturbance", params, model, cycle, options, "disturbances"
+    )
     max_size = None if max_size is None else check_positive("max_size", max_size)
     return compute_smallest_disturbance(stable_gait, max_size, max_steps)
 
@@ -503,8 +504,7 @@ def phase_response(
         coordinates = tuple(model.state)
         stride = _sample_hybrid_stride(model, params, cycle.section_state, n_samples, options)
     else:
-        gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options)
-        gait.require_start_within_step("pushes")
+        gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options, "pushes")
         coordinates = ("theta", "L1", "L2", "dtheta", "dL1", "dL2")
         stride = _sample_wheel_stride(gait, n_samples)
     jacobian, samples = stride.return_map_jacobian, concatenate_tree_rows(*stride.phases)
