@@ -30,7 +30,8 @@ def compute_section_state(place):
     return np.r_[q[2] + complementarity.ALPHA, v[2], v[:2], np.roll(q[3:], -1), np.roll(v[3:], -1)]
 
 
-@pytest.mark.parametrize("engine", ["lanes", "diffrax"])
+# XLA compiles the step of diffrax for a minute.
+@pytest.mark.parametrize("engine", ["lanes", pytest.param("diffrax", marks=pytest.mark.slow)])
 def test_the_papers_law_as_a_law_gives_the_papers_step_with_flight(engine):
     expected, step = (
         vrw.step(PARAMS, START_IN_FLIGHT, model=model, engine=engine)
