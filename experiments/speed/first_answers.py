@@ -66,6 +66,8 @@ import vrw_jax as vrw
 vrw.start_jax()
 params, start = vrw.WheelParams(), (0.1, 1.6, -0.1)
 """
+OPTIONAL_IMPORTS = "import dask, optimistix, pandas, scipy.optimize, scipy.stats, xarray, zarr"
+"""Packages that some calls import, whose bytecode exists after an installation."""
 
 
 def measure_process(call: str, cache: str, bytecode: str) -> tuple[float, float]:
@@ -91,7 +93,7 @@ def main() -> None:
     word = parser.parse_args().word
     rows = []
     bytecode = tempfile.TemporaryDirectory()
-    measure_process("", bytecode.name, bytecode.name)
+    measure_process(OPTIONAL_IMPORTS, bytecode.name, bytecode.name)
     for name, call in CALLS.items():
         if word not in name:
             continue
