@@ -36,6 +36,8 @@ from vrw_jax.studies.fit_result import FitResult, make_result, summarize
 
 N_STARTS = 8
 """Default number of starts. The first start is the given walker."""
+N_CANDIDATES = 64
+"""Number of candidates from which the other starts are selected."""
 START_RANGE_FACTOR = 2.0
 """Factor by which starts differ from the given walker, where no bounds are given."""
 N_FOLDS = 5
@@ -96,7 +98,8 @@ def fit(
         covariance: covariance of the columns of a row, instead of standard errors.
         window: time before and after a sample of a series over which it is a mean, with weights
             that fall linearly, s; by default the sampling interval, and 0 for instantaneous values.
-        n_starts: number of starts of the search, of which the best fit is returned.
+        n_starts: number of starts of the search, of which the best fit is returned: the given
+            walker, and the best of a scan around it or within bounds.
         options: numerical options of the steps.
 
     Returns:
@@ -250,7 +253,9 @@ def fit(
         prior_means[None],
         prior_weights[None],
     )
-    starts = _make_search_starts(first, lower, upper, bounds, unknown_names, free, n_starts)
+    n_candidates = 1 if n_starts == 1 else max(n_starts, N_CANDIDATES)
+    candidates = _make_candidates(first, lower, upper, bounds, unknown_names, free, n_candidates)
+    starts = fit_problem.select_starts(problem, targets, candidates, n_starts)
     quantities = [
         name.removesuffix("_offset").removeprefix(fit_problem.START_PREFIX).partition("[")[0]
         for name in unknown_names
@@ -369,18 +374,18 @@ def _arrange_conditions(
     return arranged
 
 
-def _make_search_starts(
+def _make_candidates(
     first: np.ndarray,
     lower: np.ndarray,
     upper: np.ndarray,
     bounds: Mapping[str, Any],
     names: Sequence[str],
     free: Sequence[str],
-    n_starts: int,
+    n_candidates: int,
 ) -> np.ndarray:
-    """Return the first values of all searches: the given walker, and random ones around it."""
-    shares = np.random.default_rng(0).random((n_starts, len(first)))
-    starts = np.tile(first, (n_starts, 1))
+    """Return candidates for the starts of searches: the given walker, and random ones around it."""
+    shares = np.random.default_rng(0).random((n_candidates, len(first)))
+    starts = np.tile(first, (n_candidates, 1))
     for i, name in enumerate(names):
         if name in bounds:
             starts[1:, i] = lower[i] + shares[1:, i] * (upper[i] - lower[i])

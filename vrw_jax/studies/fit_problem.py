@@ -544,6 +544,26 @@ def _make_solver() -> Any:
 
 
 @eqx.filter_jit
+def _measure_candidates(problem: FitProblem, target: FitTarget, variables: Array) -> Array:
+    """Return chi2 at each row of variables u. The programs are those of the search."""
+    evaluate = lambda u: jnp.sum(_linearize_residuals(u, (problem, target))[0] ** 2)
+    return jax.vmap(evaluate)(variables)
+
+
+def select_starts(
+    problem: FitProblem, targets: FitTarget, candidates: np.ndarray, n_starts: int
+) -> np.ndarray:
+    """Return the first candidate, and those of the others at which the mean data fit best."""
+    if len(candidates) == n_starts:
+        return candidates
+    target = FitTarget(*(jnp.asarray(np.mean(x, 0)) for x in targets))
+    measure = functools.partial(_measure_candidates, problem, target)
+    chi2 = map_in_batches(measure, FIT_BATCH_SIZES[:1], problem.invert(candidates))
+    best = 1 + np.argsort(np.asarray(chi2)[1:], kind="stable")[: n_starts - 1]
+    return candidates[np.append(0, best)]
+
+
+@eqx.filter_jit
 def _improve_fits(
     problem: FitProblem, targets: FitTarget, searches: tuple[Any, Any]
 ) -> tuple[tuple[Any, Any], FitSolution]:
