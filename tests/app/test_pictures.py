@@ -158,6 +158,7 @@ def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations
         n_backtracks=1,
         seconds=1.0,
         compile_seconds=0.5,
+        model=vrw.ViscoelasticWheel(),
     )
     objective, slack, parameters = tuning_figure(result).axes
     np.testing.assert_array_equal(objective.lines[0].get_xydata(), [[0.0, 0.4], [2.0, 0.5]])

@@ -140,7 +140,7 @@ OUTCOME_LABELS_AND_COLORS: dict[int, tuple[str, str]] = {
     Outcome.BRANCH_ENDS_BEFORE_TARGET: ("branch ends on the way", "#454545"),
     Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
     Outcome.CAME_TO_REST: ("came to rest", "#8C6D31"),
-    Outcome.GUARD_VIOLATED: ("guard violated", "#5F7F1F"),
+    Outcome.GUARD_VIOLATED: ("guard violated", "#AA66FF"),
     UNSTABLE_CYCLE_CODE: ("unstable limit cycle", OKABE_ITO_YELLOW),
     NOT_COMPUTED_CODE: ("not computed", "#FFFFFF"),
 }
