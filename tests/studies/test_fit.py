@@ -186,6 +186,7 @@ def test_forces_that_grow_together_are_not_identifiable(small_fit):
     starts = np.array([float(getattr(SMALL_WHEEL, name)) for name in free])
     expected = result.values / starts
     found = np.array(list(direction.values()))
+    assert found.max() == np.abs(found).max()
     np.testing.assert_allclose(found / found[0], expected / expected[0], rtol=1e-4)
     assert np.isinf(result.standard_errors).all()
     assert "not identifiable" in repr(result)

@@ -336,6 +336,9 @@ def summarize(problem: FitProblem, targets: FitTarget, solution: FitSolution) ->
     lower, upper = np.asarray(problem.lower), np.asarray(problem.upper)
     is_at_bound = (x <= lower + margin) | (x >= upper - margin)
     _, singular, right = np.linalg.svd(jacobian, full_matrices=False)
+    # The sign of a direction is arbitrary: its largest entry is positive.
+    largest = np.take_along_axis(right, np.abs(right).argmax(-1)[..., None], -1)
+    right = np.where(largest < 0.0, -right, right)
     is_known = singular > RELATIVE_RANK_TOLERANCE * singular[:, :1]
     inverse = np.where(is_known, 1.0 / np.where(is_known, singular, 1.0), 0.0)
     half = scale[:, None] * np.swapaxes(right, -1, -2) * inverse[:, None, :]
