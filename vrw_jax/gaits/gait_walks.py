@@ -387,14 +387,17 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
     If the walk reaches no gait, the slowest attracting gait is returned. The two gaits are equal
     for each of 1,200 random wheels.
     """
-    start_functions = (
-        lambda params: compute_walk_starts(params)[:1],
-        compute_walk_starts,
-        compute_fallback_walk_starts,
-    )
-    wheels, gaits = find_attracting_gaits(gait_finder, parameter_values, start_functions)
-    indices = find_slowest_gait_indices(wheels, len(parameter_values))
-    return jax.device_put(select_tree_rows(gaits, indices))
+    values = np.asarray(parameter_values)
+    slow_start = lambda params: compute_walk_starts(params)[:1]
+    _, slow_gaits = _find_gaits_from_starts(gait_finder, values, slow_start)
+    missing = np.flatnonzero(np.asarray(slow_gaits.outcome) != Outcome.STEPPED)
+    if not len(missing):
+        return slow_gaits
+    # A wheel without a gait has the failure of the walks from all starts.
+    wheels, gaits = find_attracting_gaits(gait_finder, values[missing])
+    rows = np.arange(len(values))
+    rows[missing] = len(values) + find_slowest_gait_indices(wheels, len(missing))
+    return jax.device_put(select_tree_rows(concatenate_tree_rows(slow_gaits, gaits), rows))
 
 
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:
