@@ -138,7 +138,7 @@ def _compute_peak_derivatives(
     return lax.map(lambda x: jax.jvp(evaluate, (parameters, state.solution), x)[1], directions)
 
 
-def _compile_for_gaits(function: Callable, system: CollocationSystem, *_: Any) -> BatchFunction:
+def _compile_for_gaits(function: Callable, system: CollocationSystem) -> BatchFunction:
     function_of_gait = with_lane_axis(functools.partial(function, system))
     return compile_batch_function(function_of_gait, system.cycle_options.batch_size)
 

@@ -323,13 +323,13 @@ class StableGait(NamedTuple):
         options: StepOptions | None,
         changes_within_step: str = "",
     ) -> "StableGait":
-        """Return the stable gait of `cycle`, which is by default the result of `limit_cycle`.
+        """Return the stable gait of `cycle`, or of the result of `limit_cycle` if it is None.
 
         Raise TypeError or ValueError if an argument is invalid or the gait is not stable. The
         messages contain `caller_name`, the name of the public function.
 
-        - `changes_within_step`: what changes the state within a step, for which the gait must have
-          one step, and the model must be able to start within it.
+        - `changes_within_step`: plural noun for disturbances within a step, such as "pushes". They
+          need a gait of one step, and a model that can start within it. "" if there are none.
         """
         require_untraced_arguments(
             caller_name, "map vrw.walk over the starts", params, options, cycle

@@ -6,7 +6,7 @@ of the rigid model and of the paper's model propagate a defect of the return map
 
 import dataclasses
 import enum
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.further_search import search_further
+from vrw_jax.gaits.further_search import replace_rows, search_further
 from vrw_jax.gaits.gait_search import find_cycles_from_starts, summarize_search
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
@@ -74,14 +74,6 @@ def compute_measure_derivatives(names: Sequence[str], quantities: np.ndarray) ->
     """Return the complex-step derivatives of measures by step quantities, (wheels, measures, 7)."""
     increments = 1j * COMPLEX_STEP * np.eye(len(QUANTITY_NAMES))
     return evaluate_measures(names, quantities[:, None, :] + increments, 1).imag / COMPLEX_STEP
-
-
-def replace_rows(
-    arrays: Iterable[np.ndarray], row_indices: np.ndarray, new_arrays: Iterable[np.ndarray]
-) -> None:
-    """Replace, in place, the rows with the indices `row_indices` of each array by new rows."""
-    for array, new_array in zip(arrays, new_arrays, strict=True):
-        array[row_indices] = new_array
 
 
 class StepQuantities(NamedTuple):
@@ -347,8 +339,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     stepped_gaits = LowerFidelityGaits.from_steps(
         ModelIndex.VISCOELASTIC, section_states, quantities, quantity_jacobian
     )
-    replace_rows(gaits, found[has_stepped], select_tree_rows(stepped_gaits, has_stepped))
-    return gaits
+    return replace_rows(gaits, found[has_stepped], select_tree_rows(stepped_gaits, has_stepped))
 
 
 def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:

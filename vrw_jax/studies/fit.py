@@ -150,8 +150,8 @@ def fit(
         raise ValueError(
             "data have a column 'time', but series need legs with springs: fit the steps or gaits."
         )
-    walks = np.unique(table.labels.get("walk", np.zeros(1)))
-    row_walks = np.searchsorted(walks, table.labels.get("walk", np.zeros(table.values.shape[1])))
+    labels = table.labels.get("walk", np.zeros(table.values.shape[1]))
+    walks, row_walks = np.unique(labels, return_inverse=True)
     starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
     first_states: Any = _find_first_states(table.kind, params, finder, start, len(walks))
     has_unknown_starts = start is None and table.kind != "gaits"
@@ -257,7 +257,9 @@ def fit(
     candidates = _make_candidates(first, lower, upper, bounds, unknown_names, free, n_candidates)
     starts = fit_problem.select_starts(problem, targets, candidates, n_starts)
     quantities = [
-        name.removesuffix("_offset").removeprefix(fit_problem.START_PREFIX).partition("[")[0]
+        name.removesuffix(fit_problem.OFFSET_SUFFIX)
+        .removeprefix(fit_problem.START_PREFIX)
+        .partition("[")[0]
         for name in unknown_names
     ]
     unknown_units = tuple(
@@ -305,7 +307,7 @@ def _count_steps(
     """Return a number of steps that takes longer than a series, also for slightly faster walks."""
     walker = finder.model if finder.model.is_wheel else finder.model.walker
     n_needed = 1
-    for x in jnp.asarray(first_states):
+    for x in jnp.asarray(np.unique(first_states, axis=0)):
         x = walker.complete_section_state(params, x) if walker.is_wheel else x
         time, n_steps = 0.0, 0
         while time < DURATION_MARGIN * last_time and n_steps < MAX_STEPS:

@@ -19,7 +19,9 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.base.checks import require_known_name
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.gaits.further_search import replace_rows
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
+from vrw_jax.studies.fit_data import HEIGHT_COLUMN
 
 FIT_BATCH_SIZES = (8, 256)
 """Numbers of fits that one call computes."""
@@ -42,7 +44,6 @@ STENCIL_SIZE = 6
 DIFFERENCE_STEP = 1e-4
 """Relative change of unknowns for derivatives of samples with unilateral contact, which machine
 code computes without derivatives. The errors of the motion, 1e-9, are divided by it."""
-SLOPE_NAME, HEIGHT_NAME = "slope", "height"
 OFFSET_SUFFIX = "_offset"
 TIME_OFFSET = "time_offset"
 START_PREFIX = "start."
@@ -232,7 +233,7 @@ class FitProblem(eqx.Module):
         self, values: ParameterValues, conditions: Mapping[str, Array]
     ) -> tuple[Any, Any, Any]:
         """Return the walker, its parameters and what differs from step to step."""
-        heights = conditions.get(HEIGHT_NAME)
+        heights = conditions.get(HEIGHT_COLUMN)
         walker, params = self.unpack(values)
         if walker.is_wheel:
             ground = walker.split_ground_by_step(params, self.n_steps, heights)
@@ -553,7 +554,10 @@ def _measure_candidates(problem: FitProblem, target: FitTarget, variables: Array
 def select_starts(
     problem: FitProblem, targets: FitTarget, candidates: np.ndarray, n_starts: int
 ) -> np.ndarray:
-    """Return the first candidate, and those of the others at which the mean data fit best."""
+    """Return the first candidate and those others with the smallest chi2, `n_starts` in all.
+
+    Of a batch of data sets, chi2 is that of their mean.
+    """
     if len(candidates) == n_starts:
         return candidates
     target = FitTarget(*(jnp.asarray(np.mean(x, 0)) for x in targets))
@@ -608,9 +612,7 @@ def solve_fits(problem: FitProblem, targets: FitTarget, starts: np.ndarray) -> F
         arguments = select_tree_rows((targets, searches), running)
         improve = functools.partial(_improve_fits, problem)
         improved = jax.tree.map(np.array, map_in_batches(improve, FIT_BATCH_SIZES, *arguments))
-        results = improved if results is None else results
-        for stored, rows in zip(jax.tree.leaves(results), jax.tree.leaves(improved), strict=True):
-            stored[running] = rows
+        results = improved if results is None else replace_rows(results, running, improved)
         searches, solution = results
         running = running[~solution.has_ended[running]]
         if not running.size:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.gaits.further_search import replace_rows
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
 from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET
@@ -31,7 +32,6 @@ from vrw_jax.studies.fidelity import (
     StepQuantities,
     compute_measure_derivatives,
     evaluate_measures,
-    replace_rows,
 )
 
 
@@ -100,8 +100,7 @@ def walk_until_settled(
                 walk_ends.section_states[active_walk_indices[failed_walk_indices]],
                 n_steps_before_leap - 2,
             )
-            third_last_step = StepQuantities(*map(np.array, third_last_step))
-            replace_rows(third_last_step, failed_walk_indices, retried_step)
+            third_last_step = replace_rows(third_last_step, failed_walk_indices, retried_step)
         last_steps = [third_last_step]
         for _ in range(2):
             last_steps.append(
@@ -309,7 +308,7 @@ class RefinedGaits(NamedTuple):
     is_attracting: np.ndarray  # whether all multipliers are inside the unit circle
     measure_values: np.ndarray  # (gaits, measures)
     measure_error_bounds: np.ndarray  # (gaits, measures)
-    n_steps: np.ndarray  # walking steps; a Jacobian costs `jacobian_cost_in_steps`
+    n_steps: np.ndarray  # walking steps; a Jacobian costs `JACOBIAN_COST_IN_STEPS`
     section_states: np.ndarray  # (gaits, 4 + 3 n)
     walking_speed: np.ndarray  # mean speed of the last step, m/s
 

@@ -18,9 +18,6 @@ from typing import Any
 
 import numpy as np
 
-ZarrGroup = Any
-"""Zarr group; the type is `Any` because only the module `store` imports zarr."""
-
 JsonObject = dict[str, Any]
 """Object of JSON: settings, attributes or metadata by name."""
 

@@ -40,6 +40,7 @@ from vrw_jax.base.printing import (
     format_outcome_counts,
 )
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.gaits.further_search import replace_rows
 from vrw_jax.gaits.gait_search import GaitChoice, parse_gait_choice
 from vrw_jax.gaits.gait_walks import compute_walk_starts
 from vrw_jax.lanes.batching import select_tree_rows
@@ -56,7 +57,6 @@ from vrw_jax.studies.fidelity import (
     evaluate_measures,
     find_paper_gaits,
     find_rigid_gaits,
-    replace_rows,
     select_wheels,
 )
 from vrw_jax.studies.refinement import (
@@ -489,7 +489,7 @@ class _MeasureRequest:
         if not len(wheel_indices):
             return
         gaits = find_gaits(select_wheels(self.params, wheel_indices))
-        replace_rows(self.lower_gaits, wheel_indices, gaits)
+        self.lower_gaits = replace_rows(self.lower_gaits, wheel_indices, gaits)
         has_gait = np.isfinite(gaits.step_quantities).all(1)
         wheel_indices, gaits = select_tree_rows((wheel_indices, gaits), has_gait)
         states, step, estimates = estimate_measures_from_lower_gaits(
