@@ -49,5 +49,5 @@ class Outcome(StatusCode):
     )  # fmt: skip
     CAME_TO_REST = 17, "The wheel came to rest: it neither rolls on nor falls back."
     GUARD_VIOLATED = (
-        18, "A mode of the walker would begin beyond one of its guards, for example after a fall."
+        18, "One of the guards was negative when its mode began, for example after a fall."
     )  # fmt: skip

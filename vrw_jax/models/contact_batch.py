@@ -13,7 +13,7 @@ from vrw_jax.models.walk_batch import (
     StepInput,
     WalkBatch,
     list_rises,
-    select_step_values,
+    make_step_input,
 )
 from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES
 
@@ -47,7 +47,7 @@ def step_batch_with_contact(
             "for all elements: call vrw.step_batch for each restitution."
         )
     slopes = values_by_parameter[PARAMETER_NAMES.index("slope")]
-    make_input = lambda name, values, *offset: select_step_values(
+    make_input = lambda name, values, *offset: make_step_input(
         name, values, n_steps, len(section_states), *offset
     )
     inputs = [*map(make_input, model.parameter_names, [*values_by_parameter, friction])]
@@ -94,7 +94,7 @@ def _make_tilt(slope: StepInput, slopes: np.ndarray, n_steps: int) -> StepInput:
     """Return the increase of the slope from the line of each step to the next one, rad."""
     if slopes.ndim < 2:
         return StepInput("", np.zeros_like(slope.values))
-    next_slope = select_step_values("slope", slopes, n_steps, slopes.shape[0], 1)
+    next_slope = make_step_input("slope", slopes, n_steps, slopes.shape[0], 1)
     return next_slope._replace(
         values=next_slope.values - slope.values,
         list_terms=lambda k: [(k, -1.0), *next_slope.list_terms(k)],

@@ -64,8 +64,8 @@ from vrw_jax.models.walk_batch import (
     StepBatchResult,
     WalkBatch,
     list_rises,
+    make_step_input,
     select_lanes,
-    select_step_values,
 )
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
@@ -315,10 +315,9 @@ def _step_batch_without_contact(
 ) -> StepBatchResult:
     n_wheels = len(section_states)
     slopes = values_by_parameter[SLOPE_INPUT_INDEX]
-    values_by_parameter[SLOPE_INPUT_INDEX] = slopes.T[0] if slopes.ndim == 2 else slopes
-    wheel_order = order_wheels_by_work(values_by_parameter, section_states)
-    values_by_parameter[SLOPE_INPUT_INDEX] = slopes
-    make_input = lambda name, values, *offset: select_step_values(
+    first_values = [x.T[0] if x.ndim == 2 else x for x in values_by_parameter]
+    wheel_order = order_wheels_by_work(first_values, section_states)
+    make_input = lambda name, values, *offset: make_step_input(
         name, values[wheel_order] if values.ndim else values, n_steps, n_wheels, *offset
     )
     inputs = [*map(make_input, model.parameter_names, values_by_parameter)]

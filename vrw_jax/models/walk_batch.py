@@ -91,7 +91,9 @@ START_INPUT_NAME = "section_state"
 
 
 class StepInput(NamedTuple):
-    """One input of each step of a batch, and its derivatives by the argument that determines it."""
+    """One input of every step, for all lanes, and its derivatives with respect to the argument that
+    it is computed from.
+    """
 
     argument: str
     values: np.ndarray  # (lanes,), or (n_steps, lanes) if they differ from step to step
@@ -106,7 +108,7 @@ class StepInput(NamedTuple):
         return self.values[k] if self.values.ndim > 1 else self.values
 
 
-def select_step_values(
+def make_step_input(
     argument: str, values: np.ndarray, n_steps: int, n_lanes: int, offset: int = 0
 ) -> StepInput:
     """Return the input that is the value of an argument in each step, or in one `offset` steps
@@ -123,7 +125,8 @@ def select_step_values(
 
 
 def list_rises(heights: np.ndarray, n_steps: int) -> list[StepInput]:
-    """Return the two rises of each step from foothold to foothold, m; see `models.compute_rises`.
+    """Return two inputs: in step k, the height of foothold k and that of foothold k + 1, each minus
+    that of the foothold before, m; see `models.compute_rises`.
 
     - `heights`: n_steps + 1 or n_steps + 2 heights of footholds for each lane, m.
     """
@@ -188,11 +191,11 @@ class WalkBatch:
         step_lanes: Callable[..., tuple[np.ndarray, ...]],
         model: Any = None,
     ) -> None:
-        """Compute up to `n_steps` steps of each walk.
+        """Compute `n_steps` steps of each walk, or fewer if it ends earlier.
 
-        - `step_lanes`: function of the indices of the walking lanes, their inputs and section
-          states, and the index of the step. It returns section states, durations, outcomes, numbers
-          of solver steps and, if derivatives are requested, Jacobians;
+        - `step_lanes`: function of the indices of the walking lanes, their inputs (None if there
+          are none) and section states, and the index of the step. It returns section states,
+          durations, outcomes, numbers of solver steps and, if derivatives are requested, Jacobians;
         - `model`: model of the wheel, whose legs may alternate.
         """
         for k in range(n_steps):
@@ -200,14 +203,7 @@ class WalkBatch:
             if not len(walking):
                 break
             lanes = select_lanes(walking, len(self.outcome))
-            inputs = None
-            if self.inputs:
-                for row, step_input in zip(self.input_matrix, self.inputs, strict=True):
-                    if step_input.values.ndim > 1:
-                        row[:] = step_input.select_values(k)
-                if k > 0 and model is not None:
-                    model.exchange_legs(self.input_matrix)
-                inputs = self.input_matrix[:, lanes]
+            inputs = self._select_inputs(k, model)[:, lanes] if self.inputs else None
             section_state, durations, outcome, solver_steps, *jacobian = step_lanes(
                 walking, inputs, self.section_state[:, lanes], k
             )
@@ -225,6 +221,15 @@ class WalkBatch:
             self.outcome[lanes] = outcome
             self.n_stepped[lanes] += outcome == Outcome.STEPPED
             self.solver_steps[lanes] += solver_steps
+
+    def _select_inputs(self, k: int, model: Any) -> np.ndarray:
+        """Return the inputs in step `k` for all lanes, in the matrix that all steps share."""
+        for row, step_input in zip(self.input_matrix, self.inputs, strict=True):
+            if step_input.values.ndim > 1:
+                row[:] = step_input.select_values(k)
+        if k > 0 and model is not None:
+            model.exchange_legs(self.input_matrix)
+        return self.input_matrix
 
     def make_batch_result(
         self,
