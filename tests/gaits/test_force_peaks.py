@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -230,3 +231,12 @@ def test_a_scan_of_peaks_has_those_of_each_gait(tmp_path):
         for name, value in cycle.measures(names).items():
             np.testing.assert_allclose(scan[name].values[i], value, rtol=1e-9, err_msg=name)
     assert scan.peak_force.attrs["units"] == "N"
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_peaks_are_refused():
+    def peak(damping):
+        return vrw.limit_cycle(vrw.WheelParams(damping=damping)).force_peaks["peak_force"]
+
+    with pytest.raises(NotImplementedError, match="first derivatives only"):
+        jax.hessian(peak)(165.0)

@@ -85,6 +85,9 @@ class PointTable(NamedTuple):
 
 # Largest number of jumps in one direction of a branch.
 MAX_JUMPS_PER_DIRECTION = 20
+# Largest relative change of period and step length at a jump within one branch. The value is chosen
+# because a change in the order of two impacts changes period and step length by 1e-4.
+MAX_MEASURE_CHANGE_AT_JUMP = 0.01
 # Changes of the parameter, as fractions of its range, after which a gait beyond a jump is searched
 # for. The values are chosen because two impacts with unilateral contact change their order within a
 # fraction of 1e-4.
@@ -190,8 +193,12 @@ class AbstractContinuation(abc.ABC):
         return COARSE_MESH_END_NAME if "mesh_error" in quantities else ADMISSIBILITY
 
     def is_same_gait(self, before: PointTable, after: PointTable) -> np.ndarray:
-        """Return for each jump whether the points on both sides belong to the same branch."""
-        return after.tests[ADMISSIBILITY] > 0.0
+        """Return whether period and step length are about equal before and after each jump."""
+        is_same = after.tests[ADMISSIBILITY] > 0.0
+        for name in {"period", "step_length"} & before.quantities.keys():
+            values, new_values = before.quantities[name], after.quantities[name]
+            is_same &= np.abs(new_values - values) <= MAX_MEASURE_CHANGE_AT_JUMP * np.abs(values)
+        return is_same
 
     def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
         """Return a sentence that describes the end of a branch."""
@@ -247,38 +254,60 @@ class AbstractContinuation(abc.ABC):
         signs = np.tile([-1.0, 1.0], len(owners) // 2)
         tracks = self.continue_branches(owners, z[owners], p[owners], signs)
         if self.continuation_problem.has_kinks:
-            tracks = list(map(self._continue_beyond_jumps, owners[:, None], tracks))
+            self._continue_beyond_jumps(owners, tracks)
         return {int(owners[i]): tracks[i : i + 2] for i in range(0, len(owners), 2)}
 
-    def _continue_beyond_jumps(self, owner: np.ndarray, track: Track) -> Track:
-        """Continue a stalled branch beyond jumps of the section state.
+    def _continue_beyond_jumps(self, owners: np.ndarray, tracks: list[Track]) -> None:
+        """Continue stalled tracks beyond jumps of the section state, all of them together.
 
         With unilateral contact, the state jumps if two impacts change their order, because the
         effects of two impacts do not commute. The search for the gait beyond a jump starts from the
         last gait, with the smallest change of the parameter that leads to a similar gait.
         """
-        lower_bound, upper_bound = self.parameter_bounds
+        may_continue = set(range(len(tracks)))
         for _ in range(MAX_JUMPS_PER_DIRECTION):
-            end = track.points[-1:]
-            if track.status != ContinuationStatus.STEP_SIZE_UNDERFLOW or len(track.points) < 2:
-                break
-            sign = np.sign([end[0].fraction_rate])
+            stalled = [
+                i
+                for i in sorted(may_continue)
+                if tracks[i].status == ContinuationStatus.STEP_SIZE_UNDERFLOW
+                and len(tracks[i].points) > 1
+            ]
+            may_continue.clear()
             for change in PARAMETER_CHANGE_FRACTIONS:
-                p = end[0].p + sign * change * (upper_bound - lower_bound)
-                if not lower_bound < p[0] < upper_bound:
-                    continue
-                (new_track,) = self.continue_branches(owner, end[0].z[None], p, sign)
-                if len(new_track.points) > 1:
-                    before, after = (
-                        self.make_table(stack_points(points), owner)
-                        for points in (end, new_track.points[:1])
-                    )
-                    if self.is_same_gait(before, after)[0]:
-                        break
-            else:
-                break
-            track = new_track._replace(points=[*track.points, *new_track.points])
-        return track
+                rows = np.array([i for i in stalled if i not in may_continue], int)
+                if not len(rows):
+                    break
+                for i, new_track in self._continue_after(owners, tracks, rows, change).items():
+                    tracks[i] = new_track._replace(points=[*tracks[i].points, *new_track.points])
+                    may_continue.add(i)
+
+    def _continue_after(
+        self, owners: np.ndarray, tracks: Sequence[Track], rows: np.ndarray, change: float
+    ) -> dict[int, Track]:
+        """Return the tracks of similar gaits that start a change of the parameter after the ends.
+
+        - `rows`: indices of tracks;
+        - `change`: fraction of the parameter's range.
+        """
+        lower_bound, upper_bound = self.parameter_bounds
+        ends = stack_points([tracks[i].points[-1] for i in rows])
+        signs = np.sign(ends.fraction_rate)
+        p = ends.p + signs * change * (upper_bound - lower_bound)
+        is_inside = (lower_bound < p) & (p < upper_bound)
+        rows, p, signs = rows[is_inside], p[is_inside], signs[is_inside]
+        new_tracks = self.continue_branches(owners[rows], ends.z[is_inside], p, signs)
+        found = [k for k, track in enumerate(new_tracks) if len(track.points) > 1]
+        if not found:
+            return {}
+        before, after = (
+            self.make_table(stack_points(points), owners[rows[found]])
+            for points in (
+                [tracks[rows[k]].points[-1] for k in found],
+                [new_tracks[k].points[0] for k in found],
+            )
+        )
+        is_same = self.is_same_gait(before, after)
+        return {int(rows[k]): new_tracks[k] for k, same in zip(found, is_same, strict=True) if same}
 
     def solve_on_chords(
         self,

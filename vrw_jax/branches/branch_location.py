@@ -35,8 +35,7 @@ from vrw_jax.branches.test_functions import (
     has_unit_circle_pair,
 )
 from vrw_jax.gaits.floquet import EQUAL_MODULI_DISTANCE, UNIT_CIRCLE_DISTANCE
-from vrw_jax.gaits.further_search import replace_rows
-from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
+from vrw_jax.lanes.batching import concatenate_tree_rows, replace_rows, select_tree_rows
 
 # Largest ratio of the quantity next to its root to the quantity at an end of the bracket; at a jump
 # the ratio is larger. The value is chosen because the point next to the root may be at nine tenths

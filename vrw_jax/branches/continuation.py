@@ -35,7 +35,6 @@ from vrw_jax.branches.abstract_continuation import (
     EVENT_ORDER,
     EVENT_ORDER_CHANGE,
     AbstractContinuation,
-    PointTable,
     QuantitiesByName,
 )
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
@@ -63,7 +62,10 @@ from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_me
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import HybridGait
-from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.lanes.batching import (
+    select_rows_on_device,
+    select_tree_rows,
+)
 from vrw_jax.models.measures import (
     FORCE_PEAK_MEASURES,
     MARGIN_MEASURES,
@@ -267,10 +269,6 @@ DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 
 # Largest number of mesh refinements of a gait on a branch or a curve.
 MAX_BRANCH_MESH_REFINEMENTS = 3
-# Largest relative change of period and step length at a jump of the section state within one
-# branch. The value is chosen because a change in the order of two impacts changes period and step
-# length by 1e-4.
-MAX_MEASURE_CHANGE_AT_JUMP = 0.01
 
 
 def split_legs(quantities: QuantitiesByName, n_legs: int) -> QuantitiesByName:
@@ -312,14 +310,6 @@ class GaitContinuation(AbstractContinuation):
         """
         problem: Any = self.continuation_problem
         return split_legs(problem.measure_gaits(wheels, points), problem.n_legs)
-
-    def is_same_gait(self, before: PointTable, after: PointTable) -> np.ndarray:
-        """Return whether period and step length are about equal before and after each jump."""
-        is_similar = super().is_same_gait(before, after)
-        for name in ("period", "step_length"):
-            values, new_values = before.quantities[name], after.quantities[name]
-            is_similar &= np.abs(new_values - values) <= MAX_MEASURE_CHANGE_AT_JUMP * np.abs(values)
-        return is_similar
 
     def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
         if end_name != FRICTION_SURPLUS:
@@ -421,7 +411,7 @@ def continue_branch(
     if cycle is not None:
         check_type("cycle", cycle, AbstractCycle, "give vrw.limit_cycle(params)")
     require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_ADVICE, params, cycle)
-    params_batch, cycle = jax.device_put(select_tree_rows((params, cycle), None))
+    params_batch, cycle = select_rows_on_device((params, cycle), None)
     (branch,) = continue_branches(
         params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
         model=convert_model_argument(resolve_model(params, model)),
@@ -499,7 +489,7 @@ def continue_branches(
     parameter_values = np.clip(pad(model.get_parameter(params, name)), *limits)
     params, parameter_values = jax.device_put((jax.tree.map(pad, params), parameter_values))
     if isinstance(cycle, AbstractCycle) and len(indices) > n_wheels:
-        cycle = jax.device_put(select_tree_rows(cycle, indices))
+        cycle = select_rows_on_device(cycle, indices)
     if name != FRICTION_NAME:
         _, params = model.with_parameter(params, name, parameter_values)
     start_outcomes, branch_data = _continue_gait_branches(
@@ -507,7 +497,7 @@ def continue_branches(
     )
     return tuple(
         _make_labeled_gait_branch(
-            data, jax.device_put(select_tree_rows(params, i)), name, model, step_options, outcome
+            data, select_rows_on_device(params, i), name, model, step_options, outcome
         )
         for i, (data, outcome) in enumerate(
             zip(branch_data[:n_wheels], start_outcomes.tolist(), strict=False)

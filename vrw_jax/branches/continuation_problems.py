@@ -522,11 +522,12 @@ def compute_contact_order_numbers(gait_steps_of_period: Any, n_legs: int) -> np.
         x.reshape(len(x), -1).astype(np.int64)
         for x in (has_contact_mode_occurred, contact_codes, event_and_impact_counts)
     ]
-    contact_order_numbers = [
-        zlib.crc32(integers_of_period.tobytes())
-        for integers_of_period in np.concatenate(integer_arrays_by_period, 1)
-    ]
-    return np.array(contact_order_numbers, float)
+    return number_rows(np.concatenate(integer_arrays_by_period, 1))
+
+
+def number_rows(rows: np.ndarray) -> np.ndarray:
+    """Return one number for each row, which is equal for equal rows."""
+    return np.array([zlib.crc32(row.tobytes()) for row in rows], float)
 
 
 @jax.jit

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
@@ -35,11 +34,9 @@ from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, make_return_map, step_batch_of_walker
 from vrw_jax.branches.abstract_continuation import (
-    ADMISSIBILITY,
     BORDER_COLLISION,
     EVENT_ORDER,
     AbstractContinuation,
-    PointTable,
     QuantitiesByName,
 )
 from vrw_jax.branches.arclength import (
@@ -52,7 +49,7 @@ from vrw_jax.branches.arclength import (
 )
 from vrw_jax.branches.branch import Branch, FixedPoint, SpecialPoint
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
-from vrw_jax.branches.continuation_problems import MapProblem
+from vrw_jax.branches.continuation_problems import MapProblem, number_rows
 from vrw_jax.branches.test_functions import (
     BIFURCATIONS,
     BRANCH_POINT,
@@ -399,9 +396,6 @@ def trace_map_branch(
 MarginFunctions = Mapping[str, Callable[[Array, Any], Array]]
 """Functions of state and parameters by name, which are positive in admissible gaits."""
 
-MAX_PERIOD_CHANGE_AT_JUMP = 0.01
-"""Largest relative change of the period at a jump within one branch, as for wheels."""
-
 
 @dataclass(frozen=True)
 class HybridContinuation(AbstractMapContinuation):
@@ -465,28 +459,13 @@ class HybridContinuation(AbstractMapContinuation):
             outcome = np.where(outcome == Outcome.STEPPED, step.outcome, outcome)
             states = step.section_state
         return quantities | {
-            EVENT_ORDER: np.array(
-                [
-                    zlib.crc32(row.tobytes())
-                    for row in np.concatenate([np.zeros((len(states), 1)), *codes], 1)
-                ],
-                float,
-            ),
+            EVENT_ORDER: number_rows(np.concatenate([np.zeros((len(states), 1)), *codes], 1)),
             "outcome": outcome,
             **{name: minima[:, i] for i, (name, _) in enumerate(self.margins)},
         }
 
     def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
         return quantities["outcome"] == Outcome.STEPPED
-
-    def name_branch_end(self, quantities: QuantitiesByName, point_index: int) -> str:
-        outcome = Outcome(int(quantities["outcome"][point_index]))
-        return ADMISSIBILITY if outcome == Outcome.STEPPED else outcome.name.lower()
-
-    def is_same_gait(self, before: PointTable, after: PointTable) -> np.ndarray:
-        periods, new_periods = (table.quantities["period"] for table in (before, after))
-        is_similar = np.abs(new_periods - periods) <= MAX_PERIOD_CHANGE_AT_JUMP * periods
-        return super().is_same_gait(before, after) & is_similar
 
 
 @eqx.filter_jit

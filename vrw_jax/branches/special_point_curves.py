@@ -322,7 +322,6 @@ def trace_special_points(
                 curve_tracer,
                 parameter_index,
                 wheels_beside_sign_change,
-                N_PARALLEL_BRANCHES,
             )
         traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, traced_curves)
     return tuple(traced_curve.special_point_curve for traced_curve in traced_curves), tuple(
@@ -377,25 +376,23 @@ def find_seeds_on_parallel_lines(
             curve_tracer.with_parameters(params, start_values_on_line)
             for start_values_on_line in start_values
         ]
-        curve_seeds += _find_seeds_in_batches(
-            curve_tracer, parameter_index, wheels_on_line, N_PARALLEL_BRANCHES
-        )
+        curve_seeds += _find_seeds_in_batches(curve_tracer, parameter_index, wheels_on_line)
     return curve_seeds
 
 
 def _find_seeds_in_batches(
-    curve_tracer: CurveTracer, parameter_index: int, wheels: list[WheelParams], batch_size: int
+    curve_tracer: CurveTracer, parameter_index: int, wheels: list[WheelParams]
 ) -> list[CurveSeed]:
     """Find seeds on the wheels' branches, which are continued in batches of the same size.
 
     A single size needs only one compiled program.
     """
     curve_seeds = []
-    for first_wheel_index in range(0, len(wheels), batch_size):
-        wheels_of_batch = wheels[first_wheel_index : first_wheel_index + batch_size]
+    for first_wheel_index in range(0, len(wheels), N_PARALLEL_BRANCHES):
+        wheels_of_batch = wheels[first_wheel_index : first_wheel_index + N_PARALLEL_BRANCHES]
         padded_wheels = [
             *wheels_of_batch,
-            *wheels_of_batch[-1:] * (batch_size - len(wheels_of_batch)),
+            *wheels_of_batch[-1:] * (N_PARALLEL_BRANCHES - len(wheels_of_batch)),
         ]
         curve_seeds += curve_tracer.find_seeds(
             parameter_index, jax.tree.map(lambda *x: jnp.stack(x), *padded_wheels)

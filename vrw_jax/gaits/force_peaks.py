@@ -162,10 +162,19 @@ def measure_force_peaks(
     """Return the `measures.FORCE_PEAK_MEASURES` of a gait by name, with first derivatives."""
     peaks, extrema = locate_force_peaks(system, parameters, state.solution)
     tangent_function = make_tangent_function(system)
+
+    def compile_derivatives(_: BatchFunction, order: int) -> BatchFunction:
+        if order > 1:
+            raise NotImplementedError(
+                "measures of the force's peaks have first derivatives only: take differences of "
+                "their gradients."
+            )
+        return _compile_for_gaits(_compute_peak_derivatives, system)
+
     compute_derivatives = make_implicit_jacobian(
         functools.partial(_compute_peak_derivatives, system),
         lambda parameters, gait: (tangent_function(parameters, gait[0]), ()),
-        lambda *_: _compile_for_gaits(_compute_peak_derivatives, system),
+        compile_derivatives,
         make_jacobian=functools.partial(_compute_peak_derivatives, system),
     )
     return attach_derivatives(compute_derivatives, peaks, parameters, (state, extrema))

@@ -159,17 +159,6 @@ def transfer_to_mesh(
     )
 
 
-def replace_rows(tree_over_wheels: Any, wheel_indices: np.ndarray, new_rows: Any) -> Any:
-    """Return a tree of NumPy arrays in which some wheels have other values."""
-
-    def replace_array_rows(array_over_wheels: Any, new_array_rows: Any) -> np.ndarray:
-        array_over_wheels = np.array(array_over_wheels)
-        array_over_wheels[wheel_indices] = new_array_rows
-        return array_over_wheels
-
-    return jax.tree.map(replace_array_rows, tree_over_wheels, new_rows)
-
-
 def _find_walk_end_states(
     gait_finder: CollocationFinder,
     parameter_values: np.ndarray,

@@ -39,7 +39,6 @@ from vrw_jax.gaits.finder_selection import (
 )
 from vrw_jax.gaits.further_search import (
     MeshSearch,
-    replace_rows,
     search_further,
     transfer_to_mesh,
 )
@@ -49,7 +48,12 @@ from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
-from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
+from vrw_jax.lanes.batching import (
+    map_in_batches,
+    replace_rows,
+    select_rows_on_device,
+    select_tree_rows,
+)
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
@@ -253,7 +257,7 @@ def limit_cycles(
         cycle_without_gait = limit_cycles(
             invalid_params, period_n=period_n, model=model, options=options, which=which
         )
-        return _take_wheels_on_device(cycle_without_gait, slice(0, 0))
+        return select_rows_on_device(cycle_without_gait, slice(0, 0))
     if has_traced_leaf(params):
         params = jax.tree.map(lambda x: jnp.broadcast_to(x, batch_shape), params)
         first_wheel_params = jax.tree.map(lambda x: x[0], params)
@@ -333,7 +337,7 @@ def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitC
             f"of this wheel attract{'s' * (n_available_gaits == 1)}: "
             "vrw.limit_cycles(params, model=...) returns them."
         )
-    return _take_wheels_on_device(
+    return select_rows_on_device(
         attracting_gaits,
         find_slowest_gait_indices(gait_wheel_indices, n_wheels) + gait_rank % n_gaits_per_wheel,
     )
@@ -354,8 +358,8 @@ def _search_with_fallbacks(
     has_batch_axis = params.damping.ndim > 0
     params_without_tangents = lax.stop_gradient(params)
     are_params_concrete = not has_traced_leaf(params)
-    add_batch_axis = lambda tree: tree if has_batch_axis else _take_wheels_on_device(tree, None)
-    drop_added_axis = lambda tree: tree if has_batch_axis else _take_wheels_on_device(tree, 0)
+    add_batch_axis = lambda tree: tree if has_batch_axis else select_rows_on_device(tree, None)
+    drop_added_axis = lambda tree: tree if has_batch_axis else select_rows_on_device(tree, 0)
     if (
         gait_finder.is_multistable
         and cycle_guess is None
@@ -508,14 +512,6 @@ def _search_without_fallbacks(
     if cycle_guess is not None or has_traced_leaf(params):
         return gait_finder.find_cycles(params, cycle_guess, **search_options)
     return map_in_batches(gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
-
-
-def _take_wheels_on_device(tree_over_wheels: Any, wheel_indices: Any) -> Any:
-    """Return the selected wheels of a tree as arrays on the device.
-
-    NumPy selects the wheels, because JAX would compile a program for each shape.
-    """
-    return jax.device_put(select_tree_rows(tree_over_wheels, wheel_indices))
 
 
 def _choose_first_step(

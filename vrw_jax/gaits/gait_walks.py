@@ -17,7 +17,11 @@ import numpy as np
 
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
+from vrw_jax.lanes.batching import (
+    concatenate_tree_rows,
+    select_rows_on_device,
+    select_tree_rows,
+)
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.wheel.params import WheelParams, compute_wheel_units_of_rows
@@ -327,7 +331,7 @@ def find_attracting_gaits(
     )
     wheels = np.concatenate([wheels[is_kept], found])
     order = np.argsort(wheels, kind="stable")
-    return wheels[order], jax.device_put(select_tree_rows(merged_gaits, order))
+    return wheels[order], select_rows_on_device(merged_gaits, order)
 
 
 def _find_gaits_from_starts(
@@ -397,7 +401,7 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
     wheels, gaits = find_attracting_gaits(gait_finder, values[missing])
     rows = np.arange(len(values))
     rows[missing] = len(values) + find_slowest_gait_indices(wheels, len(missing))
-    return jax.device_put(select_tree_rows(concatenate_tree_rows(slow_gaits, gaits), rows))
+    return select_rows_on_device(concatenate_tree_rows(slow_gaits, gaits), rows)
 
 
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:

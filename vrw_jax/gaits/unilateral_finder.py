@@ -26,7 +26,6 @@ from vrw_jax.gaits.finder import (
     move_derivative_axis_first,
 )
 from vrw_jax.gaits.fixed_points import FixedPointResult
-from vrw_jax.gaits.further_search import replace_rows
 from vrw_jax.gaits.gait_walks import find_slow_gaits, stack_section_units
 from vrw_jax.gaits.return_map_finder import (
     AbstractReturnMapFinder,
@@ -35,7 +34,11 @@ from vrw_jax.gaits.return_map_finder import (
     find_return_map_cycle,
     make_return_map_cycle,
 )
-from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
+from vrw_jax.lanes.batching import (
+    map_in_batches,
+    replace_rows,
+    select_rows_on_device,
+)
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES, UNILATERAL_DIFFERENTIABLE_NAMES
 from vrw_jax.models.step_results import AbstractStep
@@ -203,7 +206,7 @@ def _add_batch_axis(x: Array) -> Array:
 
 def _remove_batch_axis(batched_tree: Any) -> Any:
     """Return the first element of every array, which inverts `_add_batch_axis`."""
-    return jax.device_put(select_tree_rows(batched_tree, 0))
+    return select_rows_on_device(batched_tree, 0)
 
 
 class PeriodMap(NamedTuple):

@@ -128,6 +128,25 @@ def select_tree_rows(tree: PyTree, row_indices: Any) -> PyTree:
     return jax.tree.map(lambda x: np.asarray(x)[row_indices], tree)
 
 
+def select_rows_on_device(tree: PyTree, row_indices: Any) -> PyTree:
+    """Select elements as `select_tree_rows` does, and return arrays on the device.
+
+    NumPy selects the elements, because JAX would compile a program for each shape.
+    """
+    return jax.device_put(select_tree_rows(tree, row_indices))
+
+
+def replace_rows(tree: PyTree, row_indices: np.ndarray, new_rows: PyTree) -> PyTree:
+    """Return a tree of NumPy arrays in which some elements along the leading axis are replaced."""
+
+    def replace_array_rows(array: Any, new_array_rows: Any) -> np.ndarray:
+        array = np.array(array)
+        array[row_indices] = new_array_rows
+        return array
+
+    return jax.tree.map(replace_array_rows, tree, new_rows)
+
+
 def concatenate_tree_rows(*trees: PyTree) -> PyTree:
     """Concatenate trees of arrays along their leading axes, and return NumPy arrays."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *trees)

@@ -18,10 +18,15 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.further_search import replace_rows, search_further
+from vrw_jax.gaits.further_search import search_further
 from vrw_jax.gaits.gait_search import find_cycles_from_starts, summarize_search
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
-from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
+from vrw_jax.lanes.batching import (
+    map_in_batches,
+    replace_rows,
+    select_rows_on_device,
+    select_tree_rows,
+)
 from vrw_jax.models.contact_record import compute_min_bounce_height
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.models.rigid import RigidWheel
@@ -280,11 +285,6 @@ class LowerFidelityGaits(NamedTuple):
         return cls(models, section_states, quantities, inverse, jacobian, error)
 
 
-def select_wheels(params: WheelParams, wheel_indices: np.ndarray) -> WheelParams:
-    """Return the parameters of the wheels with the indices `wheel_indices`."""
-    return jax.device_put(select_tree_rows(params, wheel_indices))
-
-
 def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFidelityGaits:
     """Return the gaits of the paper's model for a batch of wheels, computed by collocation.
 
@@ -307,7 +307,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     (found,) = np.nonzero(outcomes == Outcome.STEPPED)
     if not len(found):
         return gaits
-    wheels, section_states = select_wheels(params, found), section_states[found]
+    wheels, section_states = select_rows_on_device(params, found), section_states[found]
     step = step_batch(wheels, section_states, options=step_options, derivatives=["section_state"])
     jacobian = jax.tree.map(np.asarray, step.derivatives["section_state"])
     end_states = np.asarray(step.section_state)

@@ -19,8 +19,7 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.base.checks import require_known_name
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.gaits.further_search import replace_rows
-from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
+from vrw_jax.lanes.batching import map_in_batches, replace_rows, select_tree_rows
 from vrw_jax.studies.fit_data import HEIGHT_COLUMN
 
 FIT_BATCH_SIZES = (8, 256)

@@ -29,7 +29,10 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.lanes.batching import (
+    select_rows_on_device,
+    select_tree_rows,
+)
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.studies.fidelity import (
     MEASURE_FUNCTIONS,
@@ -37,7 +40,6 @@ from vrw_jax.studies.fidelity import (
     ModelIndex,
     evaluate_measures,
     find_paper_gaits,
-    select_wheels,
 )
 from vrw_jax.studies.refinement import estimate_measures_from_lower_gaits
 from vrw_jax.studies.tolerance_request import (
@@ -179,14 +181,14 @@ def multifidelity_mean(
     def measure_wheels(indices: np.ndarray) -> MeasureResult:
         return measure_to_tolerance(
             measure,
-            select_wheels(params, indices),
+            select_rows_on_device(params, indices),
             GAIT_ERROR_FRACTION * tol,
             friction=friction_by_wheel[indices],
             stoppers=stoppers,
         )
 
     def evaluate_control(indices: np.ndarray, control: str) -> np.ndarray:
-        wheels = select_wheels(params, indices)
+        wheels = select_rows_on_device(params, indices)
         return _evaluate_control(measure, wheels, friction_by_wheel[indices], stoppers, control)
 
     pilot_wheels, other_wheels = np.split(
@@ -251,7 +253,7 @@ def _evaluate_control(
         values = evaluate_measures([measure], gaits.step_quantities)
         if control == one_step:
             wheel_batch = ContactWheelBatch.from_params(
-                select_wheels(params, found), friction[found], stoppers, options
+                select_rows_on_device(params, found), friction[found], stoppers, options
             )
             *_, estimates = estimate_measures_from_lower_gaits(
                 wheel_batch, np.arange(len(found)), gaits, [measure]

@@ -20,9 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.gaits.further_search import replace_rows
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
-from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.lanes.batching import replace_rows, select_tree_rows
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET
 from vrw_jax.studies.fidelity import (
     QUANTITY_NAMES,

@@ -35,7 +35,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.finder import MeasureReader, confirm_outcome_by_step, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.further_search import MeshSearch, replace_rows, search_further
+from vrw_jax.gaits.further_search import MeshSearch, search_further
 from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
@@ -45,6 +45,7 @@ from vrw_jax.lanes.batching import (
     concatenate_tree_rows,
     map_in_batches,
     map_in_numpy_batches,
+    replace_rows,
     select_tree_rows,
 )
 from vrw_jax.lanes.saved_traces import compile_exported_function

@@ -40,10 +40,13 @@ from vrw_jax.base.printing import (
     format_outcome_counts,
 )
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.gaits.further_search import replace_rows
 from vrw_jax.gaits.gait_search import GaitChoice, parse_gait_choice
 from vrw_jax.gaits.gait_walks import compute_walk_starts
-from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.lanes.batching import (
+    replace_rows,
+    select_rows_on_device,
+    select_tree_rows,
+)
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.studies.fidelity import (
     MEASURE_FUNCTIONS,
@@ -57,7 +60,6 @@ from vrw_jax.studies.fidelity import (
     evaluate_measures,
     find_paper_gaits,
     find_rigid_gaits,
-    select_wheels,
 )
 from vrw_jax.studies.refinement import (
     RefinedGaits,
@@ -448,7 +450,7 @@ class _MeasureRequest:
         self._walk_and_record_gaits(
             wheels, self.lower_gaits.section_states[wheels], MeasureStatus.REACHED_FROM_LOWER_GAIT
         )
-        walk_starts = compute_walk_starts(select_wheels(self.params, unfinished))
+        walk_starts = compute_walk_starts(select_rows_on_device(self.params, unfinished))
         for start in walk_starts[:N_COLD_STARTS]:
             is_missing = self.result_arrays["models"][unfinished] == ModelIndex.NONE
             self._walk_and_record_gaits(
@@ -488,7 +490,7 @@ class _MeasureRequest:
         """
         if not len(wheel_indices):
             return
-        gaits = find_gaits(select_wheels(self.params, wheel_indices))
+        gaits = find_gaits(select_rows_on_device(self.params, wheel_indices))
         self.lower_gaits = replace_rows(self.lower_gaits, wheel_indices, gaits)
         has_gait = np.isfinite(gaits.step_quantities).all(1)
         wheel_indices, gaits = select_tree_rows((wheel_indices, gaits), has_gait)
