@@ -287,3 +287,18 @@ def test_inverse_functions_agree_with_those_of_numpy_to_round_off():
         1.0 / (1.0 + np.array([0.09, 4.0])),
         rtol=1e-15,
     )
+
+
+@pytest.mark.parametrize("has_machine_code", [True, False])
+def test_an_empty_batch_traces_a_function_once(has_machine_code, capsys, monkeypatch):
+    if not has_machine_code:
+        disable_machine_code(monkeypatch)
+
+    def double(x):
+        print("traced")
+        return 2.0 * x
+
+    for _ in range(3):
+        compiled = lanes.compile_batch_function(double)
+        assert compiled.run(np.ones((2, 0), np.float32)).dtype == np.float32
+    assert capsys.readouterr().out.count("traced") == 1

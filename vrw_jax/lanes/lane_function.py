@@ -106,9 +106,6 @@ class CompiledBatchFunction:
         leaves, structure = jax.tree.flatten(argument_trees)
         leaves = [np.asarray(x) for x in leaves]
         flat_function = functools.partial(_call_with_leaves, self._function, structure)
-        n_lanes = next(x.shape[-1] for x in leaves if x.ndim)
-        if n_lanes == 0:
-            return _make_empty_results(flat_function, leaves)
         if is_machine_code_available() and self._has_machine_code():
             with contextlib.suppress(_NoMachineCodeError):
                 return run_machine_code(functools.partial(self._get_program, structure), leaves)
@@ -118,6 +115,8 @@ class CompiledBatchFunction:
         xla_program = _xla_programs.get(program_key, jax.jit(flat_function))
         if program_key:
             _xla_programs[program_key] = xla_program
+        if next(x.shape[-1] for x in leaves if x.ndim) == 0:
+            return _make_empty_results(xla_program, leaves)
         return _run_by_blocks(
             xla_program,
             self._xla_block_size,

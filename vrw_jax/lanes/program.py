@@ -165,11 +165,16 @@ def run_machine_code(get_program: GetProgram, argument_leaves: Sequence[np.ndarr
     The last axis of the arrays is the lane axis; arrays without axes are the same for all lanes.
     The results of a lane are bitwise the same whatever the other lanes are.
     """
-    # The group has two vectors of 256 bits, so that one computes during the latency of the other.
-    lanes_per_group = 2 * count_lanes_per_256_bits(argument_leaves)
     n_lanes = next(x.shape[-1] for x in argument_leaves if x.ndim)
+    # The group has two vectors of 256 bits, so that one computes during the latency of the other.
+    # An empty batch needs no code: that of groups of one lane is compiled when it is needed.
+    lanes_per_group = 2 * count_lanes_per_256_bits(argument_leaves) if n_lanes else 1
     argument_types = tuple((x.shape[:-1] if x.ndim else None, x.dtype) for x in argument_leaves)
     lane_program = get_program(argument_types, lanes_per_group)
+    if n_lanes == 0:
+        result_types = lane_program.result_shapes_and_dtypes
+        empty_results = [np.empty((*shape, 0), dtype) for shape, dtype in result_types]
+        return jax.tree.unflatten(lane_program.result_structure, empty_results)
     machine_code = lane_program.machine_code
     n_lane_groups = -(-n_lanes // lanes_per_group)
     n_padded_lanes = n_lane_groups * lanes_per_group
