@@ -9,6 +9,7 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
+from vrw_jax import lanes
 from vrw_jax.app._gait_figures import branch_figure
 from vrw_jax.app.config import FigureConfig
 from vrw_jax.app.reports import write_branch_report
@@ -330,7 +331,7 @@ def make_simplest_walker(options):
     return walk
 
 
-WALKER_STEP = make_simplest_walker(vrw.StepOptions.tight())
+WALKER_STEP = lanes.jit(make_simplest_walker(vrw.StepOptions.tight()))
 
 
 def evaluate_walker_map(_, x, slope):
@@ -360,7 +361,7 @@ def test_simplest_walker_has_the_published_fixed_points_and_multipliers(walker_b
         i = find_index_at_slope(branch, 0.009)
         assert branch.values[i] == 0.009
         np.testing.assert_allclose(branch.dataset.x.values[i], x, atol=LOCATION_TOLERANCE)
-        assert abs(float(jax.jit(WALKER_STEP)(jnp.asarray(x), 0.009)[1]) - period) < 1e-8
+        assert abs(float(WALKER_STEP(jnp.asarray(x), 0.009)[1]) - period) < 1e-8
     stable, unstable = (b.multipliers[find_index_at_slope(b, 0.009)] for b in walker_branches)
     np.testing.assert_allclose(
         stable, [np.conj(STABLE_CYCLE[2]), STABLE_CYCLE[2]][::-1], atol=LOCATION_TOLERANCE
