@@ -221,9 +221,6 @@ class CollocationFinder(AbstractGaitFinder):
         section_state = jnp.asarray(
             self.model.compute_default_start(params), parameter_values.dtype
         )
-        section_state_derivatives = jnp.zeros(
-            (len(parameter_values), section_state.shape[0]), section_state.dtype
-        )
         with ThreadPoolExecutor(2) as compile_pool:
             cycle_program_future = compile_pool.submit(
                 with_default_jax_settings(compute_cycle_and_derivatives),
@@ -232,15 +229,22 @@ class CollocationFinder(AbstractGaitFinder):
                 self.make_initial_guess(parameter_values),
             )
             step_program_future = compile_pool.submit(
-                with_default_jax_settings(compute_step_and_derivatives),
-                self.collocation_system,
-                self.model,
-                parameter_values,
-                section_state,
-                section_state_derivatives,
-                self.step_options,
+                with_default_jax_settings(self.take_gait_step), params, section_state
             )
             cycle_program_future.result(), step_program_future.result()
+
+    def take_gait_step(self, params: WheelParams, section_state: Array) -> StepResult:
+        parameter_values = self.model.collect_parameter_values(params)
+        # The program with derivatives is the one that exists.
+        step, _ = compute_step_and_derivatives(
+            self.collocation_system,
+            self.model,
+            parameter_values,
+            section_state,
+            jnp.zeros((len(parameter_values), len(section_state)), section_state.dtype),
+            self.step_options,
+        )
+        return step
 
 
 @eqx.filter_jit
