@@ -174,6 +174,7 @@ def test_tuning_ends_at_the_limit_of_a_measure_with_its_multiplier():
     assert "kick" in str(tuned)
 
 
+KICKED_SYSTEM = dataclasses.replace(BALL_SYSTEM, ground={"slope": "kick"})
 KICKS = BALL_PARAMS | {"kick": np.ones(2)}
 CALLS = {
     "walker.step": lambda: BALL_SYSTEM.step(BALL_PARAMS, [2.0]),
@@ -221,12 +222,15 @@ CALLS = {
         model=BALL_SYSTEM,
         start=[2.0],
     ),
+    "vrw.first_passage": lambda: vrw.first_passage(
+        BALL_PARAMS, 1.0, model=KICKED_SYSTEM, tol=0.2, n_walkers=1024
+    ),
     "vrw.scan": lambda: vrw.scan(vrw.samples(kick=[1.0]), base=BALL_PARAMS, model=BALL_SYSTEM),
     "vrw.tune": lambda: vrw.tune(
         BALL_PARAMS, "period", ["kick"], {"kick": (0.9, 1.1)}, model=BALL_SYSTEM
     ),
 }
-FOR_WHEELS_ONLY = ("vrw.first_passage", "vrw.smallest_disturbance", "vrw.gait_sensitivity")
+FOR_WHEELS_ONLY = ("vrw.smallest_disturbance", "vrw.gait_sensitivity")
 
 
 def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels():
@@ -241,7 +245,7 @@ def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels
     for call in CALLS.values():
         assert call() is not None
     for name in FOR_WHEELS_ONLY:
-        arguments = {"first_passage": (0.01,), "gait_sensitivity": ("speed",)}.get(name[4:], ())
+        arguments = ("speed",) if name == "vrw.gait_sensitivity" else ()
         with pytest.raises(TypeError, match="of yours"):
             operator.attrgetter(name[4:])(vrw)(vrw.WheelParams(), *arguments, model=JuggledBall())
 
@@ -258,12 +262,36 @@ def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels
             "shape",
         ),
         (lambda: vrw.basin(BALL_PARAMS, {"speed": 1.0}, model=JuggledBall()), "velocity"),
-        (lambda: vrw.first_passage(vrw.WheelParams(), 0.01, model=JuggledBall()), "of yours"),
+        (lambda: vrw.first_passage(BALL_PARAMS, 0.1, model=JuggledBall()), "does not declare"),
+        (
+            lambda: jax.grad(
+                lambda sd: vrw.first_passage(BALL_PARAMS, sd, model=KICKED_SYSTEM).mean_steps
+            )(0.4),
+            "have no derivatives",
+        ),
     ],
 )
 def test_what_is_missing_is_said_in_one_sentence(call, message):
     with pytest.raises((TypeError, ValueError), match=message):
         call()
+
+
+def test_random_kicks_end_a_walk_after_the_mean_number_of_steps_of_an_integral_equation():
+    """v' = e v + k with a normal k, until v is negative: Nystrom's method with 400 Gauss points."""
+    restitution, kick, sd = 0.5, 1.0, 0.6
+    points, weights = np.polynomial.legendre.leggauss(400)
+    highest = 2.0 + 10.0 * sd  # 8 standard deviations above the mean
+    v, weights = 0.5 * highest * (points + 1.0), 0.5 * highest * weights
+    kicks = v[None] - restitution * v[:, None] - kick
+    survival = weights * np.exp(-0.5 * (kicks / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))
+    kappa = np.sort(np.abs(np.linalg.eigvals(survival)))[-2:]
+    walker = type("KickedBall", (JuggledBall,), {"ground": {"slope": "kick"}})()
+    passage = vrw.first_passage(BALL_PARAMS, sd, model=walker)
+    assert int(passage.status) == 0
+    assert abs(passage.mean_steps - 1.0 / (1.0 - kappa[1])) < passage.error
+    assert passage.error < 0.02 * passage.mean_steps
+    assert float(passage.kappa_2) == pytest.approx(kappa[0], abs=0.03)
+    assert "mean distance" not in str(passage)
 
 
 RISING_BALL = vrw.HybridSystem(
@@ -286,6 +314,35 @@ RISING_BALL = vrw.HybridSystem(
     ground={"height": "rise"},
 )
 """A ball that bounces on stairs, whose velocity after a bounce is 0.9 sqrt(v^2 - 2 g rise)."""
+
+
+def test_random_heights_end_a_walk_as_often_as_in_counted_walks():
+    """v' = e sqrt(v^2 - 2 g rise) + k, in 200,000 walks of NumPy."""
+
+    class ClimbingBall(vrw.AbstractWalker):
+        ground = {"height": "rise"}  # noqa: RUF012
+
+        def advance(self, params, x, options):
+            square = x**2 - 2.0 * GRAVITY * params["rise"]
+            v = 0.5 * jnp.sqrt(jnp.maximum(square, 0.0)) + 1.0
+            return vrw.AdvanceResult(v, 2.0 * v / GRAVITY, jnp.where(square[0] > 0.0, 0, 3))
+
+        def starts(self, params):
+            return jnp.array([2.0])
+
+    n, sd, draw = 200_000, 0.08, np.random.default_rng(1).standard_normal
+    v, height, n_steps, is_walking = np.full(n, 2.0), sd * draw(n), 0, np.ones(n, bool)
+    while is_walking.any():
+        n_steps += is_walking.sum()
+        height, last = sd * draw(n), height
+        square = v**2 - 2.0 * GRAVITY * (height - last)
+        is_walking &= square > 0.0
+        v = 0.5 * np.sqrt(np.maximum(square, 0.0)) + 1.0
+    passage = vrw.first_passage({"rise": 0.0}, height_sd=sd, model=ClimbingBall())
+    assert int(passage.status) == 0
+    # Relative errors: three standard errors of the count, and 1.5 times the tolerance.
+    counted = n_steps / n
+    assert float(passage.mean_steps_from_gait) == pytest.approx(counted, rel=0.007 + 0.03)
 
 
 def test_heights_of_footholds_are_rises_in_walks_trajectories_and_batches():

@@ -64,7 +64,8 @@ class AbstractWalker(abc.ABC):
     - `invariants`: functions of section coordinates and parameters that a step conserves;
     - `measures`: measures of a gait, see `vrw.measure`;
     - `ground`: `{"height": name}` names the parameter that is the rise from the foothold of a step
-      to the next one, so that walks and batches take `heights`;
+      to the next one, so that walks and batches take `heights`. `{"slope": name}` names the slope
+      of a step. `first_passage` draws either at random;
     - `sample_motion`: method that returns the motion during a step, for fits to time series.
 
     Parameters are a tree of numbers, such as a dictionary or an `equinox.Module`.

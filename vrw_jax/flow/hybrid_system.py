@@ -193,7 +193,7 @@ class HybridSystem(AbstractWalker):
                     require_known_name(guard.target_mode, tuple(self.modes), "mode")
         require_known_name(self.section, tuple(self.guard_names), "guard")
         for name in self.ground:
-            require_known_name(name, ("height",), "property of the ground")
+            require_known_name(name, ("height", "slope"), "property of the ground")
         for measure in self.measures:
             check_type("a measure", measure, Measure, "decorate its function with vrw.measure")
             if measure.phase:

@@ -23,6 +23,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
+from vrw_jax.base.walker import AbstractWalker, check_parameters, is_own_walker
 from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.lanes.autodiff import make_zero_tangent
 from vrw_jax.models.stepping import (
@@ -280,7 +281,8 @@ class FirstPassage(AbstractPrintable):
       slope, or on a foothold of random height after a foothold on the mean line. If walks are
       sampled, its relative error is at most 1.5 times that of `mean_steps`;
     - `mean_distance`: distance of `mean_steps` steps along the mean slope, m. It is `mean_steps`
-      times the mean distance of completed steps from the quasi-stationary distribution;
+      times the mean distance of completed steps from the quasi-stationary distribution. It is NaN
+      for a walker of yours, whose steps have no distance;
     - `distance_error`: error estimate of `mean_distance`, m;
     - `failure_probability`: probability 1 - kappa_1 that a step from the quasi-stationary
       distribution fails;
@@ -293,7 +295,8 @@ class FirstPassage(AbstractPrintable):
     - `states`: states of the quasi-stationary distribution. For quadrature, they are squared
       angular rates at the instant at which the stance leg is vertical, 1/s^2, shape (n, 1), and
       with random heights the height of the foothold, m. For sampled walks, they are section states
-      with the slope, or the heights of the last two footholds, as last components;
+      with the slope, or the heights of the last two footholds, as last components. For a walker of
+      yours, the last component is the height of the last foothold;
     - `weights`: weights of the states, with the sum 1;
     - `status`: a `PassageStatus`;
     - `end_names`, `end_fractions`: names of the outcomes that end walks, and the fraction of walks
@@ -342,13 +345,14 @@ class FirstPassage(AbstractPrintable):
                 self.end_names, np.asarray(self.end_fractions), strict=True
             )
         ]
+        distance, error = float(self.mean_distance), float(self.distance_error)
+        distance_rows = [("mean distance", f"{distance:,.6g} m (error {error:.2g} m)")]
+        if np.isnan(distance):
+            distance_rows = []
         return [
             ("mean steps", f"{float(self.mean_steps):,.6g} (error {float(self.error):.2g})"),
             ("from the gait", f"{float(self.mean_steps_from_gait):,.6g}"),
-            (
-                "mean distance",
-                f"{float(self.mean_distance):,.6g} m (error {float(self.distance_error):.2g} m)",
-            ),
+            *distance_rows,
             ("failure probability of a step", f"{float(self.failure_probability):.6g}"),
             ("ends", ", ".join(end_texts) or "none"),
             ("sampled steps", f"{self.n_steps:,}" if self.n_steps else "none: quadrature"),
@@ -358,7 +362,7 @@ class FirstPassage(AbstractPrintable):
 
 @announce_wait("gaits and random walks", "10 s")
 def first_passage(
-    params: WheelParams,
+    params: Any,
     slope_sd: float | Scalar | None = None,
     *,
     height_sd: float | Scalar | None = None,
@@ -394,8 +398,12 @@ def first_passage(
     from concrete values, so `jit` and `vmap` do not accept sampled means. A `WheelObjective` passes
     them to `tune`.
 
+    A walker of yours declares by `ground` which of its parameters is the slope of a step or the
+    rise of a foothold, see `AbstractWalker`. Its walks are sampled, and its means have no
+    derivatives.
+
     Args:
-        params: parameters of the wheel; the slope is the mean slope.
+        params: parameters of the wheel, or of a walker of yours; the slope is the mean slope.
         slope_sd: standard deviation of the slopes, rad.
         height_sd: standard deviation of the heights, m, instead of `slope_sd`.
         model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
@@ -422,7 +430,8 @@ def first_passage(
         >>> passage.end_names
         ('TOUCHDOWN_BEFORE_STOPPER',)
     """
-    require_single_wheel(params, "take one after the other")
+    if not is_own_walker(model):
+        require_single_wheel(params, "take one after the other")
     if (slope_sd is None) == (height_sd is None):
         raise ValueError(
             f"slope_sd is {slope_sd} and height_sd is {height_sd}, but the ground has one standard "
@@ -435,8 +444,13 @@ def first_passage(
     seed, n_nodes = check_int("seed", seed, 0), check_int("n_nodes", n_nodes, 8)
     n_walkers, max_steps = check_int("n_walkers", n_walkers), check_int("max_steps", max_steps)
     tol = None if tol is None else check_positive("tol", tol)
-    resolved_model: Any = convert_model_argument(resolve_model(params, model))
-    if resolved_model.make_vertical_rate_map(params) is not None:
+    if is_own_walker(model):
+        _check_walker_on_random_ground(model, params, ground_sd, sd_name)
+        resolved_model: Any = model
+        params = check_parameters(params)
+    else:
+        resolved_model = convert_model_argument(resolve_model(params, model))
+    if resolved_model.is_wheel and resolved_model.make_vertical_rate_map(params) is not None:
         return _solve_passage_by_quadrature(
             params, jnp.asarray(ground_sd), resolved_model, n_nodes, tol, sd_name
         )
@@ -446,7 +460,7 @@ def first_passage(
     if options is None:
         options = (
             StepOptions()
-            if resolved_model.reports_contacts
+            if resolved_model.is_wheel and resolved_model.reports_contacts
             else StepOptions(rtol=SAMPLED_STEP_TOLERANCE, atol=SAMPLED_STEP_TOLERANCE)
         )
     estimate_passage = functools.partial(
@@ -462,6 +476,21 @@ def first_passage(
     if not has_traced_leaf(params, ground_sd):
         return estimate_passage(params, float(ground_sd))[0]
     return _estimate_differentiable_passage(estimate_passage, params, ground_sd)
+
+
+def _check_walker_on_random_ground(
+    walker: AbstractWalker, params: Any, ground_sd: Any, sd_name: str
+) -> None:
+    """Raise an error if the walker can't be simulated on random ground."""
+    require_untraced_arguments(
+        "vrw.first_passage", "means of a walker of yours have no derivatives", params, ground_sd
+    )
+    property_name = sd_name.removesuffix("_sd")
+    if property_name not in walker.ground:
+        raise ValueError(
+            f"{sd_name} is given, but the walker does not declare what it changes: give it "
+            f'ground={{"{property_name}": "{property_name}"}}, with the name of its parameter.'
+        )
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
@@ -613,7 +642,7 @@ def _solve_passage_by_quadrature(
 
 
 def _estimate_passage_by_sampling(
-    params: WheelParams,
+    params: Any,
     ground_sd: float,
     sd_name: str,
     model: Any,
@@ -634,9 +663,10 @@ def _estimate_passage_by_sampling(
     """
     limit_cycle_result: Any = limit_cycle(params, model=model)
     if int(limit_cycle_result.outcome) != Outcome.STEPPED:
+        kind = "wheel" if model.is_wheel else "walker"
         raise ValueError(
-            "this wheel has no gait from which a walk could begin: "
-            f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
+            f"this {kind} has no gait from which a walk could begin: {limit_cycle_result.why} "
+            f"Take a {kind} for which vrw.limit_cycle finds a gait."
         )
     walker_groups = WalkerGroups(
         params,
@@ -692,7 +722,7 @@ def _estimate_passage_by_sampling(
         "end_fractions": np.array(list(sampled_passage.fraction_by_outcome.values())),
     }
     first_passage_result = FirstPassage(
-        **jax.tree.map(lambda x: jnp.asarray(x, params.damping.dtype), passage_numbers),
+        **jax.tree.map(lambda x: jnp.asarray(x, walker_groups.gait_state.dtype), passage_numbers),
         status=jnp.asarray(int(passage_status), jnp.int32),
         end_names=tuple(sampled_passage.fraction_by_outcome),
         n_steps=sampled_passage.n_sampled_steps,

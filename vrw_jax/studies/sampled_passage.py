@@ -15,16 +15,17 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.progress import report_progress
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.walk_batch import StepBatchResult
 from vrw_jax.studies.failure_density import GaussianMixture, fit_failure_density
-from vrw_jax.wheel.params import WheelParams
 
 MAX_BIASED_GROUND_LINES = 12
 """Largest number of lines of the ground whose slopes are drawn with a bias.
@@ -159,11 +160,12 @@ class WalkerGroups:
 
     By the Markov property, the section state and the ground of a walker determine the distribution
     of later states. The ground is the slope of its line, or the heights of the two last footholds.
+    For a walker of the user, it is the height of the last one.
     At first, the state of every walker is the section state of the gait. The number of walkers per
     group is rounded up to a power of two, because a digital net has such a number of points.
     """
 
-    params: WheelParams
+    params: Any
     gait_state: np.ndarray
     ground_sd: float  # of slopes, rad, or of heights, m
     model: Any
@@ -200,6 +202,13 @@ class WalkerGroups:
         """Return whether heights of footholds are random, instead of slopes."""
         return self.sd_name == "height_sd"
 
+    @property
+    def n_continuous_entries(self) -> int:
+        """Return the number of components of a section state that are no codes."""
+        if not self.model.is_wheel:
+            return len(self.gait_state)
+        return int(self.model.count_continuous_section_entries(self.params))
+
     def __post_init__(self) -> None:
         self.n_walkers_per_group = 1 << (-(-self.n_walkers // self.n_groups) - 1).bit_length()
         self.n_walkers = self.n_groups * self.n_walkers_per_group
@@ -229,7 +238,7 @@ class WalkerGroups:
 
     def run_walks_with_changes(
         self,
-        params: WheelParams,
+        params: Any,
         section_states: np.ndarray,
         start_ground: np.ndarray,
         ground_deviations: np.ndarray,
@@ -237,7 +246,9 @@ class WalkerGroups:
         """Return the results of walks of the wheel `params` from given states on given ground."""
         ground = np.concatenate([start_ground, self.compute_ground(params, ground_deviations)], 1)
         heights = ground if self.has_heights else None
-        if heights is None:
+        if heights is None and not self.model.is_wheel:
+            params = replace_tree_parameter(params, self.model.ground["slope"], ground[:, 1:])
+        elif heights is None:
             params = eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, ground)
         return step_batch(
             params,
@@ -248,9 +259,12 @@ class WalkerGroups:
             heights=heights,
         )
 
-    def compute_ground(self, params: WheelParams, ground_deviations: np.ndarray) -> np.ndarray:
+    def compute_ground(self, params: Any, ground_deviations: np.ndarray) -> np.ndarray:
         """Return slopes (rad) or heights (m) for their standardized deviations."""
-        mean = 0.0 if self.has_heights else float(params.slope)
+        mean = 0.0
+        if not self.has_heights:
+            name = "slope" if self.model.is_wheel else self.model.ground["slope"]
+            mean = float(jax.tree.leaves(params)[find_tree_parameter(params, name)])
         return mean + self.ground_sd * ground_deviations
 
     def run_biased_walks(
@@ -285,9 +299,11 @@ class WalkerGroups:
         the mean line to a foothold of random height.
         """
         self.states = np.tile(self.gait_state, (self.n_walkers, 1))
-        start_deviations = np.zeros((self.n_walkers, 1 + self.has_heights))
+        start_deviations = np.zeros(
+            (self.n_walkers, 1 + (self.has_heights and self.model.is_wheel))
+        )
         if self.has_heights:
-            start_deviations[:, 1] = self.random.standard_normal(self.n_walkers)
+            start_deviations[:, -1] = self.random.standard_normal(self.n_walkers)
         self.ground = self.compute_ground(self.params, start_deviations)
 
     def stack_states_and_ground(self) -> np.ndarray:
@@ -295,10 +311,12 @@ class WalkerGroups:
         return np.concatenate([self.states, self.ground], 1)
 
     def compute_step_distances(self, states_after_step: np.ndarray) -> np.ndarray:
-        """Return the distance of each step along the mean slope, m.
+        """Return the distance of each step along the mean slope, m; NaN for a walker of the user.
 
         - `states_after_step`: as in `StepTransition`, shape (steps, components).
         """
+        if not self.model.is_wheel:
+            return np.full(len(states_after_step), np.nan)
         foot_distances = np.asarray(
             self.model.compute_foot_distance(
                 self.params, jnp.asarray(states_after_step[:, : self.states.shape[1]].T)
@@ -392,7 +410,7 @@ def sample_passage(
         kappa_1 = float(np.mean([transition.is_walker_alive for transition in late_transitions]))
         kappa_2 = _estimate_kappa_2(
             late_transitions,
-            int(walker_groups.model.count_continuous_section_entries(walker_groups.params)),
+            walker_groups.n_continuous_entries,
             walker_groups.ground.shape[1],
         )
         # The effect of the start, divided by the survival probability, decays by this factor.
