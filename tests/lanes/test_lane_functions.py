@@ -9,6 +9,7 @@ from jax import lax
 from support.machine_code import CodeRegistrySpy, disable_machine_code, use_cache_folder
 
 from vrw_jax import lanes
+from vrw_jax.lanes import code_cache
 
 N = 21  # no multiple of the lanes in a group
 GENERATOR = np.random.default_rng(0)
@@ -162,6 +163,25 @@ def unroll(x, law):
 def test_derivatives_of_every_mode_agree_with_an_unrolled_loop(transform):
     actual = transform(lanes.jit(energy))(jnp.asarray(X[0]), LAW)
     assert_equal_trees(actual, transform(unroll)(jnp.asarray(X[0]), LAW))
+
+
+def test_a_separate_function_is_compiled_once_for_all_calls_and_columns(monkeypatch, tmp_path):
+    matrix, texts, write = GENERATOR.normal(size=(9, 9)), [], code_cache.write_llvm_kernel
+    monkeypatch.setattr(
+        code_cache, "write_llvm_kernel", lambda *a: texts.append(write(*a)) or texts[-1]
+    )
+    multiply = lanes.mark_noinline(lambda x: matrix @ x)
+    multiply_thrice = lanes.jit(lambda x: multiply(multiply(multiply(x))))
+    x = GENERATOR.normal(size=(N, 9))
+    # Nine columns, and thus an incomplete last round; three sums of nine products each.
+    with use_cache_folder(tmp_path):
+        columns = jax.vmap(jax.jacfwd(multiply_thrice))(jnp.asarray(x))
+        images = multiply_thrice.batch(x)
+    cube = np.linalg.matrix_power(matrix, 3)
+    np.testing.assert_allclose(columns, np.broadcast_to(cube, (N, 9, 9)), atol=1e-12)
+    np.testing.assert_allclose(images, x @ cube.T, atol=1e-12)
+    # The first call has columns of unit vectors, which are the same for all lanes.
+    assert [text.count("define internal") for text in texts] == [2, 1]
 
 
 def test_other_numbers_in_closures_trace_nothing_anew(monkeypatch, tmp_path):

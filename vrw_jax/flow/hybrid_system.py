@@ -269,12 +269,13 @@ class HybridSystem(AbstractWalker):
     def _run_step(
         self,
         params: Any,
-        x: Array,
+        start: StateArray,
+        mode_index: Array,
         options: StepOptions,
-        make_log: Callable[[StateArray], Any],
+        log: Any,
         update_log: Callable,
     ) -> EventRun:
-        """Simulate one step, and record its events in a log."""
+        """Simulate until the end of a step, and record its events in a log."""
         section_guards = [
             (mode_index, guard_index)
             for mode_index, mode in enumerate(self.modes.values())
@@ -284,20 +285,26 @@ class HybridSystem(AbstractWalker):
         is_section = lambda event: jnp.any(
             jnp.stack([(event.mode == m) & (event.guard == g) for m, g in section_guards])
         )
-        start = self.embed(x, params)
         return run_events(
             self._bind_modes(params),
             options,
             start,
-            jnp.asarray(self._find_mode(None), jnp.int32),
+            mode_index,
             self.max_events,
-            make_log(start),
+            log,
             update_log,
             is_section,
         )
 
     def take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
         """Return one step of one element; `compile_step` compiles this function."""
+        mode_index = jnp.asarray(self._find_mode(None), jnp.int32)
+        return self.finish_step(params, self.embed(x, params), mode_index, options)
+
+    def finish_step(
+        self, params: Any, start: StateArray, mode_index: Array, options: StepOptions
+    ) -> HybridStep:
+        """Return the rest of a step that is in a mode, from a state of one element."""
         n_guards, n_modes = [len(mode.guards) for mode in self.modes.values()], len(self.modes)
         first_guards = np.cumsum([0, *n_guards])[:-1]
 
@@ -313,11 +320,8 @@ class HybridSystem(AbstractWalker):
                 jnp.where(is_entry, guard, events).astype(jnp.int32),
             )
 
-        make_log = lambda start: (
-            jnp.zeros(n_modes) + 0.0 * start[0],
-            jnp.full(self.max_events, -1, jnp.int32),
-        )
-        run = self._run_step(params, x, options, make_log, log_event)
+        log = jnp.zeros(n_modes) + 0.0 * start[0], jnp.full(self.max_events, -1, jnp.int32)
+        run = self._run_step(params, start, mode_index, options, log, log_event)
         mode_durations, events = run.log
         return HybridStep(
             self.project(run.state, params),
@@ -351,13 +355,15 @@ class HybridSystem(AbstractWalker):
                 jnp.where(is_entry, event.mode, modes),
             )
 
-        make_log = lambda start: (
+        start, mode_index = self.embed(x, params), jnp.asarray(self._find_mode(None), jnp.int32)
+        log = (
             jnp.zeros((self.max_events, len(start))) + start,
             jnp.zeros(self.max_events) + 0.0 * start[0],
             jnp.zeros(self.max_events, jnp.int32),
         )
-        states, durations, modes = self._run_step(params, x, options, make_log, log_event).log
-        starts = jnp.concatenate([self.embed(x, params)[None], states[:-1]])
+        run = self._run_step(params, start, mode_index, options, log, log_event)
+        states, durations, modes = run.log
+        starts = jnp.concatenate([start[None], states[:-1]])
         samplers = [
             lambda state, duration, field=mode.field: sample_phase(
                 field, state, duration, n_samples, options
@@ -548,6 +554,12 @@ def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> Hy
         ),
         max_events=system.max_events,
     )
+
+
+@functools.lru_cache
+def compile_finish(system: HybridSystem) -> Any:
+    """Return the compiled rest of a step, from a state in any mode."""
+    return lanes.jit(system.finish_step)
 
 
 @functools.lru_cache

@@ -219,8 +219,16 @@ def find_gait_from_guesses(
 def _search_from_guess(
     walker: AbstractWalker, period_n: int, params: Any, options: StepOptions, guess: Array
 ) -> HybridGait:
+
+    def map_section_state(x: Array) -> Array:
+        # The derivatives of the map are those of the steps of the gait, and so one program: by `x`
+        # and by parameters, on one of which `x` nominally depends, and not by options.
+        some_parameter = next(iter(jax.tree.leaves(params)), 0.0)
+        return_map = make_return_map(walker, params, jax.lax.stop_gradient(options))
+        return return_map(jnp.where(False, some_parameter, x))
+
     fixed_point = solve_fixed_point_implicit(
-        make_return_map(walker, params, options),
+        map_section_state,
         guess,
         period_n=period_n,
         invariants=[lambda x: walker.evaluate_invariants(params, x)] if walker.invariants else (),

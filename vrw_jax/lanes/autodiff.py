@@ -34,6 +34,7 @@ def enable_all_ad_modes(
     function_to_differentiate: ForwardFunction | None = None,
     compile_jacobian: Callable[[ForwardFunction, tuple], ForwardFunction] = lambda f, _: f,
     differentiated_arguments: tuple[tuple[int, ...], ...] = (),
+    n_directions_at_once: int | None = None,
 ) -> ForwardFunction:
     """Return `function` with derivatives in forward and reverse mode, to any order.
 
@@ -46,7 +47,8 @@ def enable_all_ad_modes(
     `compute_jacobian_columns`. Function and Jacobians are compiled once each: outside of `jit`,
     forward mode, reverse mode and single directions all call the same compiled Jacobian.
 
-    - `differentiated_arguments`: `argnums` of the orders that `function` already has.
+    - `differentiated_arguments`: `argnums` of the orders that `function` already has;
+    - `n_directions_at_once`: see `compute_jacobian_columns`.
     """
     compiled_function = jax.jit(function)
     wrapped_function = jax.custom_jvp(compiled_function)
@@ -55,7 +57,11 @@ def enable_all_ad_modes(
     def get_differentiable_jacobian(argnums: tuple[int, ...]) -> ForwardFunction:
         def compute_jacobian(*arrays: Any) -> tuple[PyTree, PyTree]:
             columns, float_outputs, nonfloat_outputs = compute_jacobian_columns(
-                function_to_differentiate or function, arrays, argnums, has_lanes=False
+                function_to_differentiate or function,
+                arrays,
+                argnums,
+                has_lanes=False,
+                n_directions_at_once=n_directions_at_once,
             )
             return (columns, float_outputs), nonfloat_outputs
 
@@ -65,6 +71,7 @@ def enable_all_ad_modes(
             compute_jacobian,
             compile_jacobian,
             argnums_by_order,
+            n_directions_at_once,
         )
 
     @with_default_jax_settings
@@ -155,12 +162,16 @@ def compute_jacobian_columns(
     argument_leaves: Sequence[Array],
     input_indices: Sequence[int],
     has_lanes: bool = True,
+    n_directions_at_once: int | None = None,
 ) -> tuple:
     """Return the Jacobian columns, the float results and all other results of a function.
 
     The columns are derivatives with respect to the leaves at `input_indices`. The leading axis of
     the columns runs over the entries of the leaves. `function` returns float arrays, and auxiliary
     results. If `has_lanes` is true, the last axis of all arrays is the batch.
+
+    - `n_directions_at_once`: number of columns that code without a loop computes. More columns are
+      computed in a loop, which repeats the function, so that the code stays short.
     """
 
     def evaluate_at_selected_leaves(*selected_leaf_values: Array) -> tuple:
@@ -188,12 +199,26 @@ def compute_jacobian_columns(
         if leaf.ndim > n_lane_axes:
             tangents = [jnp.stack(tangents, 1).reshape(n_vectors, *leaf.shape)]
         unit_tangents += tangents
-    directional_derivative_function = lambda tangents: jax.jvp(
+    differentiate = lambda tangents: jax.jvp(
         evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
     )
-    float_outputs, jacobian_columns, nonfloat_outputs = jax.vmap(
-        directional_derivative_function, out_axes=(None, 0, None)
-    )(unit_tangents)
+    differentiate_in_directions = jax.vmap(differentiate, out_axes=(None, 0, None))
+    if not n_directions_at_once or n_vectors <= n_directions_at_once:
+        float_outputs, jacobian_columns, nonfloat_outputs = differentiate_in_directions(
+            unit_tangents
+        )
+        return jacobian_columns, float_outputs, nonfloat_outputs
+    n_rounds = -(-n_vectors // n_directions_at_once)
+    n_absent = n_rounds * n_directions_at_once - n_vectors
+    rounds = [
+        jnp.concatenate([x, jnp.zeros((n_absent, *x.shape[1:]), x.dtype)]).reshape(
+            n_rounds, n_directions_at_once, *x.shape[1:]
+        )
+        for x in unit_tangents
+    ]
+    outputs, columns, other_outputs = lax.map(differentiate_in_directions, rounds)
+    float_outputs, nonfloat_outputs = jax.tree.map(lambda x: x[-1], (outputs, other_outputs))
+    jacobian_columns = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n_vectors], columns)
     return jacobian_columns, float_outputs, nonfloat_outputs
 
 

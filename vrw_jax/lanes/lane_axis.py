@@ -149,12 +149,24 @@ def _call(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[La
     flags = tuple(x.has_lanes for x in operands)
     if equation.params.get("name") != NOINLINE_FUNCTION_NAME or not any(flags):
         return _evaluate(n_lanes, closed_jaxpr, operands)
+    evaluate_arrays, result_flags = _make_separate_function(n_lanes, closed_jaxpr, flags)
+    results = evaluate_arrays(*(x.array for x in operands))
+    return list(map(LaneValue, results, result_flags))
+
+
+@functools.lru_cache(64)
+def _make_separate_function(
+    n_lanes: int, closed_jaxpr: ClosedJaxpr, flags: tuple[bool, ...]
+) -> tuple[Callable, tuple[bool, ...]]:
+    """Return a function that is traced and compiled once for all calls of a trace with lanes.
+
+    The second result says which of its results have lanes.
+    """
     result_flags = _find_lanes(closed_jaxpr, flags)
     evaluate_arrays = lambda *arrays: _make_arrays(
         n_lanes, _evaluate(n_lanes, closed_jaxpr, list(map(LaneValue, arrays, flags))), result_flags
     )
-    results = mark_noinline(evaluate_arrays)(*(x.array for x in operands))
-    return list(map(LaneValue, results, result_flags))
+    return mark_noinline(evaluate_arrays), result_flags
 
 
 def _broadcast(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:

@@ -136,15 +136,21 @@ class JaxprLowering:
                 closed_jaxpr,
             )
         llvm_function, _ = self.llvm_function_by_jaxpr_id[id(closed_jaxpr)]
-        returned_struct = llvm_builder.call(
-            llvm_function,
-            self.array_emitter.flatten_array_entries(argument_arrays, closed_jaxpr.in_avals),
+        argument_entries = self.array_emitter.flatten_array_entries(
+            list(map(self._store_large_array, argument_arrays)), closed_jaxpr.in_avals
         )
+        returned_struct = llvm_builder.call(llvm_function, argument_entries)
         result_entries = [
             llvm_builder.extract_value(returned_struct, i)
             for i in range(len(returned_struct.type.elements))
         ]
-        return split_into_entry_arrays(result_entries, closed_jaxpr.out_avals)
+        results = split_into_entry_arrays(result_entries, closed_jaxpr.out_avals)
+        return list(map(self._store_large_array, results))
+
+    def _store_large_array(self, array: LlvmArray) -> LlvmArray:
+        """Return a large array in memory, so that loops compute its entries, or those from it."""
+        is_large = math.prod(array.shape) > self.array_emitter.MAX_REGISTER_ENTRIES
+        return self.array_emitter.store_array_in_memory(array) if is_large else array
 
     def _define_separate_function(self, closed_jaxpr: ClosedJaxpr) -> ir.Function:
         """Return a new LLVM function that computes a jaxpr.

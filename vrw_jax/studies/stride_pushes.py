@@ -23,7 +23,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.flow.hybrid_system import HybridSystem, compile_finish
 from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.gaits.walker_finder import HybridGait
@@ -582,6 +582,19 @@ def _differentiate_each(finish: Callable[[Array], Array], states: Array) -> Arra
     return jax.vmap(lambda y: evaluate_with_jacobian(finish, y)[1])(states)
 
 
+@eqx.filter_jit
+def _differentiate_rest(
+    system: HybridSystem, params: Any, states: Array, mode: Array, options: StepOptions
+) -> Array:
+    """Return the derivatives of the end of a step by states in a mode, the same code for each."""
+
+    def finish(y: Array) -> Array:
+        rest = compile_finish(system)(params, y, mode, options)
+        return jnp.append(rest.section_state, rest.duration)
+
+    return jax.vmap(lambda y: evaluate_with_jacobian(finish, y)[1])(states)
+
+
 def _sample_hybrid_stride(
     system: HybridSystem, params: Any, x: Array, n_samples: int, options: StepOptions
 ) -> _Stride:
@@ -599,27 +612,19 @@ def _sample_hybrid_stride(
     phases: list[_Phase] = []
     mode_names = tuple(system.modes)
     for event in range(n_events):
-        mode = int(simulation.modes[event])
+        mode = simulation.modes[event]
         if not durations[event] > 0.0:
             continue
-        vector_field: Any = system.modes[mode_names[mode]].field
+        vector_field: Any = system.modes[mode_names[int(mode)]].field
         field = functools.partial(lambda field, y: field(y, params), vector_field)
         states = sample_phase(field, starts[event], durations[event], n_samples, options)
-
-        def finish(mode: str, n_left: int, y: Array) -> Array:
-            rest = system.simulate(params, y, events=n_left, mode=mode, options=options)
-            return jnp.append(system.project(rest.states_after[-1], params), rest.times[-1])
 
         phases.append(
             _Phase(
                 np.linspace(times[event], times[event + 1], n_samples),
-                np.full(n_samples, mode),
+                np.full(n_samples, int(mode)),
                 np.asarray(states),
-                np.asarray(
-                    _differentiate_each(
-                        functools.partial(finish, mode_names[mode], n_events - event), states
-                    )
-                ),
+                np.asarray(_differentiate_rest(system, params, states, mode, options)),
             )
         )
     return _Stride(
