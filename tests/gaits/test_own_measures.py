@@ -118,6 +118,29 @@ def test_tuning_maximizes_a_measure():
     assert (tuned.objective, float(tuned.params.damping)) == ("mean_rear_force", 180.0)
 
 
+def test_branches_have_measures_by_name_and_by_themselves():
+    """A flight from v to -v has the action 2 v^3 / 3 g, and kicks have v = k / (1 - e)."""
+    action = vrw.measure("action", phase="flight", reduction="integral")(lambda y, p: y[1] ** 2)
+    gait = vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM)
+    branch = vrw.continue_branch(
+        BALL_PARAMS, "kick", (0.5, 2.0), model=BALL_SYSTEM, cycle=gait, measures=["height", action]
+    ).dataset
+    v = branch.kick.values / 0.5
+    np.testing.assert_allclose(branch.action, 2 * v**3 / 3 / GRAVITY, rtol=1e-8)
+    np.testing.assert_allclose(branch.height, v**2 / 2 / GRAVITY, rtol=1e-8)
+    assert branch.height.units == "m"
+    assert branch.component.values.tolist() == ["velocity"]
+
+
+def test_a_branch_of_a_wheel_has_the_measure_of_each_gait():
+    wheel = vrw.WheelParams(damping=199.0)
+    branch = vrw.continue_branch(wheel, "damping", (198.0, 200.0), measures=[IMPULSE]).dataset
+    gaits = vrw.limit_cycles(vrw.WheelParams(damping=branch.damping.values[[0, -1]]))
+    # The gaits have errors of the default mesh, about 1e-10.
+    np.testing.assert_allclose(branch.rear_impulse[[0, -1]], gaits.measure(IMPULSE), rtol=1e-8)
+    assert branch.rear_impulse.units == "N s"
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -134,6 +157,16 @@ def test_tuning_maximizes_a_measure():
                 vrw.samples(damping=[200.0]), [MEAN_FORCE], model=vrw.UnilateralWheel(friction=0.7)
             ),
             "ViscoelasticWheel",
+        ),
+        (
+            lambda: vrw.continue_branch(
+                WHEEL, "damping", (190.0, 210.0), model=vrw.RigidWheel(), measures=[MEAN_FORCE]
+            ),
+            "ViscoelasticWheel",
+        ),
+        (
+            lambda: vrw.continue_branch(WHEEL, "damping", (190.0, 210.0), measures=["period"]),
+            "'period' is no measure",
         ),
         (
             lambda: dataclasses.replace(BALL_SYSTEM, measures=(MEAN_FORCE,)),

@@ -71,6 +71,8 @@ def test_a_walk_takes_a_parameter_for_each_step_and_a_batch_walks_as_one(walker)
     walk = vrw.walk(BALL_PARAMS | {"kick": kicks}, [2.0], 3, model=walker)
     np.testing.assert_allclose(walk.steps.section_state[:, 0], [2.0, 1.5, 0.75], rtol=1e-12)
     assert int(walk.n_stepped) == 3
+    section = getattr(walker, "section", "section")
+    assert walk.ending == f"The walker stepped from {section} to {section}."
     batch = vrw.step_batch(BALL_PARAMS | {"kick": kicks}, np.array([2.0]), 3, model=walker)
     expected = 0.125 * 2.0 + kicks * 1.75
     np.testing.assert_allclose(batch.section_state[:, 0], expected, rtol=1e-12)
@@ -269,6 +271,9 @@ def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels
             )(0.4),
             "have no derivatives",
         ),
+        (lambda: vrw.limit_cycle({"kick": 1.0}, model=BALL_SYSTEM), "reads the parameter 'ball'"),
+        (lambda: vrw.walk({"kick": 1.0}, [2.0], 2, model=JuggledBall()), "contains kick: add it"),
+        (lambda: vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM).measure("x"), "height"),
     ],
 )
 def test_what_is_missing_is_said_in_one_sentence(call, message):

@@ -126,12 +126,18 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
     )
     if "x" in branch_dataset:  # fixed points of a map
         components = {
-            f"$x_{{{number}}}$": values
+            _label_component(values, number): values
             for number, values in enumerate(branch_dataset.x.transpose("component", "point"), 1)
         }
-        branch_dataset = branch_dataset.assign(components)
+        has_names = "component" in branch_dataset.coords
+        branch_dataset = branch_dataset.drop_vars("component_unit", errors="ignore").assign(
+            {label: ("point", values.values) for label, values in components.items()}
+        )
         component_colors = dict(zip(components, itertools.cycle(COMPONENT_COLORS), strict=False))
-        drawn_panels = (("fixed point", component_colors), MULTIPLIER_PANEL)
+        drawn_panels = (
+            ("section coordinates" if has_names else "fixed point", component_colors),
+            MULTIPLIER_PANEL,
+        )
     legend_height = 0.32 + 0.16 * -(-len(special_points) // 2)
     figure, panel_axes = make_panel_grid(
         find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
@@ -194,6 +200,14 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
             axes.set_xlabel(format_axis_label(branch.parameter))
     _add_branch_legend(figure, special_points, branch.parameter)
     return figure
+
+
+def _label_component(values: xr.DataArray, number: int) -> str:
+    """Return the name of a component with its unit, or its number."""
+    if "component" not in values.coords:
+        return f"$x_{{{number}}}$"
+    name, unit = str(values.component.values), str(values.component_unit.values)
+    return typeset_greek_symbols(name) + (f" [{unit}]" if unit != "1" else "")
 
 
 def _select_special_point_color(special_point: SpecialPoint) -> str:

@@ -1,12 +1,12 @@
 """Measures: measured quantities with their names, units and meanings, and measures of your own."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from vrw_jax.base.checks import check_callable, check_choice
+from vrw_jax.base.checks import check_callable, check_choice, check_names, require_known_name
 from vrw_jax.base.printing import format_mathtext
 
 
@@ -86,6 +86,15 @@ def find_own_measures(measures: Any) -> dict[str, Measure]:
     given = (measures,) if isinstance(measures, Measure) else measures
     given = given if isinstance(given, list | tuple) else ()
     return {measure.name: measure for measure in given if isinstance(measure, Measure)}
+
+
+def select_measures(measures: Any, known: Sequence[Measure]) -> tuple[Measure, ...]:
+    """Return measures of the user, of which those in `known` may be given by their names."""
+    own = {measure.name: measure for measure in known} | find_own_measures(measures)
+    names = check_names("measures", name_measures(measures), "cost")
+    for name in names:
+        require_known_name(name, tuple(own) or ("measures declared by vrw.measure",), "measure")
+    return tuple(own[name] for name in names)
 
 
 def name_measures(measures: Any) -> Any:

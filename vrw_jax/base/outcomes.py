@@ -1,6 +1,8 @@
 """Outcomes of a step, of a walk and of a search for a gait."""
 
-from vrw_jax.base.printing import StatusCode
+from typing import Any
+
+from vrw_jax.base.printing import StatusCode, format_each_batch_element
 
 
 class Outcome(StatusCode):
@@ -51,3 +53,18 @@ class Outcome(StatusCode):
     GUARD_VIOLATED = (
         18, "One of the guards was negative when its mode began, for example after a fall."
     )  # fmt: skip
+
+
+def describe_outcomes(outcomes: Any, section: str = "") -> Any:
+    """Return the sentence on an outcome, or an array of sentences for a batch.
+
+    - `section`: name of the section of a walker of the user, which takes the place of a touchdown.
+    """
+
+    def describe(outcome: Any) -> str:
+        sentence = Outcome(int(outcome)).meaning
+        if not section:
+            return sentence
+        return sentence.replace("touchdown", section).replace("The wheel", "The walker")
+
+    return format_each_batch_element(describe, outcomes)

@@ -1,8 +1,9 @@
 """Interface of a walker: what steps, walks, gaits and studies need to know about it."""
 
 import abc
+import contextlib
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, TypeGuard
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from vrw_jax.base.checks import check_reals, check_type
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import replace_tree_parameter
+from vrw_jax.base.parameters import list_tree_parameters, replace_tree_parameter
 
 
 class AdvanceResult(eqx.Module):
@@ -126,9 +127,17 @@ class AbstractWalker(abc.ABC):
         """Return the quantities that a step conserves."""
         return jnp.stack([invariant(x, params) for invariant in self.invariants])
 
-    def measure_step(self, params: Any, x: Array, step: Any, options: StepOptions) -> dict:
-        """Return the values of `measures` for the step from `x`, by name."""
-        return {measure.name: jnp.asarray(measure(step, params)) for measure in self.measures}
+    def measure_step(
+        self,
+        params: Any,
+        x: Array,
+        step: Any,
+        options: StepOptions,
+        measures: Sequence[Measure] | None = None,
+    ) -> dict[str, Array]:
+        """Return the values of measures, by default its own, for the step from `x`, by name."""
+        measures = self.measures if measures is None else measures
+        return {measure.name: jnp.asarray(measure(step, params)) for measure in measures}
 
     def sample_motion(
         self, params: Any, x: Any, options: StepOptions, n_samples: int
@@ -161,6 +170,11 @@ class AbstractWalker(abc.ABC):
             )
 
 
+def name_section(walker: AbstractWalker) -> str:
+    """Return the name of the event at which steps begin and end, for sentences."""
+    return getattr(walker, "section", "section").replace("_", " ")
+
+
 def is_own_walker(model: Any) -> TypeGuard[AbstractWalker]:
     """Return whether a model is a walker of the user, and no model of the wheel."""
     return isinstance(model, AbstractWalker) and not model.is_wheel
@@ -169,6 +183,22 @@ def is_own_walker(model: Any) -> TypeGuard[AbstractWalker]:
 def check_parameters(params: Any) -> Any:
     """Return a tree of parameters as arrays, or raise an error."""
     return jax.tree.map(lambda leaf: check_reals("a parameter", leaf), params)
+
+
+@contextlib.contextmanager
+def name_missing_parameters(params: Any) -> Iterator[None]:
+    """Return a context in which a parameter that a walker lacks raises an error with its name."""
+    try:
+        yield
+    except KeyError as error:
+        names = [parameter.name for parameter in list_tree_parameters(params)]
+        name = error.args[0] if error.args else None
+        if not isinstance(name, str) or name in names:
+            raise
+        raise ValueError(
+            f"the walker reads the parameter {name!r}, but params contains {', '.join(names)}: "
+            "add it to params."
+        ) from error
 
 
 def check_arguments(
@@ -189,11 +219,12 @@ def check_arguments(
     if not 1 <= x.ndim <= max_axes:
         shapes = "(n,)" if max_axes == 1 else "(n,) or (batch, n)"
         raise ValueError(f"{name} has shape {x.shape}, but its shape must be {shapes}.")
-    walker.check_definition(
-        jax.tree.map(lambda p: jax.ShapeDtypeStruct(p.shape[max_axes - 1 :], p.dtype), params),
-        jax.ShapeDtypeStruct(x.shape[-1:], x.dtype),
-        name,
-    )
+    with name_missing_parameters(params):
+        walker.check_definition(
+            jax.tree.map(lambda p: jax.ShapeDtypeStruct(p.shape[max_axes - 1 :], p.dtype), params),
+            jax.ShapeDtypeStruct(x.shape[-1:], x.dtype),
+            name,
+        )
     options.check_tolerances(x.dtype)
     return params, x, options
 

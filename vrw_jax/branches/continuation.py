@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,6 +26,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure, select_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
@@ -334,6 +335,7 @@ def continue_branch(
     step_options: StepOptions | None = None,
     force_peaks: bool = False,
     margins: Mapping[str, Callable[[Array, Any], Array]] | None = None,
+    measures: Sequence[str | Measure] = (),
     switch_at: SpecialPoint | None = None,
 ) -> Branch:
     """Continue the branch of limit cycles through `params` in one parameter, within `bounds`.
@@ -382,6 +384,8 @@ def continue_branch(
             change of the number of peaks, such as at a landing or at the start of slip.
         margins: for a `HybridSystem`, functions of state and parameters by name, such as the
             distance to a guard. Their minima over the gait are measures of the branch.
+        measures: measures of your own, see `vrw.measure`, for the dataset of the branch. For a
+            walker of yours, also names of its measures.
         switch_at: for a `HybridSystem`, a branch point or period doubling of the branch of `cycle`.
             The branch that crosses there is continued, or that of gaits of twice the period.
 
@@ -400,8 +404,9 @@ def continue_branch(
     if is_own_walker(model):
         check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
         return continue_hybrid_branch(
-            model, params, name, bounds, cycle, period_n, step_options, options, margins, switch_at
-        )
+            model, params, name, bounds, cycle, period_n, step_options, options, margins, switch_at,
+            measures,
+        )  # fmt: skip
     if margins or switch_at is not None:
         raise ValueError(
             "margins and switch_at are for a HybridSystem, but the model is a wheel: leave them "
@@ -416,6 +421,7 @@ def continue_branch(
         params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
         model=convert_model_argument(resolve_model(params, model)),
         cycle_options=cycle_options, step_options=step_options, force_peaks=force_peaks,
+        measures=measures,
     )  # fmt: skip
     return branch
 
@@ -433,6 +439,7 @@ def continue_branches(
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
     force_peaks: bool = False,
+    measures: Sequence[str | Measure] = (),
 ) -> tuple[Branch, ...]:
     """Continue the branches of a batch of wheels, as `continue_branch` does for one wheel.
 
@@ -450,6 +457,7 @@ def continue_branches(
         cycle_options: options of the gaits.
         step_options: as in `continue_branch`.
         force_peaks: as in `continue_branch`.
+        measures: as in `continue_branch`.
 
     Returns:
         One `Branch` per wheel.
@@ -478,6 +486,7 @@ def continue_branches(
         "parameter_name": name,
         "period_n": period_n,
         "measures_force_peaks": force_peaks,
+        "own_measures": select_measures(measures, ()),
     }
     n_wheels = _check_branches(params, cycle, cycle_options, **problem_fields)
     limits, options = np.array(check_range("bounds", bounds)), check_arclength_options(options)
@@ -497,7 +506,13 @@ def continue_branches(
     )
     return tuple(
         _make_labeled_gait_branch(
-            data, select_rows_on_device(params, i), name, model, step_options, outcome
+            data,
+            select_rows_on_device(params, i),
+            name,
+            model,
+            step_options,
+            outcome,
+            problem_fields["own_measures"],
         )
         for i, (data, outcome) in enumerate(
             zip(branch_data[:n_wheels], start_outcomes.tolist(), strict=False)
@@ -515,6 +530,7 @@ def _check_branches(
     period_n: int,
     step_options: StepOptions,
     measures_force_peaks: bool,
+    own_measures: tuple[Measure, ...],
     n_legs: int,
 ) -> int:
     """Return the number of wheels, or raise an error if an argument is invalid."""
@@ -537,6 +553,11 @@ def _check_branches(
         raise ValueError(
             f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
             "the force: take vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
+        )
+    if own_measures and not gait_finder.supports_cold_start:
+        raise ValueError(
+            f"{own_measures[0].name} is a measure of your own, but it is known for gaits of the "
+            "paper's model and of your own walkers only: take model=vrw.ViscoelasticWheel()."
         )
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))
@@ -604,6 +625,7 @@ def _make_labeled_gait_branch(
     model: Any,
     step_options: StepOptions,
     start_outcome: int,
+    own_measures: tuple[Measure, ...],
 ) -> Branch:
     start_provenance = collect_provenance_attributes(params, model, step_options)
     start_provenance.pop(f"parameter_{parameter_name}", None)
@@ -626,6 +648,10 @@ def _make_labeled_gait_branch(
         },
         "point",
     )
+    for measure in own_measures:
+        branch_variables[measure.name] = xr.Variable(
+            "point", quantity_table[measure.name], measure.variable_attributes
+        )
     branch_variables["section_state"] = xr.Variable(
         ("point", "component"),
         quantity_table["section_state"],

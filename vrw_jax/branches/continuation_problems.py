@@ -20,12 +20,14 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.base import batch_sizes
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.abstract_continuation import EVENT_ORDER, QuantitiesByName
 from vrw_jax.branches.arclength import AbstractContinuationProblem, ContinuationPoint, NewtonStep
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.force_peaks import locate_force_peaks
+from vrw_jax.gaits.limit_cycle_result import evaluate_own_measure
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.return_map_finder import measure_return_map_force_peaks
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
@@ -142,6 +144,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
     parameter_name: str
     period_n: int
     measures_force_peaks: bool
+    own_measures: tuple[Measure, ...] = ()  # of the user
 
     @property
     def parameter_index(self) -> int:
@@ -275,7 +278,7 @@ class CollocationProblem(AbstractGaitProblem):
         `takeoff_acceleration`, m/s^2. The latter is the lowest acceleration of the rear foot at
         take-off over the gait steps.
         """
-        return map_in_numpy_batches(
+        states, quantities = map_in_numpy_batches(
             functools.partial(
                 _read_collocated_gaits,
                 self.collocation_system,
@@ -288,6 +291,31 @@ class CollocationProblem(AbstractGaitProblem):
             wheels.is_phase_active,
             z,
         )
+        for measure in self.own_measures:
+            evaluate = functools.partial(
+                _measure_solutions, measure, self.collocation_system, self.model, self.shapes
+            )
+            quantities[measure.name] = map_in_numpy_batches(
+                evaluate, POINT_BATCH_SIZES, values, z, states
+            )
+        return states, quantities
+
+
+@eqx.filter_jit
+def _measure_solutions(
+    measure: Measure,
+    system: CollocationSystem,
+    model: Any,
+    shapes: SolutionShapes,
+    parameters: Array,
+    z: Array,
+    states: Array,
+) -> Array:
+    """Return a measure of the user of many collocated gaits."""
+    evaluate = functools.partial(evaluate_own_measure, measure, system, model)
+    return jax.vmap(lambda p, z, x: evaluate(p, unpack_solution(shapes, z), x))(
+        parameters, z, states
+    )
 
 
 @functools.partial(jax.jit, static_argnums=range(4))

@@ -24,15 +24,22 @@ from vrw_jax.base.checks import (
     check_real,
     check_reals,
     check_type,
+    require_known_name,
     require_no_masked_entries,
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure, select_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.walker import AbstractWalker, make_return_map, step_batch_of_walker
+from vrw_jax.base.walker import (
+    AbstractWalker,
+    make_return_map,
+    name_coordinates,
+    step_batch_of_walker,
+)
 from vrw_jax.branches.abstract_continuation import (
     BORDER_COLLISION,
     EVENT_ORDER,
@@ -49,7 +56,7 @@ from vrw_jax.branches.arclength import (
 )
 from vrw_jax.branches.branch import Branch, FixedPoint, SpecialPoint
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
-from vrw_jax.branches.continuation_problems import MapProblem, number_rows
+from vrw_jax.branches.continuation_problems import POINT_BATCH_SIZES, MapProblem, number_rows
 from vrw_jax.branches.test_functions import (
     BIFURCATIONS,
     BRANCH_POINT,
@@ -67,6 +74,7 @@ from vrw_jax.gaits.fixed_points import (
     has_unit_multiplier,
 )
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
+from vrw_jax.lanes.batching import map_in_numpy_batches
 from vrw_jax.models.measures import make_labeled_variables
 
 
@@ -130,8 +138,10 @@ class AbstractMapContinuation(AbstractContinuation):
     state_units: Any = 1.0
     crossed_tangent: np.ndarray | None = None
 
-    measure_names: ClassVar[tuple[str, ...]] = ()
-    """Names of the quantities that the dataset of the branch contains."""
+    measure_attributes: ClassVar[Mapping[str, Mapping[str, str]]] = {}
+    """Attributes of the quantities that the dataset of the branch contains, by name."""
+    component_units: ClassVar[tuple[tuple[str, str], ...]] = ()
+    """Names and units of the components of the state, if they have names."""
 
     @property
     def parameter_unit(self) -> float:
@@ -379,13 +389,21 @@ def trace_map_branch(
         reasons = (UNIT_MULTIPLIER_ADVICE if is_singular else "",) * 2
         return Branch(name, empty_dataset, (), reasons, Outcome.NO_CYCLE_FOUND)
     quantities = branch_data.quantities
+    units = dict(continuation.component_units)
+    components = {
+        "component": list(units),
+        "component_unit": ("component", list(units.values())),
+    }
     dataset = xr.Dataset(
         {
             "x": (("point", "component"), quantities["x"]),
-            **{measure: ("point", quantities[measure]) for measure in continuation.measure_names},
+            **{
+                measure: ("point", quantities[measure], attributes)
+                for measure, attributes in continuation.measure_attributes.items()
+            },
         }
         | make_stability_variables(branch_data.points.return_map_jacobian),
-        {name: ("point", branch_data.points.p)},
+        {name: ("point", branch_data.points.p)} | (components if units else {}),
         {"title": f"Branch of fixed points along {name}"},
     )
     return Branch(
@@ -407,6 +425,8 @@ class HybridContinuation(AbstractMapContinuation):
     period_n: int
     step_options: StepOptions
     margins: tuple[tuple[str, Callable[[Array, Any], Array]], ...]
+    measures: tuple[Measure, ...]
+    component_units: tuple[tuple[str, str], ...]  # type: ignore[misc]
 
     @property
     def test_functions(self) -> dict[str, TestFunction]:  # type: ignore[override]
@@ -422,8 +442,12 @@ class HybridContinuation(AbstractMapContinuation):
         }
 
     @property
-    def measure_names(self) -> tuple[str, ...]:  # type: ignore[override]
-        return ("period", *(name for name, _ in self.margins))
+    def measure_attributes(self) -> dict[str, Mapping[str, str]]:  # type: ignore[override]
+        return {
+            "period": {"units": "s"},
+            **{name: {} for name, _ in self.margins},
+            **{measure.name: measure.variable_attributes for measure in self.measures},
+        }
 
     def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable:
         params = replace_tree_parameter(
@@ -443,6 +467,7 @@ class HybridContinuation(AbstractMapContinuation):
         states, walker, options = self.state_units * points.z, self.walker, self.step_options
         params = replace_tree_parameter(wheels, self.name, points.p)
         quantities = {"x": states, "period": np.zeros(len(states))}
+        quantities |= {measure.name: np.zeros(len(states)) for measure in self.measures}
         codes, outcome = [], np.full(len(states), int(Outcome.STEPPED))
         minima = np.full((len(states), len(self.margins)), np.inf)
         for _ in range(self.period_n):
@@ -454,6 +479,13 @@ class HybridContinuation(AbstractMapContinuation):
                 )
                 minima = np.minimum(minima, step_minima)
             quantities["period"] = quantities["period"] + step.duration
+            if self.measures:
+                values = map_in_numpy_batches(
+                    functools.partial(_measure_steps, walker, self.measures, options),
+                    POINT_BATCH_SIZES, params, states, step,
+                )  # fmt: skip
+                for measure, value in values.items():
+                    quantities[measure] = quantities[measure] + value / self.period_n
             if isinstance(walker, HybridSystem):
                 codes.append(np.column_stack([step.n_events, step.events]))
             outcome = np.where(outcome == Outcome.STEPPED, step.outcome, outcome)
@@ -466,6 +498,19 @@ class HybridContinuation(AbstractMapContinuation):
 
     def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
         return quantities["outcome"] == Outcome.STEPPED
+
+
+@eqx.filter_jit
+def _measure_steps(
+    walker: AbstractWalker,
+    measures: tuple[Measure, ...],
+    options: StepOptions,
+    params: Any,
+    x: Array,
+    steps: Any,
+) -> dict[str, Array]:
+    evaluate = lambda params, x, step: walker.measure_step(params, x, step, options, measures)
+    return jax.vmap(evaluate)(params, x, steps)
 
 
 @eqx.filter_jit
@@ -519,8 +564,16 @@ def continue_hybrid_branch(
     options: ArclengthOptions | None,
     margins: MarginFunctions | None,
     switch_at: SpecialPoint | None,
+    measures: Any,
 ) -> Branch:
     """Return the branch of `continue_branch` for a walker of the user."""
+    measures = select_measures(measures, walker.measures)
+    for measure in measures:
+        if measure.phase and isinstance(walker, HybridSystem):
+            require_known_name(measure.phase, tuple(walker.modes), "mode")
+    coordinates = (
+        name_coordinates(walker, np.shape(gait.section_state)[-1]) if walker.coordinates else {}
+    )
     check_int("period_n", period_n)
     step_options = StepOptions() if step_options is None else step_options
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
@@ -547,7 +600,8 @@ def continue_hybrid_branch(
     return trace_map_branch(
         functools.partial(
             HybridContinuation, walker=walker, name=name, period_n=n_periods * period_n,
-            step_options=step_options, margins=tuple(margins.items()),
+            step_options=step_options, margins=tuple(margins.items()), measures=measures,
+            component_units=tuple(coordinates.items()),
         ),
         map_section_state, gait.section_state, start_value, bounds, params, name, None, options,
         switch_at,

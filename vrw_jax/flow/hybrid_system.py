@@ -213,10 +213,16 @@ class HybridSystem(AbstractWalker):
         return f"HybridSystem({modes}; section {self.section!r})"
 
     def measure_step(
-        self, params: Any, x: Array, step: HybridStep, options: StepOptions
+        self,
+        params: Any,
+        x: Array,
+        step: HybridStep,
+        options: StepOptions,
+        measures: Sequence[Measure] | None = None,
     ) -> dict[str, Array]:
-        of_modes = tuple(measure for measure in self.measures if measure.phase)
-        values = {m.name: jnp.asarray(m(step, params)) for m in self.measures if not m.phase}
+        measures = self.measures if measures is None else measures
+        of_modes = tuple(measure for measure in measures if measure.phase)
+        values = {m.name: jnp.asarray(m(step, params)) for m in measures if not m.phase}
         if not of_modes:
             return values
         end = compile_step(_append_integrals(self, of_modes))(params, x, options)

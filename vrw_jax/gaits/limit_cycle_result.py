@@ -184,7 +184,7 @@ class LimitCycle(AbstractCycle):
         )
 
     def _evaluate_own_measure(self, measure: Measure) -> Array:
-        evaluate = functools.partial(_evaluate_own_measure, measure, self.system, self.model)
+        evaluate = functools.partial(evaluate_own_measure, measure, self.system, self.model)
         return self.map_over_batch_axes(evaluate)(
             self.parameters, self.collocation_state.solution, self.section_state
         )
@@ -235,7 +235,7 @@ class LimitCycle(AbstractCycle):
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _evaluate_own_measure(
+def evaluate_own_measure(
     measure: Measure,
     system: CollocationSystem,
     model: ViscoelasticWheel,

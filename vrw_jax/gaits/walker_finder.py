@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.base import batch_sizes
-from vrw_jax.base.checks import check_int, check_reals, has_traced_leaf
+from vrw_jax.base.checks import check_int, check_reals, has_traced_leaf, require_known_name
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
@@ -31,6 +31,7 @@ from vrw_jax.base.walker import (
     compile_step,
     make_return_map,
     name_coordinates,
+    name_missing_parameters,
 )
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point_implicit
@@ -101,6 +102,13 @@ class HybridGait(NamedTuple):
     def spectral_radius(self) -> Any:
         """Return the largest modulus of a multiplier, which is below 1 for stable gaits."""
         return jnp.abs(self.multipliers[..., 0])
+
+    def measure(self, measure: str | Measure) -> Any:
+        """Return the period, or one of the walker's measures, by its name or itself."""
+        values = {"period": self.period, **self.values}
+        name = measure.name if isinstance(measure, Measure) else measure
+        require_known_name(name, tuple(values), "measure")
+        return values[name]
 
     @property
     def why(self) -> Any:
@@ -182,7 +190,8 @@ def _check_search(
         has_batch = any(leaf.ndim for leaf in jax.tree.leaves(params))
         axes = jax.tree.map(lambda leaf: 0 if leaf.ndim else None, params)
         propose = jax.vmap(walker.starts, (axes,)) if has_batch else walker.starts
-        guesses = check_reals("starts", propose(params))
+        with name_missing_parameters(params):
+            guesses = check_reals("starts", propose(params))
         if guesses.ndim - has_batch == 1:
             guesses = guesses[..., None, :]
     else:
@@ -394,7 +403,8 @@ def make_walker_finder(
             "this walker has no starts, but the search for its gaits begins there: give a function "
             "starts= of its parameters in its definition, which returns section coordinates."
         )
-    start = walker.starts(params) if guess is None else guess
+    with name_missing_parameters(params):
+        start = walker.starts(params) if guess is None else guess
     coordinates = name_coordinates(walker, jnp.shape(start)[-1])
     described_measures = {
         "period": Measure("period", "s", "T", "period", "Duration of all steps of the gait."),

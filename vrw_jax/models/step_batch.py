@@ -36,6 +36,7 @@ from vrw_jax.base.walker import (
     AbstractWalker,
     check_parameters,
     is_own_walker,
+    name_section,
     step_batch_of_walker,
 )
 from vrw_jax.flow.tableaus import load_explicit_tableau
@@ -250,7 +251,8 @@ def _step_batch_of_own_walker(
         return section_state.T, step.durations.T, step.outcome, step.solver_steps
 
     batch.take_steps(n_steps, step_lanes)
-    return batch.make_batch_result("lanes", (options.solver,))
+    result = batch.make_batch_result("lanes", (options.solver,))
+    return dataclasses.replace(result, section=name_section(walker))
 
 
 def _check_parameter_shapes(

@@ -19,11 +19,10 @@ from jaxtyping import Array, Int
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_int, check_reals, check_type, format_value
 from vrw_jax.base.options import EngineName, StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import Outcome, describe_outcomes
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_step_ending,
     format_numbers,
     format_outcome_counts,
     format_quantity,
@@ -36,6 +35,7 @@ from vrw_jax.base.walker import (
     check_parameters,
     compile_step,
     is_own_walker,
+    name_section,
 )
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
@@ -365,7 +365,8 @@ class Walk(AbstractPrintable):
     - `start`: section state at the start;
     - `steps`: section state, durations and outcome of each step;
     - `n_stepped`: number of steps before the first failure;
-    - `units`: units of the section state, for printing.
+    - `units`: units of the section state, for printing;
+    - `section`: name of the section of a walker of yours, for printing.
 
     Examples:
         >>> walk = vrw.walk(vrw.WheelParams(damping=150.0), vrw.paper_start(), 5)
@@ -377,6 +378,7 @@ class Walk(AbstractPrintable):
     steps: AdvanceResult
     n_stepped: Int[Array, ""]
     units: str = eqx.field(static=True, default="(rad, rad/s, m/s)")
+    section: str = eqx.field(static=True, default="")
 
     @property
     def outcome(self) -> Array:
@@ -391,7 +393,7 @@ class Walk(AbstractPrintable):
         """Return a sentence that describes how the walk ended, or an array of sentences for a
         batch.
         """
-        return describe_step_ending(self.outcome, Outcome)
+        return describe_outcomes(self.outcome, self.section)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return labels and printed texts: outcome, number of steps, start, last state and time."""
@@ -400,7 +402,7 @@ class Walk(AbstractPrintable):
             return [("walks", format_outcome_counts(walk_outcome, Outcome))]
         last_step_index = max(int(self.n_stepped) - 1, 0)
         return [
-            ("outcome", Outcome(int(walk_outcome)).meaning),
+            ("outcome", self.ending),
             ("steps", f"{int(self.n_stepped)} of {self.steps.outcome.shape[-1]}"),
             ("start", f"{format_numbers(self.start)} {self.units}".strip()),
             ("last section state", format_numbers(self.steps.section_state[last_step_index])),
@@ -448,7 +450,8 @@ def _simulate_walk_by_scan(
         advance_walk_by_one_step, (x, jnp.int32(Outcome.STEPPED)), stepwise_ground, length=n_steps
     )
     n_stepped = jnp.sum(step_results.outcome == Outcome.STEPPED)
-    return Walk(x, step_results, n_stepped, **({} if model.is_wheel else {"units": ""}))
+    labels = {} if model.is_wheel else {"units": "", "section": name_section(model)}
+    return Walk(x, step_results, n_stepped, **labels)
 
 
 @announce_wait("a gait step", "5 s")

@@ -22,7 +22,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.walker import is_own_walker
+from vrw_jax.base.walker import is_own_walker, name_missing_parameters
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.flow.hybrid_trajectory import sample_walk_of_system
 from vrw_jax.models.contact_mechanics import (
@@ -204,7 +204,8 @@ def _simulate_own_walker(
             "x is None, but this walker has no starts: give section coordinates at the start."
         )
     first_params = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], params)
-    x = jnp.atleast_2d(walker.starts(first_params))[0] if x is None else x
+    with name_missing_parameters(params):
+        x = jnp.atleast_2d(walker.starts(first_params))[0] if x is None else x
     params, x, _, options, stepwise = convert_own_walk_arguments(
         params, x, n_steps, walker, options, "auto", heights
     )

@@ -8,11 +8,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import Outcome, describe_outcomes
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
-    describe_step_ending,
     format_outcome_counts,
     format_quantity,
 )
@@ -46,7 +45,8 @@ class StepBatchResult(AbstractPrintable):
       stiffness;
     - `engine`: "lanes" or "diffrax";
     - `solver_names`: names of the solvers; the first is the solver in the options;
-    - `derivatives`: `StepSensitivity` by the name of the requested input.
+    - `derivatives`: `StepSensitivity` by the name of the requested input;
+    - `section`: name of the section of a walker of yours, for printing.
 
     Examples:
         >>> params, states = vrw.WheelParams(damping=150.0), np.tile(vrw.paper_start(), (3, 1))
@@ -63,11 +63,12 @@ class StepBatchResult(AbstractPrintable):
     engine: str = eqx.field(static=True)
     solver_names: tuple[str, ...] = eqx.field(static=True)
     derivatives: dict[str, StepSensitivity] = eqx.field(default_factory=dict)
+    section: str = eqx.field(static=True, default="")
 
     @property
     def ending(self) -> Any:
         """Return one sentence on the end of each walk, as an array over the batch."""
-        return describe_step_ending(self.outcome, Outcome)
+        return describe_outcomes(self.outcome, self.section)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for outcomes, numbers of gait steps, engine and time."""
