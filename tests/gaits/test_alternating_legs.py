@@ -97,6 +97,63 @@ def test_derivatives_and_branches_by_a_parameter_of_one_leg_are_those_of_gaits()
     np.testing.assert_allclose(periods, expected, atol=1e-9)
 
 
+def test_scans_measure_both_steps_of_a_gait_together(cycle):
+    names = ["period", "energy_lost_damping", "clearance_sls1", "d period / d leg.first.damping"]
+    design = vrw.grid({"leg.first.damping": [149.9, 150.0, 150.1]})
+    scan = vrw.scan(design, names, base=PARAMS, model=make_wheel())
+    first = vrw.step(PARAMS, cycle.section_state, model=make_wheel())
+    second = vrw.step(PARAMS, first.section_state, model=make_wheel(turn=1.0))
+    # The gait and its steps have errors of 1e-10.
+    np.testing.assert_allclose(scan.period[1], first.period + second.period, atol=1e-8)
+    lost = first.energy.damping + second.energy.damping
+    np.testing.assert_allclose(scan.energy_lost_damping[1], lost, rtol=1e-8)
+    clearances = [step.margins.clearance_sls1 for step in (first, second)]
+    np.testing.assert_allclose(scan.clearance_sls1[1], min(clearances), rtol=1e-7)
+    assert clearances[0] > clearances[1] + 1e-3
+    difference = float(scan.period[2] - scan.period[0]) / 0.2
+    # The third derivative of the period makes an error of 1e-7 in the difference.
+    np.testing.assert_allclose(scan["d period / d leg.first.damping"][1], difference, rtol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0])
+def test_basins_know_whose_turn_it_is(cycle, turn):
+    """The gait begins with the first leg, and one step later with the second."""
+    states = vrw.walk(PARAMS, cycle.section_state, 2, model=make_wheel()).steps.section_state
+    start = np.asarray(states[0 if turn else 1])
+    wheel, names = make_wheel(turn=turn), ("theta_touchdown", "dtheta_touchdown", "dL1_touchdown")
+    grid = dict(zip(names, start, strict=True)) | {names[1]: start[1] * np.array([0.95, 1.0, 1.05])}
+    basin = vrw.basin(PARAMS, grid, model=wheel)
+    assert basin.attractor.values.tolist() == [0, 0, 0]
+    # Walks are periodic to 1e-7.
+    orbit = basin.orbit_state.values[0, :2]
+    np.testing.assert_allclose(orbit, [start, states[1 if turn else 0]], atol=1e-6)
+    np.testing.assert_allclose(basin.orbit_dls_fraction, cycle.dls_fraction, atol=1e-6)
+    box = grid | {names[1]: (0.95 * start[1], 1.05 * start[1])}
+    share = vrw.basin_share(PARAMS, box, model=wheel, n_starts=8, max_steps=41)
+    assert share.share == 1.0
+
+
+@pytest.mark.slow
+def test_tuning_keeps_a_margin_in_both_steps(cycle):
+    """Speed and the lower clearance of both steps decrease with the damping of the second leg."""
+    limit = 0.0705
+    tuned = vrw.tune(
+        PARAMS, {"speed": -1.0}, ["leg.second.damping"], {"leg.second.damping": (155.0, 185.0)},
+        {"clearance_sls1": (limit, None)}, model=make_wheel(),
+    )  # fmt: skip
+    assert tuned.status.name == "CONVERGED"
+    damping = float(tuned.model.leg_force.second.damping)
+    legs = FIRST, SECOND | {"damping": damping}
+    gait = vrw.limit_cycle(PARAMS, model=make_wheel(*legs), period_n=2)
+    assert abs(float(gait.speed) + tuned.value) < 1e-9
+    first = vrw.step(PARAMS, gait.section_state, model=make_wheel(*legs))
+    second = vrw.step(PARAMS, first.section_state, model=make_wheel(*legs, turn=1.0))
+    clearances = [float(step.margins.clearance_sls1) for step in (first, second)]
+    assert abs(min(clearances) - limit) < 1e-7
+    table = vrw.sensitivities(PARAMS, measures=["speed"], model=make_wheel(*legs))
+    assert abs(float(table.value[0]) + tuned.value) < 1e-9
+
+
 @pytest.mark.slow
 def test_force_peaks_and_stoppers_see_both_legs(cycle):
     walk = vrw.simulate(PARAMS, cycle.section_state, 2, model=make_wheel(), n_samples=2001)
@@ -111,9 +168,13 @@ def test_force_peaks_and_stoppers_see_both_legs(cycle):
 def test_what_two_legs_cannot_do_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="a gait repeats after an even number of steps"):
         vrw.limit_cycle(PARAMS, model=make_wheel())
-    with pytest.raises(ValueError, match=r"the legs alternate, but vrw.basin compares"):
-        vrw.basin(
-            PARAMS, {"theta_post_impact": -0.7, "dtheta_post_impact": 1.1}, model=make_wheel()
-        )
+    with pytest.raises(ValueError, match="need a gait of one step"):
+        vrw.smallest_disturbance(PARAMS, model=make_wheel())
+    design = vrw.grid(damping=[150.0])
+    contact = vrw.UnilateralWheel(leg_force=make_wheel().leg_force)
+    with pytest.raises(ValueError, match=r"with a UnilateralWheel vrw.scan takes gaits of one"):
+        vrw.scan(design, ["period"], model=contact)
+    with pytest.raises(ValueError, match="slope_sd is given and the legs alternate"):
+        vrw.scan(design, ["period"], model=make_wheel(), slope_sd=0.01)
     with pytest.raises(ValueError, match="n_legs is 7, but legs alternate only if"):
         vrw.step(vrw.WheelParams(n_legs=7), vrw.paper_start(), model=make_wheel())

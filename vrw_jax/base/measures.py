@@ -123,9 +123,9 @@ def measure(
     `acceleration`, `fore_force` and `rear_force`, and the phases are "DLS", "SLS-I" and "SLS-II".
     For a `HybridSystem`, the instant is the state, and the phases are the modes.
 
-    Give the measure to `vrw.scan`, `vrw.tune`, `vrw.sensitivities` or `cycle.measure`, or to your
-    own walker as `measures=(cost,)`, whose gaits have it in `values`. Its value for several steps
-    is the mean over the steps.
+    Give the measure to `vrw.scan`, `vrw.tune`, `vrw.sensitivities`, `vrw.continue_branch` or
+    `cycle.measure`, or to your own walker as `measures=(cost,)`, whose gaits have it in `values`.
+    Its value for several steps is the mean over the steps.
 
     Args:
         name: name of the measure.

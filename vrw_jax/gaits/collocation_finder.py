@@ -184,7 +184,11 @@ class CollocationFinder(AbstractGaitFinder):
             self.step_options,
         )
         stack_coordinates = lambda cycle: jnp.concatenate(
-            [cycle.section_state, cycle.durations], -1
+            [
+                cycle.section_state,
+                cycle.durations.reshape(*cycle.section_state.shape[:-1], -1),
+            ],
+            -1,
         )
         branch_point = GaitBranchPoint(
             stack_coordinates(cycle),
@@ -285,7 +289,8 @@ def compute_step_and_derivatives(
         start = attach_derivatives(
             lambda *_: section_state_derivatives, section_state, parameter_values, ()
         )
-        return model.take_step(collocation_system.make_wheel(parameter_values), start, options)
+        params = collocation_system.make_wheel(parameter_values)
+        return model.take_step_of_gait(params, start, options)
 
     step, parameter_jacobian = evaluate_with_jacobian(take_step, parameter_values)
     return step, move_derivative_axis_first(parameter_jacobian)

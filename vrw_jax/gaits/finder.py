@@ -243,7 +243,7 @@ class AbstractGaitFinder(eqx.Module):
         """Compute one event-driven step from a section state, by a program that is
         already compiled.
         """
-        return self.model.take_step(params, section_state, self.step_options)
+        return self.model.take_step_of_gait(params, section_state, self.step_options)
 
     def find_cycle_from_values(
         self, parameter_values: ParameterValues, cycle_guess: Any = None, **search_options: bool

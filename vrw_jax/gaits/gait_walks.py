@@ -5,6 +5,7 @@ steps. Only walks that have neither settled nor failed continue, so that long tr
 little.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,7 @@ import numpy as np
 
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.walker import is_own_walker
 from vrw_jax.lanes.batching import (
     concatenate_tree_rows,
     select_rows_on_device,
@@ -447,6 +449,7 @@ def walk_until_periodic(
     - `max_period`: longest period that is detected, in steps.
     """
     n_starts = len(start_states)
+    leg_models = [model] if is_own_walker(model) else model.list_models_of_legs()
     repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_starts), params)
     n_rounds = -(-max_steps // N_STEPS_PER_ROUND)
     state_history = np.full(
@@ -463,7 +466,11 @@ def walk_until_periodic(
         outcomes = np.zeros(len(section_states), int)
         for step_index in range(first_step, last_step):
             steps = step_batch(
-                wheels, section_states, model=model, options=options, engine=options.engine
+                wheels,
+                section_states,
+                model=leg_models[step_index % len(leg_models)],
+                options=options,
+                engine=options.engine,
             )
             section_states = steps.section_state
             state_history[unsettled_walk_indices, step_index + 1] = section_states
@@ -484,10 +491,12 @@ def walk_until_periodic(
     for i in np.flatnonzero(orbit_periods):
         states_of_walk = state_history[i, : n_steps_to_orbit[i] + 1]
         last_period_states = states_of_walk[-orbit_periods[i] :]
+        # Legs that alternate are in their first roles in the first state of an orbit.
+        step_indices = n_steps_to_orbit[i] + 1 + np.arange(-orbit_periods[i], 0)
+        values = last_period_states[:, min(1, start_states.shape[1] - 1)]
+        values = np.where(step_indices % len(leg_models) == 0, values, np.inf)
         orbit_states[i, : orbit_periods[i]] = np.roll(
-            last_period_states,
-            -int(np.argmin(last_period_states[:, min(1, start_states.shape[1] - 1)])),
-            axis=0,
+            last_period_states, -int(np.argmin(values)), axis=0
         )
         orbit_distances = np.linalg.norm(states_of_walk[:, None] - last_period_states, axis=-1).min(
             1
@@ -554,9 +563,13 @@ def find_distinct_orbits(walk_ends: PeriodicWalkEnds) -> tuple[np.ndarray, list[
 def measure_orbit_steps(
     params: Any, section_states: np.ndarray, model: Any, options: StepOptions
 ) -> dict[str, np.ndarray]:
-    """Return all measures of one step from each section state, by name.
+    """Return all measures of the step from each section state of an orbit, by name.
 
     `section_states` has the shape (states, entries).
     """
-    measures = [model.take_step(params, jnp.asarray(x), options).measures() for x in section_states]
+    leg_models = itertools.cycle(model.list_models_of_legs())
+    measures = [
+        leg_model.take_step(params, jnp.asarray(x), options).measures()
+        for leg_model, x in zip(leg_models, section_states, strict=False)
+    ]
     return jax.tree.map(lambda *values: np.stack(values), *measures)

@@ -20,7 +20,7 @@ from vrw_jax.gaits.finder_selection import (
 )
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.models.stepping import ModelLike
+from vrw_jax.models.stepping import ModelLike, require_legs_in_turn_by_collocation
 
 
 @announce_wait("the gait with its derivatives", "15 s")
@@ -64,7 +64,9 @@ def sensitivities(
     guess = check_cycle_guess(guess)
     if not is_own_walker(model):
         model = resolve_model(params, model)  # type: ignore[arg-type]
-    gait_finder = resolve_finder(params, model, options, guess=guess)
+        require_legs_in_turn_by_collocation(model, "vrw.sensitivities")
+    period_n = getattr(model, "leg_period", 1)
+    gait_finder = resolve_finder(params, model, options, period_n, guess)
     measure_names = (
         gait_finder.default_measures
         if measures is None

@@ -16,7 +16,7 @@ from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.models.measures import MEASURES
-from vrw_jax.models.step_results import SectionState
+from vrw_jax.models.step_results import SectionState, combine_steps
 from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import (
     LAW_NAMES,
@@ -377,6 +377,21 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         if laws is None or self.leg_period == 1:
             return params
         return params.attach_laws(laws.exchange_legs(step_index % 2))
+
+    def list_models_of_legs(self) -> list["AbstractWheel"]:
+        """Return the model as it is in each step until the legs repeat."""
+        laws = self.laws
+        if laws is None or self.leg_period == 1:
+            return [self]
+        return [self.with_laws(laws.exchange_legs(k)) for k in range(self.leg_period)]
+
+    def take_step_of_gait(self, params: WheelParams, x: Any, options: StepOptions) -> Any:
+        """Return one step, or all steps until the legs repeat as one, see `combine_steps`."""
+        result = self.take_step(params, x, options)
+        for k in range(1, self.leg_period):
+            step = self.take_step(self.select_params(params, k), result.section_state, options)
+            result = combine_steps(result, step)
+        return result
 
     def with_step_ground(
         self, params: WheelParams, step_ground: StepGroundValues

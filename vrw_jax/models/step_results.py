@@ -1,10 +1,12 @@
 """Results of one step: measures, margins and energies. All models share a common part."""
 
 import abc
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -376,6 +378,33 @@ class StepResult(AbstractStep):
             **self.required_friction.measures(),
             **self.margins.measures(),
         }
+
+
+def combine_steps(first: StepResult, second: StepResult) -> StepResult:
+    """Return two successive steps as one, for gaits in which two different legs land in turn.
+
+    Durations, lengths and energies are sums. Indicators and margins are the lower, and required
+    friction coefficients the higher of both. If the first step has failed, it is the result.
+    """
+
+    def merge(function: Callable, field_name: str) -> Any:
+        return jax.tree.map(function, getattr(first, field_name), getattr(second, field_name))
+
+    both = StepResult(
+        section_state=second.section_state,
+        post_impact=first.post_impact,
+        durations=merge(jnp.add, "durations"),
+        step_length=merge(jnp.add, "step_length"),
+        indicators=merge(jnp.minimum, "indicators"),
+        margins=merge(jnp.minimum, "margins"),
+        required_friction=merge(jnp.maximum, "required_friction"),
+        energy=merge(jnp.add, "energy"),
+        outcome=second.outcome,
+        solver_steps=merge(jnp.add, "solver_steps"),
+        engine=first.engine,
+    )
+    has_stepped = first.outcome == Outcome.STEPPED
+    return jax.tree.map(functools.partial(jnp.where, has_stepped), both, first)
 
 
 class Trajectory(eqx.Module):

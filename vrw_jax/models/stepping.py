@@ -125,12 +125,12 @@ def require_compliant_model(model: Any, computation_text: str, command_name: str
         )
 
 
-def require_equal_legs(model: AbstractWheel, command_name: str) -> None:
-    """Raise a `ValueError` if the legs of a model alternate from step to step."""
-    if model.leg_period > 1:
+def require_legs_in_turn_by_collocation(model: Any, command_name: str) -> None:
+    """Raise a `ValueError` if the legs of a model without collocation alternate."""
+    if model.leg_period > 1 and model.batch_kernel != "phases":
         raise ValueError(
-            f"the legs alternate, but {command_name} compares walks of equal steps: give one law "
-            "for all legs, or follow walks by vrw.walk."
+            f"the legs alternate, but with a {type(model).__name__} {command_name} takes gaits of "
+            "one step only: give vrw.ViscoelasticWheel(leg_force=...), or one law for all legs."
         )
 
 

@@ -48,7 +48,6 @@ from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
     convert_step_options,
-    require_equal_legs,
     require_single_wheel,
 )
 from vrw_jax.wheel import transitions
@@ -117,7 +116,6 @@ def basin(
         require_single_wheel(params, "compute one basin after the other")
         # The model is valid for any start.
         model = convert_model_argument(model).fallback_model
-        require_equal_legs(model, "vrw.basin")
     else:
         params = check_parameters(params)
     options = convert_step_options(options)
@@ -348,7 +346,9 @@ class StableGait(NamedTuple):
             )
         options = convert_step_options(options)
         options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
-        cycle = limit_cycle(params, model=model) if cycle is None else cycle
+        leg_models = [model] if is_own else model.list_models_of_legs()
+        if cycle is None:
+            cycle = limit_cycle(params, model=model, period_n=len(leg_models))
         cycle_type: Any = HybridGait if is_own else AbstractCycle
         check_type("cycle", cycle, cycle_type, "give vrw.limit_cycle(params, model=...)")
         if int(cycle.outcome) != Outcome.STEPPED:
@@ -361,7 +361,7 @@ class StableGait(NamedTuple):
         if changes_within_step and period_n > 1:
             raise ValueError(
                 f"cycle repeats after {period_n} steps, but {changes_within_step} within a step "
-                "need a gait of one step: give a cycle with period_n=1."
+                "need a gait of one step: give a cycle with period_n=1, and one law for all legs."
             )
         if not spectral_radius < 1.0:
             raise ValueError(
@@ -369,8 +369,9 @@ class StableGait(NamedTuple):
                 "and has no basin: take a wheel whose gait has a spectral radius below 1."
             )
         section_states = [np.asarray(cycle.section_state)[None]]
-        for _ in range(period_n):
-            steps = step_batch(params, section_states[-1], model=model, options=options)
+        for k in range(period_n):
+            leg_model = leg_models[k % len(leg_models)]
+            steps = step_batch(params, section_states[-1], model=leg_model, options=options)
             section_states.append(steps.section_state)
         stable_gait = cls(params, model, options, np.concatenate(section_states[:-1]))
         if not stable_gait.is_on_gait(section_states[-1])[0]:
@@ -380,10 +381,11 @@ class StableGait(NamedTuple):
             )
         return stable_gait
 
-    def is_on_gait(self, section_states: np.ndarray) -> np.ndarray:
+    def is_on_gait(self, section_states: np.ndarray, n_steps: int = 0) -> np.ndarray:
         """Return whether each section state agrees with a section state of the gait, shape
         (states,).
 
+        Legs that alternate have to be the same, `n_steps` steps after the start of a walk.
         Two states agree if their distance is at most `MAX_ARRIVAL_DISTANCE`, in units of the wheel.
         For a walker of the user, the unit is the largest section coordinate of the gait.
         """
@@ -394,11 +396,14 @@ class StableGait(NamedTuple):
             n_entries = self.model.count_continuous_section_entries(self.params)
             units = self.model.collect_section_units(wheel_units, self.params.n_legs)
             units = np.asarray(units)[:n_entries]
-        differences = section_states[:, None, :n_entries] - self.section_states[:, :n_entries]
+        leg_period = getattr(self.model, "leg_period", 1)
+        gait_states = self.section_states[n_steps % leg_period :: leg_period, :n_entries]
+        differences = section_states[:, None, :n_entries] - gait_states
         return np.abs(differences / units).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
 
 
-# Number of gait steps between two tests, chosen because more frequent tests need many calls.
+# Number of gait steps between two tests, chosen because more frequent tests need many calls, and
+# because it is even, so that legs in turn are in their first roles again.
 N_STEPS_PER_ARRIVAL_TEST = 10
 
 
@@ -422,15 +427,18 @@ def walk_until_on_gait(
     for first_step in range(0, max_steps, N_STEPS_PER_ARRIVAL_TEST):
         if not len(walking_indices):
             break
+        n_steps = min(N_STEPS_PER_ARRIVAL_TEST, max_steps - first_step)
         walk_results = step_batch(
             stable_gait.params,
             section_states,
-            min(N_STEPS_PER_ARRIVAL_TEST, max_steps - first_step),
+            n_steps,
             model=stable_gait.model,
             options=stable_gait.step_options,
         )
         has_stepped = walk_results.outcome == Outcome.STEPPED
-        is_on_gait = has_stepped & stable_gait.is_on_gait(walk_results.section_state)
+        is_on_gait = has_stepped & stable_gait.is_on_gait(
+            walk_results.section_state, first_step + n_steps
+        )
         has_arrived[walking_indices] = is_on_gait
         walk_outcomes[walking_indices] = walk_results.outcome
         n_steps_walked[walking_indices] += walk_results.n_stepped

@@ -117,6 +117,7 @@ class CollocationScanEngine:
         self._finder: Any = make_finder(
             request.wheel_model.without_values(),
             request.base_wheel.n_legs,
+            period_n=request.wheel_model.leg_period,
             cycle_options=request.cycle_options,
             step_options=request.step_options,
         )
@@ -172,7 +173,7 @@ class CollocationScanEngine:
         model, params = finder.model.from_parameter_values(
             tuple(jax.device_put(list(rows.T))), finder.n_legs
         )
-        default_finder: Any = make_finder(finder.model, finder.n_legs)
+        default_finder: Any = make_finder(finder.model, finder.n_legs, period_n=finder.period_n)
         for _, indices, mesh_search in search_further(
             find_from_starts,
             finder,
@@ -262,7 +263,7 @@ def _evaluate_step(
 ) -> tuple:
     """Return outcome, end state and measures of one gait step from a section state."""
     model, params = finder.model.from_parameter_values(values, finder.n_legs)
-    step = model.take_step(params, x, options)
+    step = model.take_step_of_gait(params, x, options)
     step_names = {*names}.difference(DIFFERENTIABLE_MEASURES)
     measures = {
         name: value

@@ -38,6 +38,7 @@ from vrw_jax.models.stepping import (
     convert_model_argument,
     convert_step_options,
     require_compliant_model,
+    require_legs_in_turn_by_collocation,
 )
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.studies.measure_catalog import (
@@ -219,8 +220,13 @@ def plan_scan(
         check_type("base", base, WheelParams, "write vrw.WheelParams(slope=...)")
         base.require_single_wheel("give numbers, and what varies in the design")
         model = convert_model_argument(model)
+        require_legs_in_turn_by_collocation(model, "vrw.scan")
         gait_finder = make_finder(
-            model, base.n_legs, cycle_options=cycle_options, step_options=options
+            model,
+            base.n_legs,
+            period_n=model.leg_period,
+            cycle_options=cycle_options,
+            step_options=options,
         )
     dtype = np.dtype(jnp.result_type(*jax.tree.leaves(base)))
     options.check_tolerances(dtype)
@@ -257,6 +263,11 @@ def plan_scan(
             )
     if slope_sd is not None:
         slope_sd = check_positive("slope_sd", slope_sd)
+        if getattr(model, "leg_period", 1) > 1:
+            raise ValueError(
+                "slope_sd is given and the legs alternate, but walks over random slopes have equal "
+                "legs: give one law for all legs, or no slope_sd."
+            )
         if tol is not None:
             raise ValueError(
                 "tol and slope_sd are both given, but a scan to a tolerance has no measures of "

@@ -62,6 +62,7 @@ from vrw_jax.models.stepping import (
     convert_model_argument,
     convert_step_options,
     require_compliant_model,
+    require_legs_in_turn_by_collocation,
     require_single_wheel,
 )
 from vrw_jax.studies.optimum_curve import follow_optimum
@@ -658,9 +659,12 @@ def make_tune_problem(
             f"free is {free_parameters}, but a WheelObjective is a function of WheelParams, which "
             "do not contain a leg force: give a measure, or a function of the cycle."
         )
+    if own_finder is None:
+        require_legs_in_turn_by_collocation(checked_model, "vrw.tune")
     gait_finder: AbstractGaitFinder = own_finder or make_finder(
         convert_model_argument(resolve_model(params, checked_model)),
         params.n_legs,
+        period_n=checked_model.leg_period if own_finder is None else 1,
         cycle_options=cycle_options,
         step_options=options,
     )
