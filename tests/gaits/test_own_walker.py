@@ -95,6 +95,17 @@ def test_section_coordinates_of_another_length_are_refused():
         BALL_SYSTEM.step(BALL_PARAMS, [2.0, 1.0])
 
 
+def test_panels_show_the_coordinates_of_a_walk_with_gaps_at_its_events():
+    walk = vrw.simulate(BALL_PARAMS, [2.0], 3, model=BALL_SYSTEM, n_samples=5)
+    panels = vrw.plot.gait_panels(walk).axes
+    assert [axes.get_ylabel() for axes in panels] == ["height [m]", "velocity [m/s]"]
+    velocity = panels[1].lines[-1].get_ydata()
+    assert np.flatnonzero(np.isnan(velocity)).tolist() == [5, 11]  # between three flights
+    assert velocity[4] == pytest.approx(-2.0, rel=1e-9)
+    bounces = [line.get_xdata()[0] for line in panels[0].lines[:-1]]
+    np.testing.assert_allclose(bounces, 4.0 / GRAVITY * np.array([1.0, 2.0]), rtol=1e-9)
+
+
 def test_figures_show_the_results_of_any_walker():
     walker = JuggledBall()
     design = vrw.grid({"kick": [0.5, 1.0], "ball.restitution": [0.4, 0.5]})

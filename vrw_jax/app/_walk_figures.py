@@ -1,5 +1,6 @@
 """Figures of walks: Figs 6 to 10 of the paper, and an animation of a walk."""
 
+import string
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 from PIL import Image
 
@@ -49,11 +52,12 @@ from vrw_jax.app.figure_style import (
     make_panel_grid,
     require_dataset_variables,
     require_variables_of_datasets,
+    typeset_greek_symbols,
 )
 from vrw_jax.base.checks import check_int, check_path, check_positive, check_type
 from vrw_jax.models.measures import MEASURES, PHASE_NAMES
 
-NO_WALK_REMEDY = "give vrw.simulate(params, model=...), of any model"
+NO_WALK_REMEDY = "give vrw.simulate(params, model=...), of any model of the wheel"
 """Remedy in the error message for a dataset that is not a walk."""
 
 NO_PAPER_WALK_REMEDY = (
@@ -80,9 +84,11 @@ def gait_panels(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
     The panels show angle, leg lengths, load share, foot height and ground forces. Gray bands mark
     double support, and dotted lines mark collision II. For walks with unilateral contact, the
     panels show angle, leg lengths, contact modes, foot heights, and normal and tangential forces.
+    For a `HybridSystem`, each panel shows a coordinate of the state, on a background that marks the
+    modes, with dotted lines at the section.
 
     Args:
-        gait: dataset that `vrw.simulate` returns for any model.
+        gait: dataset that `vrw.simulate` returns for any model, or for a `HybridSystem`.
         width: "column", "page" or a number of mm; None for the usual width.
 
     Returns:
@@ -92,7 +98,51 @@ def gait_panels(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.gait_panels(gait)
     """
+    if isinstance(gait, xr.Dataset) and "section" in gait.attrs and gait.sizes.get("time"):
+        return _make_coordinate_panels(gait, width)
     return _make_gait_panels(gait, width, forces_only=False)
+
+
+MODE_TINTS = ("white", LIGHT_GRAY_COLOR, "#DCEBF5", "#FBE3D6", "#D9EFE7", "#F5E6EF", "#FCF9D5")
+"""Backgrounds of the modes of a walker in turn, light tints of the colors of lines."""
+
+
+def _make_coordinate_panels(walk: xr.Dataset, width: FigureWidth) -> Figure:
+    """Return a figure of the state of a walker over time, with its modes and events."""
+    times, spans = walk.time.values, find_constant_spans(walk, walk.phase.values)
+    mode_names = walk.phase.attrs["flag_meanings"].split()
+    # A line has a gap at each event, where a reset may change the state.
+    gaps = np.flatnonzero(np.diff(times) == 0.0) + 1
+    width_inches = find_width_inches(width, 0.8 * PAGE_FIGURE_WIDTH_INCHES)
+    figure = StyledFigure(figsize=(width_inches, 0.6 + 1.25 * len(walk.data_vars)))
+    panel_axes = figure.subplots(len(walk.data_vars), 1, sharex=True, squeeze=False)[:, 0]
+    step_ends = times[np.flatnonzero(np.diff(walk.step.values)) + 1]
+    for axes, (name, variable), letter in zip(
+        panel_axes, walk.data_vars.items(), string.ascii_lowercase, strict=False
+    ):
+        for start_time, end_time, mode in spans:
+            tint = MODE_TINTS[mode % len(MODE_TINTS)]
+            axes.axvspan(start_time, end_time, color=tint, linewidth=0.0, zorder=0)
+        for time in step_ends:
+            axes.axvline(time, color=DARK_GRAY_COLOR, linewidth=0.5, linestyle=(0, (1, 2)))
+        axes.plot(np.insert(times, gaps, np.nan), np.insert(variable.values, gaps, np.nan), "k")
+        unit = variable.attrs.get("units", "1")
+        axes.set_ylabel(typeset_greek_symbols(str(name)) + f" [{unit}]" * (unit != "1"))
+        draw_panel_letter(axes, letter)
+    panel_axes[-1].set(xlabel="time [s]", xlim=(times[0], times[-1]))
+    handles: list[Any] = [
+        Patch(facecolor=MODE_TINTS[mode % len(MODE_TINTS)], edgecolor="#888888", linewidth=0.4,
+              label=mode_names[mode].replace("_", " "))
+        for mode in sorted({mode for *_, mode in spans})
+    ]  # fmt: skip
+    if len(step_ends):
+        label = str(walk.attrs["section"]).replace("_", " ")
+        handles.append(
+            Line2D([], [], color=DARK_GRAY_COLOR, linewidth=0.5, linestyle=":", label=label)
+        )
+    add_figure_legend(figure, handles, len(handles))
+    figure.align_ylabels(panel_axes)
+    return figure
 
 
 @figure_style()

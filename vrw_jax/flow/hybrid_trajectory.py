@@ -78,6 +78,7 @@ def sample_walk_of_system(
         },
         {
             "title": "Walk of a HybridSystem",
+            "section": system.section,
             "n_steps": step + (outcome == Outcome.STEPPED),
             "outcome": outcome.name,
             "outcome_meaning": ending,
