@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from reference_code import five_coordinates
 from support.leg_laws import (
+    BumpStop,
     PaperLeg,
     ProgressiveLeg,
     QuadraticDamper,
@@ -59,6 +60,24 @@ def test_a_gait_is_a_fixed_point_of_five_coordinates(law, damping):
     reference = five_coordinates.step(reference_params, np.asarray(cycle.section_state))
     np.testing.assert_allclose(reference["section_state"], cycle.section_state, atol=1e-11)
     np.testing.assert_allclose(reference["durations"], cycle.durations, atol=1e-10)
+
+
+def test_a_gait_with_a_kink_is_more_accurate_than_the_mesh():
+    """The reference is 200 steps with tight tolerances, in which the gait attracts the wheel."""
+    model = make_wheel(BumpStop(100.0))
+    cycle = vrw.limit_cycle(PARAMS, model=model)
+    start, options = np.array([[0.11, 1.85, -0.1]]), vrw.StepOptions.tight()
+    walk = vrw.step_batch(PARAMS, start, 200, model=model, options=options)
+    np.testing.assert_allclose(cycle.section_state, walk.section_state[0], atol=1e-10)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_gait_with_a_kink_are_differences_of_gaits():
+    def measure_kinked_period(k2):
+        return find_gait(BumpStop(k2)).period
+
+    difference = (measure_kinked_period(101.0) - measure_kinked_period(99.0)) / 2.0
+    np.testing.assert_allclose(jax.grad(measure_kinked_period)(100.0), difference, rtol=1e-5)
 
 
 def test_derivatives_by_parameters_of_law_and_wheel_are_differences_of_gaits():

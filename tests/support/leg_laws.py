@@ -42,6 +42,20 @@ class PaperLeg(eqx.Module):
         return self.k * (params.natural_length - L) - params.damping * dL
 
 
+class BumpStop(eqx.Module):
+    """A second spring, which touches below a length: the force has a kink."""
+
+    k2: float = 300.0
+    length: float = 0.9
+
+    def __call__(self, L, dL, params):
+        spring = params.stiffness * (params.natural_length - L)
+        return spring - params.damping * dL + self.k2 * jnp.maximum(self.length - L, 0.0)
+
+    def kinks(self, L, dL, params):
+        return (L - self.length,)
+
+
 def make_wheel(law) -> vrw.ViscoelasticWheel:
     return vrw.ViscoelasticWheel(leg_force=law)
 

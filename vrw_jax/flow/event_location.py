@@ -22,7 +22,7 @@ from vrw_jax.flow.tableaus import (
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.flow.tangents import BatchPhase
+from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
 
 
 class IntegrationStatus(IntEnum):
@@ -78,6 +78,26 @@ class EventSearch(NamedTuple):
     n_tried_steps: Array
     n_iterations: Array
     correction: Array | None  # change of the step length by the last iteration, s
+
+    @classmethod
+    def begin(
+        cls, step_start: IntegratorState, event_step_length: Array, is_exact: bool
+    ) -> "EventSearch":
+        """Return a search before its first iteration, with a first length of the solver step."""
+        initial_indices = jnp.zeros(event_step_length.shape, jnp.int32)
+        zero_duration = jnp.zeros_like(event_step_length)
+        return cls(
+            event_step_length,
+            zero_duration,
+            step_start.next_step_length,
+            step_start.has_guard_crossed,
+            step_start.state,
+            zero_duration,
+            initial_indices,
+            initial_indices,
+            jnp.zeros((), jnp.int32),
+            zero_duration + jnp.inf if is_exact else None,
+        )
 
 
 EVENT_TIME_ACCURACY = 1e-8
@@ -186,19 +206,8 @@ class _EventLocator(NamedTuple):
                 jnp.minimum(first_crossing_fraction, fraction_to_zero),
                 first_crossing_fraction,
             )
-        initial_indices = jnp.zeros(step_length.shape, jnp.int32)
-        zero_duration = jnp.zeros_like(step_length)
-        return EventSearch(
-            step_length * first_crossing_fraction,
-            zero_duration,
-            step_length,
-            step_start.has_guard_crossed,
-            step_start.state,
-            zero_duration,
-            initial_indices,
-            initial_indices,
-            jnp.zeros((), jnp.int32),
-            zero_duration + jnp.inf if self.phase.has_exact_events else None,
+        return EventSearch.begin(
+            step_start, step_length * first_crossing_fraction, self.phase.has_exact_events
         )
 
     def iterate(self, search: EventSearch) -> EventSearch:
@@ -377,6 +386,45 @@ def compute_event_time_tangent(
             event_time_tangent,
         )
     return event_time_tangent
+
+
+def propagate_to_event(
+    tableau: ButcherTableau,
+    solver_step_function: SolverStepFunction,
+    phase_tangents: PhaseTangents,
+    integrator_state: IntegratorState,
+    last_step_length: Array,
+    event_guard_index: Array,
+) -> tuple[Array, Array, Vector]:
+    """Return the tangents after the last solver step of a phase.
+
+    They are those at a fixed time, (directions, components, batch), that of the event's time, and
+    those of positions and rates at the event.
+
+    - `last_step_length`: time from `integrator_state` to the event, s.
+    """
+    stage_states, _ = solver_step_function(integrator_state.state, last_step_length)
+    assert integrator_state.state_tangents is not None
+    end_state_tangents = phase_tangents.propagate_to_step_end(
+        tableau, stage_states, integrator_state.state_tangents, last_step_length
+    )
+    end_state, n = stage_states[-1], len(stage_states[-1].q)
+    tangents_by_component = tuple(jnp.moveaxis(end_state_tangents, 1, 0))
+    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
+    event_time_tangent = compute_event_time_tangent(
+        integrator_state.has_guard_crossed,
+        event_guard_index,
+        phase.evaluate_with_rates(phase.evaluate_guards, end_state)[1],
+        phase_tangents.evaluate_tangents(
+            lambda phase, state: phase.evaluate_guards(state), end_state, end_state_tangents
+        ),
+    )
+    motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
+    state_tangents = tuple(
+        x + event_time_tangent * y
+        for x, y in zip(tangents_by_component[: 2 * n], motion_rates, strict=True)
+    )
+    return end_state_tangents, event_time_tangent, state_tangents
 
 
 def has_guard_crossed(guard_value: Array, guard_rate: Array) -> Array:

@@ -20,14 +20,17 @@ from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.event_location import (
+    EventSearch,
     IntegrationStatus,
     IntegratorState,
-    compute_event_time_tangent,
     find_first_guard,
     has_guard_crossed,
     locate_event,
+    propagate_to_event,
 )
+from vrw_jax.flow.kinks import find_sides, integrate_over_kinks
 from vrw_jax.flow.minima import (
+    EnterSides,
     MarginMinimaResult,
     compute_margin_minima_jvp,
     init_margin_minima_state,
@@ -156,6 +159,10 @@ class SearchEnd(NamedTuple):
     start_state: StageState
     integrator_state: IntegratorState  # after the loop, with the minima of the whole phase
     margin_minima_result: MarginMinimaResult | None
+    # Only phases with kinks have the following data.
+    enter_sides: EnterSides | None = None
+    sides: Vector = ()  # at the end of the phase
+    located_guard_index: Any = None  # guard that is zero at the end
 
 
 def _compute_phase_end_jvp(
@@ -169,33 +176,20 @@ def _compute_phase_end_jvp(
     The result contains the tangents of positions, rates, duration and minima of the margins. The
     first axis contains the directions.
     """
-    solver_step_function, start_state, integrator_state, margin_minima_result = search_end
-    n = len(start_state.q)
+    solver_step_function, start_state, integrator_state, margin_minima_result = search_end[:4]
+    n, enter_sides = len(start_state.q), search_end.enter_sides
     last_step_length = jnp.where(
         integrator_state.has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
     )
-    stage_states, _ = solver_step_function(integrator_state.state, last_step_length)
-    assert integrator_state.state_tangents is not None
-    end_state_tangents = phase_tangents.propagate_to_step_end(
-        tableau, stage_states, integrator_state.state_tangents, last_step_length
+    end_state_tangents, event_time_tangent, state_tangents = propagate_to_event(
+        tableau,
+        solver_step_function,
+        phase_tangents if enter_sides is None else phase_tangents.on_sides(search_end.sides),
+        integrator_state,
+        last_step_length,
+        phase_end.end_guard_index if enter_sides is None else search_end.located_guard_index,
     )
-
-    end_state = stage_states[-1]
-    tangents_by_component = tuple(jnp.moveaxis(end_state_tangents, 1, 0))
-    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
-    event_time_tangent = compute_event_time_tangent(
-        integrator_state.has_guard_crossed,
-        phase_end.end_guard_index,
-        phase.evaluate_with_rates(phase.evaluate_guards, end_state)[1],
-        phase_tangents.evaluate_tangents(
-            lambda phase, state: phase.evaluate_guards(state), end_state, end_state_tangents
-        ),
-    )
-    motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
-    state_tangents = tuple(
-        x + event_time_tangent * y
-        for x, y in zip(tangents_by_component[: 2 * n], motion_rates, strict=True)
-    )
+    held_tangents = tuple(jnp.moveaxis(end_state_tangents, 1, 0))[2 * n :]
     minima_tangents = None
     margin_minima_state = integrator_state.margin_minima_state
     if margin_minima_state is not None and margin_minima_result is not None:
@@ -207,7 +201,8 @@ def _compute_phase_end_jvp(
             margin_minima_result,
             start_state,
             phase_end.state,
-            jnp.stack([*state_tangents, *tangents_by_component[2 * n :]], 1),
+            jnp.stack([*state_tangents, *held_tangents], 1),
+            enter_sides,
         )
     return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
 
@@ -222,46 +217,80 @@ def integrate_to_event(
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None = None,
+    attach_derivatives: Callable | None = None,
 ) -> tuple[PhaseEnd, SearchEnd]:
     """Return the end of a phase for each batch element, and what its derivatives need.
 
-    The arguments are those of `integrate_batch_phase`.
+    The arguments are those of `integrate_batch_phase` and of `integrate_over_kinks`.
     """
     phase = _wrap_each_phase_function(
         phase, lanes.mark_noinline if phase.is_compiled_separately else jax.jit
     )
+    n_guards: Any = None
+    phase_with_kinks, enter_sides = phase, None
+    if phase.evaluate_kinks is not None:
+        start_state = phase.make_state(q, v)
+        n_guards = len(phase.evaluate_guards(start_state))
+        phase = phase.on_sides(find_sides(phase, start_state))
+
+        def enter_sides(sides: Vector) -> tuple[BatchPhase, SolverStepFunction, Any]:
+            phase = _wrap_each_phase_function(phase_with_kinks.on_sides(sides), lanes.mark_noinline)
+            tangents = None if phase_tangents is None else phase_tangents.on_sides(sides)
+            return phase, _make_solver_step_function(phase, tableau, options), tangents
+
     solver_step_function = _make_solver_step_function(phase, tableau, options)
     start_state = phase.make_state(q, v)
     guard_values, guard_rates = lax.stop_gradient(
         phase.evaluate_with_rates(phase.evaluate_guards, start_state)
     )
     is_guard_met_at_start = phase.guards_met_at_start or tuple(
-        map(has_guard_crossed, guard_values, guard_rates)
+        map(has_guard_crossed, guard_values[:n_guards], guard_rates[:n_guards])
     )
     # The index is that of the first guard whose event is the start itself.
     start_event_guard_index = find_first_guard(is_guard_met_at_start, -1)
     is_phase_started = is_active & (start_event_guard_index < 0)
 
-    integrator_state = _integrate_until_crossing(
-        phase,
-        solver_step_function,
-        tableau,
-        start_state,
-        guard_values,
-        is_phase_started,
-        initial_dt,
-        options,
-        straggler_count,
-        phase_tangents,
+    integrator_state = _make_initial_state(
+        phase, start_state, guard_values, is_phase_started, initial_dt, phase_tangents
     )
-    is_crossing = integrator_state.has_guard_crossed
-    if phase.margins_include_start or phase_tangents is not None:
-        # The functions are called, not inlined, because the program is already long.
-        phase = _wrap_each_phase_function(phase, lanes.mark_noinline)
-        solver_step_function = _make_solver_step_function(phase, tableau, options)
-    event_search = locate_event(
+    integrate_until_crossing = functools.partial(
+        _integrate_until_crossing, tableau, options, straggler_count
+    )
+    locate = lambda phase, solver_step_function, integrator_state: locate_event(
         phase, solver_step_function, tableau, lax.stop_gradient(integrator_state), options
     )
+
+    if enter_sides is None:
+        integrator_state = integrate_until_crossing(
+            phase, solver_step_function, phase_tangents, integrator_state
+        )
+        if phase.margins_include_start or phase_tangents is not None:
+            # The functions are called, not inlined, because the program is already long.
+            phase = phase_with_kinks = _wrap_each_phase_function(phase, lanes.mark_noinline)
+            solver_step_function = _make_solver_step_function(phase, tableau, options)
+        event_search = locate(phase, solver_step_function, integrator_state)
+        sides, end_guard_index = (), event_search.guard_index
+    else:
+
+        def integrate_segment(
+            phase: BatchPhase, solver: SolverStepFunction, tangents: Any, state: IntegratorState
+        ) -> tuple[IntegratorState, EventSearch]:
+            state = integrate_until_crossing(phase, solver, tangents, state)
+            return state, locate(phase, solver, state)
+
+        sides, integrator_state, event_search, end_guard_index, _ = integrate_over_kinks(
+            integrate_segment,
+            enter_sides,
+            phase.sides,
+            n_guards,
+            tableau,
+            integrator_state,
+            options,
+            attach_derivatives,
+        )
+        end_guard_index = jnp.where(end_guard_index < 0, event_search.guard_index, end_guard_index)
+        phase, solver_step_function, _ = enter_sides(sides)
+    is_crossing = integrator_state.has_guard_crossed
     is_crossing_event_unresolved = is_crossing & event_search.is_event_unresolved
     duration = integrator_state.elapsed_time + jnp.where(
         is_crossing, event_search.event_step_length, 0.0
@@ -284,9 +313,10 @@ def integrate_to_event(
             phase,
             solver_step_function,
             margin_minima_state,
-            jnp.stack(phase.evaluate_margins(start_state)),
+            jnp.stack(phase_with_kinks.evaluate_margins(start_state)),
             options,
             min_iterations=3 if phase.has_exact_events else 1,
+            enter_sides=enter_sides,
         )
     is_event_too_late = (
         is_crossing & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
@@ -294,7 +324,7 @@ def integrate_to_event(
     event_guard_index = jnp.where(
         is_active & (start_event_guard_index >= 0),
         start_event_guard_index,
-        jnp.where(is_crossing, event_search.guard_index, -1),
+        jnp.where(is_crossing, end_guard_index, -1),
     )
     phase_end = PhaseEnd(
         state=end_state,
@@ -317,6 +347,11 @@ def integrate_to_event(
         start_state,
         integrator_state._replace(margin_minima_state=margin_minima_state),
         margin_minima_result,
+        enter_sides,
+        sides,
+        None
+        if enter_sides is None
+        else jnp.where(phase_end.end_guard_index < 0, -1, event_search.guard_index),
     )
 
 
@@ -343,20 +378,18 @@ def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> Bat
         evaluate_acceleration=wrap_function(phase.evaluate_acceleration),
         evaluate_guards=wrap_function(phase.evaluate_guards),
         evaluate_margins=wrap_function(phase.evaluate_margins),
+        on_sides=lambda sides: _wrap_each_phase_function(phase.on_sides(sides), wrap_function),
     )
 
 
 def _integrate_until_crossing(
-    phase: BatchPhase,
-    solver_step_function: SolverStepFunction,
     tableau: ButcherTableau,
-    start_state: StageState,
-    guard_values: Vector,
-    is_phase_started: Array,
-    initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None,
+    phase: BatchPhase,
+    solver_step_function: SolverStepFunction,
     phase_tangents: PhaseTangents | None,
+    initial_state: IntegratorState,
 ) -> IntegratorState:
     """Take adaptive solver steps in all batch elements, and return the state of the loop.
 
@@ -455,13 +488,25 @@ def _integrate_until_crossing(
             (n_running_elements <= straggler_count) & is_iteration_limit_exceeded
         )
 
+    return lax.while_loop(needs_more_steps, take_one_solver_step, initial_state)
+
+
+def _make_initial_state(
+    phase: BatchPhase,
+    start_state: StageState,
+    guard_values: Vector,
+    is_phase_started: Array,
+    initial_dt: Array,
+    phase_tangents: PhaseTangents | None,
+) -> IntegratorState:
+    """Return the state of the loop before the first solver step."""
     initial_minima = (
         init_margin_minima_state(phase, start_state, phase_tangents)
         if phase.margins_include_start
         else None
     )
     initial_counts, initial_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
-    initial_state = IntegratorState(
+    return IntegratorState(
         state=start_state,
         guard_values=guard_values,
         next_step_length=initial_dt,
@@ -477,7 +522,6 @@ def _integrate_until_crossing(
         margin_minima_state=initial_minima,
         state_tangents=None if phase_tangents is None else phase_tangents.start_tangents,
     )
-    return lax.while_loop(needs_more_steps, take_one_solver_step, initial_state)
 
 
 def _classify_solver_step(

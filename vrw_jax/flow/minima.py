@@ -6,6 +6,7 @@ one margin after another.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +24,8 @@ MINIMUM_LOCATION_TOLERANCE = 1e-6
 """Accuracy of the location of a minimum, as a fraction of the solver step. The value is chosen
 because the error of the minimum is proportional to the square of the error of its location.
 """
+EnterSides = Callable[[Vector], tuple[BatchPhase, SolverStepFunction, Any]]
+"""Function that returns the phase on the given sides of its kinks, its solver, and its tangents."""
 
 
 def _evaluate_cubic(
@@ -134,6 +137,7 @@ class MarginMinimaState(NamedTuple):
     step_start_margin_rates: Array  # rates of the margins at the step's start
     # tangents of that start, (margins, directions, components, batch)
     step_start_tangents: Array | None = None
+    step_start_sides: Vector = ()  # `BatchPhase.sides` in that step, each (margins, batch)
 
 
 def init_margin_minima_state(
@@ -166,6 +170,7 @@ def init_margin_minima_state(
         zero_margins,
         zero_margins,
         zero_tangents,
+        make_zeros(phase.sides),
     )
 
 
@@ -197,12 +202,6 @@ def update_margin_minima_state(
         & (margin_minimum < margin_minima_state.lowest_margin_values)
     )
 
-    def replace_if_lower(old_value: Array, new_value: Array) -> Array:
-        n_margins, *batch_shape = is_minimum_lower.shape
-        n_inner_axes = old_value.ndim - is_minimum_lower.ndim
-        is_lower = is_minimum_lower.reshape(n_margins, *(1,) * n_inner_axes, *batch_shape)
-        return jnp.where(is_lower, new_value, old_value)
-
     minimum_of_step = margin_minima_state._replace(
         lowest_margin_values=margin_minimum,
         step_start_q=step_start.q,
@@ -211,14 +210,65 @@ def update_margin_minima_state(
         time_to_minimum=margin_minimum_location * step_length,
         step_start_margin_rates=margin_minima_state.margin_rates,
         step_start_tangents=step_start_tangents,
+        step_start_sides=phase.sides,
     )
     margin_values, margin_rates = select_trees_by_condition(
         is_accepted,
         (margin_values, margin_rates),
         (margin_minima_state.margin_values, margin_minima_state.margin_rates),
     )
-    lowest_minimum = jax.tree.map(replace_if_lower, margin_minima_state, minimum_of_step)
+    lowest_minimum = _replace_if_lower(is_minimum_lower, margin_minima_state, minimum_of_step)
     return lowest_minimum._replace(margin_values=margin_values, margin_rates=margin_rates)
+
+
+def _replace_if_lower(
+    is_minimum_lower: Array, old_state: MarginMinimaState, new_state: MarginMinimaState
+) -> MarginMinimaState:
+    def replace_if_lower(old_value: Array, new_value: Array) -> Array:
+        n_margins, *batch_shape = is_minimum_lower.shape
+        n_inner_axes = old_value.ndim - is_minimum_lower.ndim
+        is_lower = is_minimum_lower.reshape(n_margins, *(1,) * n_inner_axes, *batch_shape)
+        return jnp.where(is_lower, new_value, old_value)
+
+    return jax.tree.map(replace_if_lower, old_state, new_state)
+
+
+def pass_kink_of_margins(
+    phase: BatchPhase,
+    next_phase: BatchPhase,
+    margin_minima_state: MarginMinimaState,
+    kink_state: StageState,
+    is_at_kink: Array,
+    kink_tangents: Array | None,
+) -> MarginMinimaState:
+    """Return the lowest minima after a kink, where a margin may have a minimum or may jump.
+
+    - `phase`, `next_phase`: the phase before and after the kink;
+    - `kink_state`, `kink_tangents`: state at the kink in `next_phase`, and its tangents.
+    """
+    old_values = margin_minima_state.margin_values
+    values, rates = _evaluate_margins_with_rates(next_phase, kink_state)
+    lower_values = jnp.minimum(old_values, values)
+    zero_length = jnp.zeros(is_at_kink.shape, values.dtype)
+    minimum_at_kink = margin_minima_state._replace(
+        lowest_margin_values=lower_values,
+        step_start_q=kink_state.q,
+        step_start_v=kink_state.v,
+        step_length=zero_length,
+        time_to_minimum=zero_length,
+        step_start_margin_rates=rates,
+        step_start_tangents=kink_tangents,
+        step_start_sides=tuple(
+            jnp.where(values < old_values, *x)
+            for x in zip(next_phase.sides, phase.sides, strict=True)
+        ),
+    )
+    is_lower = is_at_kink & (lower_values < margin_minima_state.lowest_margin_values)
+    lowest_minimum = _replace_if_lower(is_lower, margin_minima_state, minimum_at_kink)
+    return lowest_minimum._replace(
+        margin_values=jnp.where(is_at_kink, values, old_values),
+        margin_rates=jnp.where(is_at_kink, rates, margin_minima_state.margin_rates),
+    )
 
 
 def _evaluate_margins_with_rates(phase: BatchPhase, state: StageState) -> tuple[Array, Array]:
@@ -254,6 +304,7 @@ def refine_margin_minima(
     start_margin_values: Array,
     options: StepOptions,
     min_iterations: int = 1,
+    enter_sides: EnterSides | None = None,
 ) -> MarginMinimaResult:
     """Return the minima of the margins over the phase, refined by a secant iteration.
 
@@ -261,12 +312,19 @@ def refine_margin_minima(
     iteration takes a solver step from the start of the solver step that contains the minimum. At
     most `max_margin_search_iterations` iterations are made per margin, and at least
     `min_iterations`. Each iteration adds correct digits to the derivatives of the minimum's time.
+
+    - `enter_sides`: function for phases with kinks.
     """
+
+    phase_and_solver = phase, solver_step_function
 
     def refine_one_margin_minimum(
         _: None, margin_scan_inputs: tuple
     ) -> tuple[None, tuple[Array, Array]]:
         margin_index, margin_minimum_state = margin_scan_inputs
+        phase, solver_step_function = phase_and_solver
+        if enter_sides is not None:
+            phase, solver_step_function, _ = enter_sides(margin_minimum_state.step_start_sides)
         minimum_step_start_state = phase.make_state(
             margin_minimum_state.step_start_q, margin_minimum_state.step_start_v
         )
@@ -357,6 +415,7 @@ def compute_margin_minima_jvp(
     start_state: StageState,
     end_state: StageState,
     end_tangents: Array,
+    enter_sides: EnterSides | None = None,
 ) -> Array:
     """Return the tangents of the minima of the margins, shape (directions, margins, batch).
 
@@ -365,23 +424,28 @@ def compute_margin_minima_jvp(
     of the phase, and `end_tangents` are the tangents of the end state.
     """
     phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
-    compute_margin_tangents = functools.partial(
-        phase_tangents.evaluate_tangents,
-        lambda phase, state: jnp.stack(phase.evaluate_margins(state)),
-    )
+    phase_and_solver = phase, solver_step_function, phase_tangents
+    evaluate_margins = lambda phase, state: jnp.stack(phase.evaluate_margins(state))
+    compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)
 
     def compute_margin_tangent(_: None, margin_scan_inputs: tuple) -> tuple[None, Array]:
         margin_index, margin_minimum_state, step_length = margin_scan_inputs
+        phase, solver_step_function, step_tangents = phase_and_solver
+        if enter_sides is not None:
+            phase, solver_step_function, step_tangents = enter_sides(
+                margin_minimum_state.step_start_sides
+            )
         minimum_step_start_state = phase.make_state(
             margin_minimum_state.step_start_q, margin_minimum_state.step_start_v
         )
         stage_states = solver_step_function(minimum_step_start_state, step_length)[0]
-        state_tangents = phase_tangents.propagate_to_step_end(
+        state_tangents = step_tangents.propagate_to_step_end(
             tableau, stage_states, margin_minimum_state.step_start_tangents, step_length
         )
-        return None, select_entry_by_mask(
-            margin_index, compute_margin_tangents(stage_states[-1], state_tangents), 1
+        margin_tangents = step_tangents.evaluate_tangents(
+            evaluate_margins, stage_states[-1], state_tangents
         )
+        return None, select_entry_by_mask(margin_index, margin_tangents, 1)
 
     margin_indices = jnp.arange(len(margin_minima_result.phase_margin_minima), dtype=jnp.int32)
     interior_minima_tangents = jnp.moveaxis(

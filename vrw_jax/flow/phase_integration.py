@@ -22,17 +22,21 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax import lanes
 from vrw_jax.base.elementwise import select_entry_by_mask
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Scalar
-from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS, has_guard_crossed
+from vrw_jax.base.types import Scalar, Vector
+from vrw_jax.flow.event_location import (
+    GUARD_ROUNDOFF_IN_EPS,
+    IntegratorState,
+    has_guard_crossed,
+)
 from vrw_jax.flow.integrate import (
     PhaseEnd,
-    SearchEnd,
     integrate_to_event,
     sample_batch_phase,
 )
 from vrw_jax.flow.tableaus import (
     STEP_LENGTH_SAFETY_FACTOR,
     ButcherTableau,
+    SolverStepFunction,
     StageAccelerations,
     StageState,
     estimate_step_error,
@@ -95,6 +99,14 @@ class GuardsAndMargins(NamedTuple):
         return is_guard_met, is_guard_met & is_guard_zero & (guard_rates < 0.0)
 
 
+class PhaseKinks(NamedTuple):
+    """Kinks of a vector field, see `tangents.BatchPhase`."""
+
+    evaluate_kinks: Callable[[StateArray], Vector]
+    on_sides: Callable[[Vector], tuple[VectorField, EvaluateGuardsAndMargins]]
+    """Function that returns vector field, guards and margins on the given sides of the kinks."""
+
+
 def integrate_phase(
     vector_field: VectorField,
     guards_and_margins: GuardsAndMargins,
@@ -102,6 +114,7 @@ def integrate_phase(
     is_active: Bool[Array, ""],
     options: StepOptions,
     state_units: StateArray | None = None,
+    kinks: PhaseKinks | None = None,
 ) -> PhaseEnd:
     """Return the end of the phase that begins at `start_state`, where a guard first falls to zero.
 
@@ -127,14 +140,28 @@ def integrate_phase(
             f"includes_phase_start has {len(guards_and_margins.includes_phase_start)} flags, but "
             f"there are {n_margins} margins: give one flag for each."
         )
-    phase, tableau = _make_phase(vector_field, options, state_units)
-    phase = phase._replace(
-        evaluate_guards=lambda state: tuple(evaluate(state.v[0])[:n_guards]),
-        evaluate_margins=lambda state: tuple(evaluate(state.v[0])[n_guards:]),
-        margins_include_start=guards_and_margins.includes_phase_start,
-        guard_scales=guards_and_margins.guard_scales,
-        guards_met_at_start=tuple(is_guard_met),
-    )
+
+    def make_phase(
+        field: VectorField, evaluate: EvaluateGuardsAndMargins, sides: tuple = ()
+    ) -> tuple[BatchPhase, ButcherTableau]:
+        phase, tableau = _make_phase(field, options, state_units)
+        n_all_guards = n_guards + len(sides)
+        phase = phase._replace(
+            evaluate_guards=lambda state: tuple(evaluate(state.v[0])[:n_all_guards]),
+            evaluate_margins=lambda state: tuple(evaluate(state.v[0])[n_all_guards:]),
+            margins_include_start=guards_and_margins.includes_phase_start,
+            guard_scales=guards_and_margins.guard_scales,
+            guards_met_at_start=tuple(is_guard_met),
+            sides=sides,
+        )
+        if kinks is not None:
+            phase = phase._replace(
+                evaluate_kinks=lambda state: kinks.evaluate_kinks(state.v[0]),
+                on_sides=lambda sides: make_phase(*kinks.on_sides(sides), sides)[0],
+            )
+        return phase, tableau
+
+    phase, tableau = make_phase(vector_field, evaluate)
     first_step_length = jnp.minimum(options.dt0, options.max_phase_time)
     phase_end, search_end = integrate_to_event(
         phase,
@@ -145,12 +172,23 @@ def integrate_phase(
         is_active,
         lax.stop_gradient(0.0 * start_state[0]) + first_step_length,
         options,
+        attach_derivatives=_attach_event_derivatives,
     )
     was_located = search_end.integrator_state.has_guard_crossed | jnp.any(
         is_guard_falling & (jnp.arange(n_guards) == phase_end.end_guard_index)
     )
-    end_time, end_state = _attach_event_derivatives(
-        evaluate, phase_end, search_end, was_located & (phase_end.end_guard_index >= 0)
+    end_phase, located_guard_index = phase, phase_end.end_guard_index
+    if search_end.enter_sides is not None:
+        end_phase, *_ = search_end.enter_sides(search_end.sides)
+        located_guard_index = search_end.located_guard_index
+    end_time, (end_state,) = _attach_event_derivatives(
+        end_phase,
+        search_end.solver_step_function,
+        search_end.integrator_state,
+        phase_end.duration,
+        phase_end.state,
+        located_guard_index,
+        was_located & (phase_end.end_guard_index >= 0),
     )
     margin_minima = start_values[n_guards:]
     if search_end.margin_minima_result is not None:
@@ -165,25 +203,26 @@ def integrate_phase(
 
 
 def _attach_event_derivatives(
-    evaluate_guards: EvaluateGuardsAndMargins,
-    phase_end: PhaseEnd,
-    search_end: SearchEnd,
+    phase: BatchPhase,
+    solver_step_function: SolverStepFunction,
+    step_start: IntegratorState,
+    last_time: Scalar,
+    last_stage: StageState,
+    guard_index: Array,
     was_located: Bool[Array, ""],
-) -> tuple[Scalar, StateArray]:
-    """Return time and state at the end of a phase, with derivatives that the event's time affects.
+) -> tuple[Scalar, tuple[StateArray]]:
+    """Return time and rates at an event, with derivatives that the event's time affects.
 
     Time and state of the event solve two equations: the guard is zero, and the last solver step
     reaches the state. All derivatives follow from them by the implicit function theorem.
     """
-    last_time, last_state = phase_end.duration, phase_end.state.v[0]
-    step_start = search_end.integrator_state
+    (last_state,) = last_stage.v
 
     def evaluate_event_equations(event: tuple[Scalar, StateArray]) -> tuple[Scalar, StateArray]:
         end_time, state = event
-        guard_value = select_entry_by_mask(phase_end.end_guard_index, evaluate_guards(state))
-        stage_states, _ = search_end.solver_step_function(
-            step_start.state, end_time - step_start.elapsed_time
-        )
+        guard_values = phase.evaluate_guards(last_stage._replace(v=(state,)))
+        guard_value = select_entry_by_mask(guard_index, jnp.stack(guard_values))
+        stage_states, _ = solver_step_function(step_start.state, end_time - step_start.elapsed_time)
         return (
             jnp.where(was_located, guard_value, last_time - end_time),
             state - jnp.where(was_located, stage_states[-1].v[0], last_state),
@@ -202,12 +241,13 @@ def _attach_event_derivatives(
         )
         return time_change, state_change + field * time_change
 
-    return lax.custom_root(
+    end_time, end_state = lax.custom_root(
         evaluate_event_equations,
         (last_time, last_state),
         lambda _, located_event: located_event,
         solve_tangent_equations,
     )
+    return end_time, (end_state,)
 
 
 MAX_STEP_GROWTH = 2.0

@@ -80,6 +80,14 @@ class BatchPhase(NamedTuple):
     """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
     guards_met_at_start: Vector | None = None
     """Whether each guard ends the phase at its start; by default, its value and rate decide."""
+    evaluate_kinks: Callable[[StageState], Vector] | None = None
+    """Function that returns the values of functions at whose zeros the equations have kinks."""
+    on_sides: Callable[[Vector], "BatchPhase"] = lambda sides: NotImplemented
+    """Function that returns the phase with equations that are smooth, for the signs of the values
+    of `evaluate_kinks`. Each kink adds a guard, which triggers where its sign changes.
+    """
+    sides: Vector = ()
+    """Signs for which the equations are smooth; empty without kinks."""
 
     def make_state(self, q: Vector, v: Vector) -> StageState:
         """Return the state with positions `q`, rates `v` and the accelerations there."""
@@ -396,6 +404,12 @@ class PhaseTangents(NamedTuple):
     phase_constants_tangents: Any  # tree of the constants, directions first
     # tangents of positions, rates, held constants, (directions, components, batch)
     start_tangents: Array
+
+    def on_sides(self, sides: Vector) -> "PhaseTangents":
+        """Return the tangents in a phase with smooth equations, see `BatchPhase.on_sides`."""
+        return self._replace(
+            make_phase=lambda *constants: self.make_phase(*constants).on_sides(sides)
+        )
 
     def propagate_to_step_end(
         self,

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits.collocation_search import (
     CollocationState,
@@ -34,6 +35,11 @@ from vrw_jax.gaits.limit_cycle_result import (
     solve_limit_cycle,
 )
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.return_map_finder import (
+    ReturnMapCycle,
+    ReturnMapFinder,
+    find_return_map_cycle,
+)
 from vrw_jax.gaits.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.settings import with_default_jax_settings
@@ -45,7 +51,7 @@ from vrw_jax.models.measures import (
     MEASURES,
 )
 from vrw_jax.models.step_results import AbstractStep, SectionState, StepResult
-from vrw_jax.models.stepping import convert_step_arguments
+from vrw_jax.models.stepping import convert_step_arguments, start_walk_toward_gait
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.params import WheelParams
@@ -249,6 +255,33 @@ class CollocationFinder(AbstractGaitFinder):
             self.step_options,
         )
         return step
+
+
+class KinkedGaitFinder(ReturnMapFinder):
+    """Finder of gaits whose legs have a force with kinks.
+
+    A mesh that does not adapt to the kinks is less accurate than event-driven steps. Collocation
+    therefore only finds the start of Newton's method on the return map.
+    """
+
+    cycle_options: CycleOptions = eqx.field(static=True, default_factory=CycleOptions)
+
+    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
+        if cycle_guess is None:
+            cycle_guess = self._find_start(lax.stop_gradient(params))
+        # The derivative of Newton's method would need second derivatives, which compile slowly.
+        return find_return_map_cycle(
+            *self.prepare_search(params, cycle_guess), self.period_n, uses_implicit_jvp=True
+        )
+
+    def _find_start(self, params: WheelParams) -> Array:
+        """Return the section state of a gait on a mesh, or of a walk if there is none."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        cycle = CollocationFinder(**fields).find_cycle(params)
+        if not has_traced_leaf(cycle.found) and bool(cycle.found):
+            return cycle.section_state
+        walk = start_walk_toward_gait(self.model, params, self.step_options)
+        return jnp.where(cycle.found, cycle.section_state, walk.steps.section_state[-1])
 
 
 @eqx.filter_jit

@@ -12,7 +12,7 @@ from vrw_jax.base.checks import check_int, check_type, has_traced_leaf
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import format_numbers
 from vrw_jax.base.walker import is_own_walker
-from vrw_jax.gaits.collocation_finder import CollocationFinder
+from vrw_jax.gaits.collocation_finder import CollocationFinder, KinkedGaitFinder
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder import AbstractGaitFinder
@@ -40,8 +40,12 @@ def make_finder(
     period_n: int = 1,
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
+    stays_on_mesh: bool = False,
 ) -> AbstractGaitFinder:
-    """Return the gait finder for a model."""
+    """Return the gait finder for a model.
+
+    - `stays_on_mesh`: whether collocation finds gaits of a force with kinks too.
+    """
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = convert_model_argument(model)
@@ -61,6 +65,8 @@ def make_finder(
             # default mesh then has errors of 3e-9.
             default_options = default_options.refine_mesh()
         search_options = {"cycle_options": cycle_options or default_options}
+        if resolved_model.has_kinks and not stays_on_mesh:
+            finder_class = KinkedGaitFinder
     return finder_class(
         model=resolved_model,
         n_legs=n_legs,

@@ -18,6 +18,7 @@ from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_results import SectionState, combine_steps
 from vrw_jax.wheel.ground import compute_foot_distance
+from vrw_jax.wheel.laws import count_kinks
 from vrw_jax.wheel.params import (
     LAW_NAMES,
     PARAMETER_DOMAINS,
@@ -355,6 +356,11 @@ class AbstractWheel(AbstractWalker, eqx.Module):
             return None
         line_slopes = complete_ground_line_slopes(params.slope, n_steps)
         return (jnp.stack([line_slopes[:-1], line_slopes[1:]], axis=-1),)
+
+    @property
+    def has_kinks(self) -> bool:
+        """Return whether the law of the legs declares kinks."""
+        return count_kinks((self.laws or WheelLaws()).leg) > 0
 
     @property
     def leg_period(self) -> int:

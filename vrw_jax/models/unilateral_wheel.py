@@ -42,7 +42,7 @@ from vrw_jax.models.interface import (
 )
 from vrw_jax.models.step_results import PAPER_START_STATE
 from vrw_jax.models.viscoelastic import can_use_batch_kernel
-from vrw_jax.wheel.laws import convert_hub_torque, convert_leg_force
+from vrw_jax.wheel.laws import convert_hub_torque, convert_leg_force, count_kinks
 from vrw_jax.wheel.params import (
     FRICTION_DOMAIN,
     FRICTION_NAME,
@@ -55,6 +55,16 @@ STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
 """Kinds of stoppers for legs in the air: they hold the leg with any force, or they only push."""
 FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
 """Meaning of infinite friction: limit of large friction, or rule (A1)-(A4) of the paper."""
+
+
+def _convert_smooth_leg_force(leg_force: Any) -> Any:
+    leg_force = convert_leg_force(leg_force)
+    if count_kinks(leg_force):
+        raise ValueError(
+            "leg_force declares kinks, but a UnilateralWheel does not stop at them: give a law "
+            "without the method kinks, or take vrw.ViscoelasticWheel."
+        )
+    return leg_force
 
 
 class UnilateralTrajectory(eqx.Module):
@@ -217,7 +227,7 @@ class UnilateralWheel(AbstractContactWheel):
     stoppers: str = eqx.field(static=True, default=STOPPERS_BILATERAL)
     restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
     infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
-    leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
+    leg_force: Any = eqx.field(converter=_convert_smooth_leg_force, default=None)
     hub_torque: Any = eqx.field(converter=convert_hub_torque, default=None)
     uneven: UnevenGround | None = None
 

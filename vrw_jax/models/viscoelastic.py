@@ -28,6 +28,7 @@ from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
 from vrw_jax.flow.phase_integration import (
     GuardsAndMargins,
+    PhaseKinks,
     StateArray,
     VectorField,
     integrate_phase,
@@ -84,7 +85,8 @@ class ViscoelasticWheel(AbstractWheel):
       motion;
     - `leg_force`: force along a leg in N, as a function `f(L, dL, params)` of its length in m, its
       rate in m/s and the parameters of the wheel. A positive force pushes the hub away from the
-      foot. None means the paper's force, k (L* - L) - c dL. See docs/howto/own_leg.md;
+      foot. A method `kinks(L, dL, params)` declares where the force has kinks or jumps. None means
+      the paper's force, k (L* - L) - c dL. See docs/howto/own_leg.md;
     - `hub_torque`: torque of a motor on the hub in N m, as a number or a function
       `f(dtheta, params)` of the rate of the wheel in rad/s. A positive torque drives the wheel
       forward. The torque is external, or acts against a body that slides along with the hub and
@@ -436,6 +438,13 @@ def make_batch_phase(
         implicit_dynamics,
         is_compiled_separately,
         phase.coordinate_units,
+        evaluate_kinks=None
+        if phase.n_kinks == 0
+        else lambda stage: phase.compute_kinks(complete_motion_at_stage(stage)),
+        on_sides=lambda sides: make_batch_phase(
+            phase.on_sides(sides), records_margins, is_compiled_separately
+        ),
+        sides=phase.sides,
     )
 
 
@@ -628,6 +637,7 @@ class DiffraxPhaseFunctions(NamedTuple):
     motion_unpacker: Callable[[StateArray], Motion]
     vector_field: VectorField
     guards: GuardsAndMargins
+    kinks: PhaseKinks | None
 
 
 def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhaseFunctions:
@@ -647,10 +657,22 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
 
     guards_and_margins = GuardsAndMargins(
         evaluate_guards_and_margins,
-        len(phase.all_guard_outcomes),
+        len(phase.all_guard_outcomes) - phase.n_kinks,
         phase.are_margins_counted_at_start if records_margins else (),
     )
-    return DiffraxPhaseFunctions(phase.unpack_motion, evaluate_vector_field, guards_and_margins)
+
+    def enter_sides(sides: Vector) -> tuple[VectorField, Callable]:
+        functions = make_diffrax_phase(phase.on_sides(sides), records_margins)
+        return functions.vector_field, functions.guards.evaluate_guards_and_margins
+
+    return DiffraxPhaseFunctions(
+        phase.unpack_motion,
+        evaluate_vector_field,
+        guards_and_margins,
+        PhaseKinks(lambda y: phase.compute_kinks(phase.unpack_motion(y)), enter_sides)
+        if phase.n_kinks
+        else None,
+    )
 
 
 def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
@@ -667,6 +689,7 @@ def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> P
             is_phase_active,
             compute_wheel_units(phase.s).scale_times_to_seconds(options),
             jnp.stack(phase.coordinate_units),
+            diffrax_phase.kinks,
         )
         end_state = tuple(phase_end.state)
         return PhaseResult(

@@ -120,6 +120,7 @@ class CollocationScanEngine:
             period_n=request.wheel_model.leg_period,
             cycle_options=request.cycle_options,
             step_options=request.step_options,
+            stays_on_mesh=True,
         )
         self.evaluate_cycles = self._make_cycle_function(self._finder)
         self.evaluate_steps: Callable = jax.vmap(
@@ -173,7 +174,9 @@ class CollocationScanEngine:
         model, params = finder.model.from_parameter_values(
             tuple(jax.device_put(list(rows.T))), finder.n_legs
         )
-        default_finder: Any = make_finder(finder.model, finder.n_legs, period_n=finder.period_n)
+        default_finder: Any = make_finder(
+            finder.model, finder.n_legs, period_n=finder.period_n, stays_on_mesh=True
+        )
         for _, indices, mesh_search in search_further(
             find_from_starts,
             finder,

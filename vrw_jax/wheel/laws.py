@@ -15,7 +15,7 @@ import numpy as np
 
 from vrw_jax.base.checks import check_reals, format_value
 from vrw_jax.base.parameters import list_parameters, parameter
-from vrw_jax.base.types import Elementwise
+from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, Symbols, WheelLaws, WheelUnits
 
 
@@ -79,6 +79,14 @@ class AlternatingLegs(eqx.Module):
         forces = self.first(L, dL, params), self.second(L, dL, params)
         return jnp.where(self.turn < 0.5, *forces)
 
+    def kinks(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> tuple:
+        is_first = self.turn < 0.5
+        first, second = (evaluate_kinks(law, L, dL, params) for law in (self.first, self.second))
+        return (
+            *(jnp.where(is_first, value, 1.0) for value in first),
+            *(jnp.where(is_first, 1.0, value) for value in second),
+        )
+
     def exchange(self, has_changed: Any = True) -> "AlternatingLegs":
         """Return the laws as the next leg sees them, if `has_changed`."""
         is_first = (self.turn < 0.5) ^ has_changed
@@ -104,6 +112,72 @@ class SpringDamper(eqx.Module):
 
     def __call__(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> Elementwise:
         return self.stiffness * (self.natural_length - L) - self.damping * dL
+
+
+def evaluate_kinks(law: Any, L: Elementwise, dL: Elementwise, params: LawParameters) -> tuple:
+    """Return the values of the functions that change sign at the kinks of a law of a leg."""
+    return tuple(law.kinks(L, dL, params)) if hasattr(law, "kinks") else ()
+
+
+def count_kinks(law: Any) -> int:
+    """Return the number of kinks that a law of a leg declares."""
+    if not hasattr(law, "kinks"):
+        return 0
+    return len(_evaluate_kink_shapes(law, jax.ShapeDtypeStruct((), jnp.result_type(float))))
+
+
+def _evaluate_kink_shapes(law: Any, length: jax.ShapeDtypeStruct) -> tuple:
+    evaluate = lambda L: evaluate_kinks(law, L, L, LawParameters._make([*[L] * 8, 8]))
+    return jax.eval_shape(evaluate, length)
+
+
+ONE_SIDED_DISTANCE = 1e-7
+"""Distance from a kink at which a one-sided law is evaluated, in units of the wheel.
+
+The value is chosen because the force is extrapolated linearly over the distance, with an error of
+its square, which is round-off.
+"""
+
+
+class OneSidedLegForce(eqx.Module):
+    """Law of a leg on one side of each of its kinks, continued smoothly to the other side.
+
+    Beyond a kink, the force is linear, with the value and the derivatives next to the kink. A
+    solver step that crosses the kink is therefore as accurate as within a smooth law.
+    """
+
+    law: Any
+    sides: Vector  # signs of the functions of the kinks
+    other_sides: Vector  # those of the neighboring legs
+
+    def __call__(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> Elementwise:
+        length_unit = params.locked_length
+        velocity_unit = jnp.sqrt(params.gravity * length_unit)
+        inner_L, inner_dL = L, dL
+        for index, side in enumerate(self.sides):
+            evaluate = lambda x, y, i=index, side=side: (
+                side * evaluate_kinks(self.law, x, y, params)[i]
+            )
+            one, zero = jnp.ones_like(inner_L), jnp.zeros_like(inner_L)
+            value, slope_L = jax.jvp(evaluate, (inner_L, inner_dL), (one, zero))
+            slope_dL = jax.jvp(evaluate, (inner_L, inner_dL), (zero, one))[1]
+            step_L, step_dL = slope_L * length_unit, slope_dL * velocity_unit
+            squared_slope = step_L * step_L + step_dL * step_dL
+            squared_slope = jnp.where(squared_slope > 0.0, squared_slope, 1.0)
+            missing_value = ONE_SIDED_DISTANCE * jnp.sqrt(squared_slope) - value
+            change = jnp.where(missing_value > 0.0, missing_value / squared_slope, 0.0)
+            inner_L = inner_L + change * step_L * length_unit
+            inner_dL = inner_dL + change * step_dL * velocity_unit
+        force, force_change = jax.jvp(
+            lambda L, dL: self.law(L, dL, params), (inner_L, inner_dL), (L - inner_L, dL - inner_dL)
+        )
+        return force + force_change
+
+    def kinks(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> tuple:
+        return evaluate_kinks(self.law, L, dL, params)
+
+    def exchange(self) -> "OneSidedLegForce":
+        return OneSidedLegForce(_exchange_legs(self.law), self.other_sides, self.sides)
 
 
 class ScaledLegForce(eqx.Module):
@@ -196,7 +270,16 @@ def evaluate_leg_force(
     if s.leg_force is None:
         return s.k * (s.Ls - L) - s.c * dL
     params = _collect_law_parameters(s)
+    if isinstance(s.leg_force, OneSidedLegForce) and np.ndim(leg_numbers):
+        s = s._replace(leg_force=s.leg_force.law)  # The sides are those of Leg 1 and Leg 2.
     return _apply_to_legs(s, lambda law: law(L, dL, params), leg_numbers)
+
+
+def evaluate_leg_kinks(s: Symbols, L: Elementwise, dL: Elementwise, leg_number: int) -> Vector:
+    """Return the values of the functions that change sign at the kinks of a leg's force."""
+    params = _collect_law_parameters(s)
+    law = s.leg_force if leg_number % 2 == 1 else _exchange_legs(s.leg_force)
+    return evaluate_kinks(law, L, dL, params)
 
 
 def compute_damping_coefficient(s: Symbols, L: Elementwise, dL: Elementwise) -> Elementwise:
@@ -330,4 +413,10 @@ def _check_result(law: Any, law_name: str, n_arguments: int) -> None:
             raise ValueError(
                 f"{law_name} returns {result.dtype.name} of shape {result.shape} for arguments of "
                 f"shape {shape}, but it acts element by element: return one real number for each."
+            )
+        kinks = _evaluate_kink_shapes(law, lengths)
+        if not all(getattr(kink, "shape", None) == shape for kink in kinks):
+            raise ValueError(
+                f"kinks of {law_name} do not act element by element: return a tuple of real "
+                "functions of L, dL and params, which change sign where the force has a kink."
             )

@@ -10,6 +10,7 @@ initial motion of the next phase in `PAPER_PHASES`.
 import abc
 import dataclasses
 import functools
+import operator
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ from vrw_jax.wheel.dynamics import (
     compute_landing_foot_height,
     compute_rear_foot_height,
 )
+from vrw_jax.wheel.laws import OneSidedLegForce, count_kinks, evaluate_leg_kinks
 from vrw_jax.wheel.outcomes import are_coordinates_at_rest
 from vrw_jax.wheel.params import Symbols, compute_wheel_units
 
@@ -104,6 +106,8 @@ class AbstractPhase(abc.ABC):
     """Sine and cosine of the tilt of `GroundAhead` and, if heights are given, its rise; empty on
     flat ground.
     """
+    sides: Vector = ()
+    """Sides of the kinks of the legs' forces on which the equations hold, see `on_sides`."""
 
     phase_name: ClassVar[str]
     phase_title: ClassVar[str]
@@ -114,6 +118,8 @@ class AbstractPhase(abc.ABC):
     """Number of degrees of freedom of the phase."""
     specific_assumptions: ClassVar[tuple[Assumption, ...]]
     """Assumptions behind the guards from `compute_end_guard` and `compute_specific_guards`."""
+    legs_with_force: ClassVar[tuple[int, ...]] = (1, 2)
+    """Numbers of the legs whose forces affect the motion."""
     guard_outcomes: ClassVar[tuple[Outcome, ...]]
     """Outcomes of the guards from `compute_end_guard` and `compute_specific_guards`, in this
     order.
@@ -241,7 +247,27 @@ class AbstractPhase(abc.ABC):
             m.dtheta,
             jnp.minimum(m.L1, m.L2) - self.s.a,
             *((phase_instant.fore_force.normal,) if self.stop_at_lift_off else ()),
+            *map(operator.mul, self.sides, self.compute_kinks(m) if self.sides else ()),
         )
+
+    def compute_kinks(self, motion: Motion) -> Vector:
+        """Return the values of the functions that change sign at the kinks of the legs' forces."""
+        kinks = evaluate_leg_kinks(self.s, motion.L1, motion.dL1, 1)
+        if 2 in self.legs_with_force:
+            kinks += evaluate_leg_kinks(self.s, motion.L2, motion.dL2, 2)
+        return kinks
+
+    def on_sides(self, sides: Vector) -> "AbstractPhase":
+        """Return the phase with forces that are smooth, as on the given sides of all kinks.
+
+        Each kink has a guard, which triggers when the motion leaves its side.
+
+        - `sides`: signs of the values of `compute_kinks`.
+        """
+        n_kinks, law = len(sides) // len(self.legs_with_force), self.s.leg_force
+        law = law.law if isinstance(law, OneSidedLegForce) else law
+        leg_force = OneSidedLegForce(law, sides[:n_kinks], sides[n_kinks:])
+        return dataclasses.replace(self, s=self.s._replace(leg_force=leg_force), sides=sides)
 
     @classmethod
     def list_assumptions(cls) -> tuple[Assumption, ...]:
@@ -254,9 +280,16 @@ class AbstractPhase(abc.ABC):
     @property
     def all_guard_outcomes(self) -> tuple[Outcome, ...]:
         """Return the outcomes of all guards, in the order of `compute_guards`."""
-        return self.guard_outcomes + (
-            SHARED_FAILURE_OUTCOMES if self.stop_at_lift_off else SHARED_FAILURE_OUTCOMES[:-1]
+        return (
+            self.guard_outcomes
+            + (SHARED_FAILURE_OUTCOMES if self.stop_at_lift_off else SHARED_FAILURE_OUTCOMES[:-1])
+            + (Outcome.TOO_MANY_EVENTS,) * self.n_kinks
         )
+
+    @property
+    def n_kinks(self) -> int:
+        """Return the number of kinks of the forces of all legs with a force."""
+        return len(self.legs_with_force) * count_kinks(self.s.leg_force)
 
     def compute_margins(self, phase_instant: "PhaseInstant") -> Vector:
         """Return the values of all margins, in the order of `PhaseMargins`."""
@@ -493,6 +526,7 @@ class SingleSupport2(AbstractPhase):
             "the next foot would meet the ground twice", "the height of the next foot", "h", "m"
         ),
     )
+    legs_with_force = (1,)
     guard_outcomes = (Outcome.STEPPED,)
     counts_contraction_at_start, counts_specific_margins_at_start = True, (True, True)
 

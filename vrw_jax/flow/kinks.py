@@ -1,0 +1,216 @@
+"""Integrate a phase whose equations have kinks, from one kink to the next.
+
+Between two kinks, the equations are those of `BatchPhase.on_sides`. They are smooth beyond the kink
+too, so that a solver step may cross it, and the search for events locates it. The integration then
+goes on from there on the other side. Tangents pass the kink by a saltation matrix, which is the
+identity if the accelerations do not jump.
+"""
+
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from vrw_jax.base.elementwise import run_if_any_element_active, select_trees_by_condition
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.types import Vector
+from vrw_jax.flow.event_location import (
+    EventSearch,
+    IntegrationStatus,
+    IntegratorState,
+    find_first_guard,
+    has_guard_crossed,
+    propagate_to_event,
+)
+from vrw_jax.flow.minima import EnterSides, pass_kink_of_margins, update_margin_minima_state
+from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
+from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
+
+
+def find_sides(phase: BatchPhase, state: StageState) -> Vector:
+    """Return the sides of the kinks on which the motion goes on from a state."""
+    assert phase.evaluate_kinks is not None
+    values, rates = lax.stop_gradient(phase.evaluate_with_rates(phase.evaluate_kinks, state))
+    return tuple(
+        jnp.where(has_guard_crossed(*kink), -jnp.ones_like(kink[0]), 1.0)
+        for kink in zip(values, rates, strict=True)
+    )
+
+
+class KinkPassage(NamedTuple):
+    """State of the integration over kinks."""
+
+    sides: Vector
+    integrator_state: IntegratorState
+    search: EventSearch  # search for the event that ended the last segment
+    end_guard_index: Array
+    """Index of the guard that ends the phase; -1 if the guard that the search found does.
+
+    They differ if a jump of the force makes a guard negative. A kink ends the phase if the motion
+    would slide along it, because the force drives the motion back from both sides.
+    """
+    is_passed: Array  # whether the last segment ended at a kink, and the phase goes on
+
+
+def integrate_over_kinks(
+    integrate_segment: Callable[..., tuple[IntegratorState, EventSearch]],
+    enter_sides: EnterSides,
+    sides: Vector,
+    n_guards: int,
+    tableau: ButcherTableau,
+    integrator_state: IntegratorState,
+    options: StepOptions,
+    attach_derivatives: Callable | None = None,
+) -> KinkPassage:
+    """Integrate each batch element to the first guard that ends the phase.
+
+    - `integrate_segment`: function of phase, solver, tangents and state that integrates to the next
+      crossing of a guard, and locates it;
+    - `sides`: sides of the kinks at the start;
+    - `n_guards`: number of guards that end the phase, which precede those of the kinks;
+    - `attach_derivatives`: function that returns the time and the rates at a kink with derivatives.
+    """
+
+    def integrate_to_next_kink(passage: KinkPassage) -> KinkPassage:
+        phase, solver_step_function, phase_tangents = enter_sides(passage.sides)
+        state, search = integrate_segment(
+            phase, solver_step_function, phase_tangents, passage.integrator_state
+        )
+        is_at_kink = (
+            state.has_guard_crossed & ~search.is_event_unresolved & (search.guard_index >= n_guards)
+        )
+        q, v = search.end_state.q, search.end_state.v
+        elapsed_time = state.elapsed_time + search.event_step_length
+        if attach_derivatives is not None:
+            elapsed_time, v = attach_derivatives(
+                phase,
+                solver_step_function,
+                state,
+                elapsed_time,
+                search.end_state,
+                search.guard_index,
+                is_at_kink,
+            )
+        kink_values = lax.stop_gradient(phase.evaluate_guards(phase.make_state(q, v))[n_guards:])
+        # Functions that are zero at the same point change their signs together.
+        is_crossed = [
+            is_at_kink & ((search.guard_index == n_guards + i) | (value <= 0.0))
+            for i, value in enumerate(kink_values)
+        ]
+        next_sides = tuple(
+            map(lambda x, side: jnp.where(x, -side, side), is_crossed, passage.sides)
+        )
+        next_phase, *_ = enter_sides(next_sides)
+        kink_state = next_phase.make_state(q, v)
+        guard_values, guard_rates = lax.stop_gradient(
+            next_phase.evaluate_with_rates(next_phase.evaluate_guards, kink_state)
+        )
+        is_sliding = functools.reduce(
+            operator.or_, map(lambda x, rate: x & (rate <= 0.0), is_crossed, guard_rates[n_guards:])
+        )
+        end_guard_index = find_first_guard(
+            [*map(has_guard_crossed, guard_values[:n_guards], guard_rates[:n_guards])], -1
+        )
+        end_guard_index = jnp.where(
+            is_sliding & (end_guard_index < 0), search.guard_index, end_guard_index
+        )
+        end_guard_index = jnp.where(is_at_kink, end_guard_index, -1)
+        is_passed = is_at_kink & (end_guard_index < 0)
+        # The function of a kink is zero there, up to round-off.
+        guard_values = guard_values[:n_guards] + tuple(
+            map(lambda x, value: jnp.where(x, 0.0, value), is_crossed, guard_values[n_guards:])
+        )
+        next_state = state._replace(
+            state=kink_state,
+            guard_values=guard_values,
+            next_step_length=jnp.minimum(
+                state.next_step_length, options.max_phase_time - lax.stop_gradient(elapsed_time)
+            ),
+            elapsed_time=elapsed_time,
+            integration_status=jnp.full_like(state.integration_status, IntegrationStatus.RUNNING),
+            n_tried_steps=state.n_tried_steps + search.n_tried_steps,
+        )
+        select_passed = functools.partial(select_trees_by_condition, is_passed)
+        unbatched: dict[str, Any] = {
+            name: getattr(state, name) for name in ("n_iterations_until_half_ended", "n_iterations")
+        }
+        kink_tangents = None
+        if phase_tangents is not None:
+            pass_kink = functools.partial(
+                _pass_tangents,
+                phase_tangents, tableau, solver_step_function, state, search, kink_state, is_passed,
+            )  # fmt: skip
+            unchanged_tangents = state.state_tangents, state.state_tangents
+            tangents, kink_tangents = run_if_any_element_active(
+                jnp.any(is_passed), pass_kink, unchanged_tangents
+            )
+            unbatched["state_tangents"] = tangents
+        if state.margin_minima_state is not None:
+            minima = update_margin_minima_state(
+                phase, state.margin_minima_state, state.state, search.end_state,
+                search.event_step_length, is_passed, state.state_tangents,
+            )  # fmt: skip
+            unbatched["margin_minima_state"] = pass_kink_of_margins(
+                phase, next_phase, minima, kink_state, is_passed, kink_tangents
+            )
+        drop: dict[str, Any] = dict.fromkeys(unbatched)
+        next_state = select_passed(next_state._replace(**drop), state._replace(**drop))
+        return KinkPassage(
+            select_passed(next_sides, passage.sides),
+            next_state._replace(**unbatched),
+            search,
+            end_guard_index,
+            is_passed,
+        )
+
+    no_search = EventSearch.begin(
+        integrator_state,
+        jnp.zeros_like(integrator_state.elapsed_time),
+        enter_sides(sides)[0].has_exact_events,
+    )
+    start = KinkPassage(
+        sides,
+        integrator_state,
+        no_search,
+        jnp.full_like(no_search.guard_index, -1),
+        jnp.ones_like(no_search.is_event_unresolved),
+    )
+    return lax.while_loop(lambda passage: jnp.any(passage.is_passed), integrate_to_next_kink, start)
+
+
+def _pass_tangents(
+    phase_tangents: PhaseTangents,
+    tableau: ButcherTableau,
+    solver_step_function: SolverStepFunction,
+    integrator_state: IntegratorState,
+    search: EventSearch,
+    kink_state: StageState,
+    is_passed: Array,
+    tangents: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """Return the tangents after a kink at a fixed time, and those of the state at the kink.
+
+    - `kink_state`: state after the kink;
+    - `tangents`: results for batch elements that are not at a kink.
+    """
+    end_tangents, time_tangent, kink_tangents = propagate_to_event(
+        tableau,
+        solver_step_function,
+        phase_tangents,
+        integrator_state,
+        jnp.where(is_passed, search.event_step_length, 0.0),
+        search.guard_index,
+    )
+    n = len(kink_state.q)
+    rates_after = *kink_state.v, *kink_state.acceleration.acceleration[:n]
+    tangents_after = [
+        x - time_tangent * rate for x, rate in zip(kink_tangents, rates_after, strict=True)
+    ]
+    return tuple(
+        jnp.where(is_passed, jnp.concatenate([jnp.stack(x, 1), end_tangents[:, 2 * n :]], 1), y)
+        for x, y in zip((tangents_after, kink_tangents), tangents, strict=True)
+    )  # type: ignore[return-value]
