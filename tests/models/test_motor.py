@@ -26,6 +26,16 @@ class DirectCurrentMotor(eqx.Module):
         return self.stall * (1.0 - dtheta / self.idle_rate)
 
 
+class SwingMotor(eqx.Module):
+    """Torque that is largest where Leg 1 stands upright, and falls with the rate."""
+
+    peak: float = vrw.parameter(30.0, unit="N m")
+    brake: float = 2.0
+
+    def __call__(self, theta, dtheta, params):
+        return self.peak * jnp.cos(3.0 * theta) - self.brake * dtheta
+
+
 def make_wheel(torque):
     return vrw.ViscoelasticWheel(hub_torque=torque)
 
@@ -52,6 +62,38 @@ def test_a_step_agrees_with_five_coordinates(torque, engine):
     )
     if not callable(torque):  # The reference integrates the power of the dampers.
         assert abs(step.energy.damping - reference["energy_lost_damping"]) < 1e-9
+
+
+def test_a_torque_of_angle_and_rate_agrees_with_five_coordinates():
+    def make_params(peak):
+        law = lambda theta, rate: peak * np.cos(3.0 * theta) - 2.0 * rate
+        return REFERENCE_PARAMS | {"angle_torque": law}
+
+    options = vrw.StepOptions.tight()
+    step = vrw.step(PARAMS, START, model=make_wheel(SwingMotor()), options=options)
+    reference = five_coordinates.step(make_params(30.0), START)
+    np.testing.assert_allclose(step.section_state, reference["section_state"], atol=1e-11)
+    np.testing.assert_allclose(step.durations, reference["durations"], atol=1e-11)
+    advance_reference = lambda peak: five_coordinates.return_map(make_params(peak[0]), START)
+    expected = five_coordinates.jacobian(advance_reference, np.array([30.0]))[:, 0]
+    derivative = jax.jacfwd(lambda peak: advance(SwingMotor(peak)))(30.0)
+    np.testing.assert_allclose(derivative, expected, rtol=1e-7, atol=1e-11)
+
+
+def test_the_work_of_a_torque_of_the_angle_is_in_the_energy_of_damping():
+    """The reference is the torque, integrated over the angle, and the power of the dampers."""
+    torque = lambda theta, dtheta, params: 30.0 * jnp.cos(3.0 * theta)
+    step = vrw.step(PARAMS, START, model=make_wheel(torque))
+    walk = vrw.simulate(PARAMS, START, 1, model=make_wheel(torque), n_samples=2001)
+    integrate = lambda theta: 10.0 * np.sin(3.0 * theta)
+    work = integrate(step.section_state[0]) - integrate(step.post_impact[0])
+    dissipated = np.trapezoid(walk.damping_power, walk.time)
+    assert abs(float(step.energy.damping) - (dissipated - float(work))) < 1e-4
+
+
+def test_unilateral_contact_refuses_a_torque_of_the_angle():
+    with pytest.raises(ValueError, match="hub_torque depends on the angle"):
+        vrw.UnilateralWheel(hub_torque=SwingMotor())
 
 
 def test_a_motor_without_torque_changes_nothing():

@@ -54,6 +54,8 @@ class Wheel:
         """
         tau = np.zeros(5)
         tau[2] = self.params["hub_torque"](v[2]) if "hub_torque" in self.params else 0.0
+        if "angle_torque" in self.params:
+            tau[2] += self.params["angle_torque"](q[2], v[2])
         tau[3:] = self.leg_force(q[3:], v[3:])
         return tau
 

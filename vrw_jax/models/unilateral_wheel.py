@@ -42,7 +42,12 @@ from vrw_jax.models.interface import (
 )
 from vrw_jax.models.step_results import PAPER_START_STATE
 from vrw_jax.models.viscoelastic import can_use_batch_kernel
-from vrw_jax.wheel.laws import convert_hub_torque, convert_leg_force, count_kinks
+from vrw_jax.wheel.laws import (
+    convert_hub_torque,
+    convert_leg_force,
+    count_kinks,
+    takes_angle,
+)
 from vrw_jax.wheel.params import (
     FRICTION_DOMAIN,
     FRICTION_NAME,
@@ -65,6 +70,16 @@ def _convert_smooth_leg_force(leg_force: Any) -> Any:
             "without the method kinks, or take vrw.ViscoelasticWheel."
         )
     return leg_force
+
+
+def _convert_torque_of_rate(hub_torque: Any) -> Any:
+    hub_torque = convert_hub_torque(hub_torque)
+    if takes_angle(hub_torque):
+        raise ValueError(
+            "hub_torque depends on the angle, but with unilateral contact any leg may stand: give "
+            "a torque f(dtheta, params) of the rate, or take vrw.ViscoelasticWheel."
+        )
+    return hub_torque
 
 
 class UnilateralTrajectory(eqx.Module):
@@ -228,7 +243,7 @@ class UnilateralWheel(AbstractContactWheel):
     restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
     infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
     leg_force: Any = eqx.field(converter=_convert_smooth_leg_force, default=None)
-    hub_torque: Any = eqx.field(converter=convert_hub_torque, default=None)
+    hub_torque: Any = eqx.field(converter=_convert_torque_of_rate, default=None)
     uneven: UnevenGround | None = None
 
     if TYPE_CHECKING:

@@ -87,10 +87,10 @@ class ViscoelasticWheel(AbstractWheel):
       rate in m/s and the parameters of the wheel. A positive force pushes the hub away from the
       foot. A method `kinks(L, dL, params)` declares where the force has kinks or jumps. None means
       the paper's force, k (L* - L) - c dL. See docs/howto/own_leg.md;
-    - `hub_torque`: torque of a motor on the hub in N m, as a number or a function
-      `f(dtheta, params)` of the rate of the wheel in rad/s. A positive torque drives the wheel
-      forward. The torque is external, or acts against a body that slides along with the hub and
-      does not turn. See docs/howto/own_leg.md;
+    - `hub_torque`: torque of a motor on the hub in N m, as a number, a function `f(dtheta, params)`
+      of the rate of the wheel in rad/s, or a function `f(theta, dtheta, params)` of the angle of
+      Leg 1 in rad too. A positive torque drives the wheel forward. The torque is external, or acts
+      against a body that slides along with the hub. See docs/howto/own_leg.md;
     - `stop_at_lift_off`: whether a step fails if the ground would have to pull on Leg 1, because
       the model does not describe bouncing. If False, the step continues formally, as the paper's
       steps do after scuffing, and the margins report the violation.

@@ -242,7 +242,7 @@ def compute_equation_terms(s: Symbols, motion: Motion) -> EquationTerms:
     )
     if s.hub_torque is not None:
         # Hub and legs turn together, so that the work of the torque is torque times dtheta.
-        applied_moment_theta = applied_moment_theta + evaluate_hub_torque(s, dtheta)
+        applied_moment_theta = applied_moment_theta + evaluate_hub_torque(s, dtheta, sin, cos)
     return EquationTerms(
         mass_matrix=mass_matrix,
         applied_moment_theta=applied_moment_theta,
@@ -377,7 +377,9 @@ def compute_double_support_equation(
             leg_force_1 * rear_leg.sin + leg_force_2 * motion.sin_theta
         )
     if s.hub_torque is not None:
-        generalized_force = generalized_force + evaluate_hub_torque(s, dtheta)
+        generalized_force = generalized_force + evaluate_hub_torque(
+            s, dtheta, motion.sin_theta, motion.cos_theta
+        )
     return SingleDofEquation(
         constant_inertia + 2.0 * sin_squared_rate_coefficient * cos, generalized_force
     )

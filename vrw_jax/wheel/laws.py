@@ -1,10 +1,11 @@
 """Laws that a user gives: the force along a leg, and the torque on the hub.
 
 A law of a leg is a function `f(L, dL, params)` of the length of the leg and of its rate. A law of
-the hub is a function `f(dtheta, params)` of the rate at which the wheel turns. Laws are equinox
-modules, whose fields are parameters with derivatives.
+the hub is a function `f(dtheta, params)` of the rate at which the wheel turns, or of its angle too,
+`f(theta, dtheta, params)`. Laws are equinox modules, whose fields are parameters with derivatives.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.checks import check_reals, format_value
+from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.parameters import list_parameters, parameter
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, Symbols, WheelLaws, WheelUnits
@@ -211,9 +213,10 @@ class ScaledHubTorque(eqx.Module):
     length_unit: Elementwise
     time_unit: Elementwise
 
-    def __call__(self, dtheta: Elementwise, params: LawParameters) -> Elementwise:
+    def __call__(self, *motion_and_params: Any) -> Elementwise:
+        *angle, dtheta, params = motion_and_params
         units = WheelUnits(self.length_unit, self.time_unit, 1.0)
-        si_torque = self.law(dtheta * units.rate_unit, _convert_to_si(params, units))
+        si_torque = self.law(*angle, dtheta * units.rate_unit, _convert_to_si(params, units))
         return self.share * (si_torque / (units.acceleration_unit * units.length_unit))
 
 
@@ -293,15 +296,44 @@ def number_legs(leg_template: Elementwise) -> np.ndarray:
     return np.arange(1, len(leg_template) + 1).reshape(-1, *(1,) * (jnp.ndim(leg_template) - 1))
 
 
-def evaluate_hub_torque(s: Symbols, dtheta: Elementwise) -> Elementwise:
-    """Return the torque on the hub by a user's law, N m; positive drives the wheel forward."""
-    return s.hub_torque(dtheta, _collect_law_parameters(s))
+def takes_angle(hub_torque: Any) -> bool:
+    """Return whether a law of the hub is a function of three arguments, the first an angle."""
+    if isinstance(hub_torque, ScaledHubTorque):
+        return takes_angle(hub_torque.law)
+    function = hub_torque.function if isinstance(hub_torque, FunctionLaw) else hub_torque
+    return callable(function) and len(inspect.signature(function).parameters) == 3
+
+
+def evaluate_hub_torque(s: Symbols, dtheta: Elementwise, *sine_cosine: Elementwise) -> Elementwise:
+    """Return the torque on the hub by a user's law, N m; positive drives the wheel forward.
+
+    - `sine_cosine`: those of the angle of Leg 1, for a law that depends on the angle.
+    """
+    angle = (_compute_angle(*sine_cosine),) if takes_angle(s.hub_torque) else ()
+    return s.hub_torque(*angle, dtheta, _collect_law_parameters(s))
+
+
+def _compute_angle(sine: Elementwise, cosine: Elementwise) -> Elementwise:
+    """Return an angle between -pi/2 and pi/2, by primitives that have machine code.
+
+    A polynomial for the half angle (Abramowitz and Stegun 4.4.49) has an error of 1e-5. The sine of
+    its difference to the angle corrects it.
+    """
+    ratio = sine / (1.0 + cosine)
+    square = ratio * ratio
+    polynomial = 0.9998660 + square * (
+        -0.3302995 + square * (0.1801410 + square * (-0.0851330 + square * 0.0208351))
+    )
+    angle = 2.0 * ratio * polynomial
+    rough_sine, rough_cosine = compute_sine_cosine(angle)
+    correction = sine * rough_cosine - cosine * rough_sine
+    return angle + correction + correction * correction * correction / 6.0
 
 
 def compute_motor_work(s: Symbols, angle: Elementwise) -> Elementwise:
     """Return the work of a constant torque on the hub that turns by `angle`, J.
 
-    The work is zero for a torque that varies with the rate, which counts as a damper.
+    The work is zero for a torque that varies, which counts as a damper.
     """
     return s.hub_torque.torque * angle if isinstance(s.hub_torque, ConstantTorque) else 0.0 * angle
 
@@ -354,7 +386,9 @@ def convert_hub_torque(hub_torque: Any) -> Any:
     """
     if hub_torque is not None and not callable(hub_torque):
         hub_torque = ConstantTorque(hub_torque)
-    return _convert_law(hub_torque, "hub_torque", "torque on the hub", "f(dtheta, params)", "N m")
+    has_angle = not isinstance(hub_torque, type) and takes_angle(hub_torque)
+    signature = "f(theta, dtheta, params)" if has_angle else "f(dtheta, params)"
+    return _convert_law(hub_torque, "hub_torque", "torque on the hub", signature, "N m")
 
 
 def _convert_law(law: Any, law_name: str, meaning: str, signature: str, unit: str) -> Any:
