@@ -32,7 +32,8 @@ def test_a_case_has_a_reference_rows_a_figure_and_a_section_of_the_page(name):
     assert (ROOT / "docs" / "figures" / f"failure_{name}.png").exists()
     problems = failures.PROBLEMS.read_text()
     assert f"## {case.title}\n" in problems
-    assert f"<!-- failure {name} -->" in problems
+    assert f"](../figures/failure_{name}.svg)" in problems
+    assert f"| [{case.title}](#{failures.anchor(case.title)}) |" in problems
     assert f"](hybrid_problems.md#{failures.anchor(case.title)})" in failures.OVERVIEW.read_text()
 
 

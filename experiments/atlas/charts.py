@@ -204,15 +204,23 @@ def summarize_by_border(rows: list[Row]) -> list[Row]:
     return table_rows
 
 
+LARGEST_SHOWN_DISTANCE = 1e-6
+"""Largest relative distance from a border in the table, because no outcome differs beyond it."""
+
+
 def corners(rows: list[Row]) -> str:
     """Other outcomes of the lane engine, and of the diffrax engine, by border and distance."""
     result = summarize_by_border(rows)
-    distances = list(dict.fromkeys(row["distance"] for row in result))
+    distances = [
+        distance
+        for distance in dict.fromkeys(row["distance"] for row in result)
+        if float(distance) <= LARGEST_SHOWN_DISTANCE
+    ]
     lines = [
         (
             border.replace(" | ", " / "),
             rows_of_group[0]["cases"],
-            *(row["other_outcome"] for row in rows_of_group),
+            *(row["other_outcome"] for row in rows_of_group if row["distance"] in distances),
         )
         for border, rows_of_group in group_rows(result, "border").items()
     ]
@@ -233,10 +241,9 @@ def limits(rows: list[Row]) -> str:
             "; ".join(result),
             f"{is_same} of {len(rows_of_group)}",
             f"{max(read_column(rows_of_group, 'time_difference_s')):.0e} s",
-            str(int(max(read_column(rows_of_group, "solver_steps")))),
         )
         lines.append(cells)
-    header = ("limit", "outcomes by value", "as isolated", "times differ by", "most solver steps")
+    header = ("limit", "outcomes by value", "as isolated", "times differ by")
     return format_markdown(header, lines)
 
 
@@ -451,12 +458,16 @@ def events(rows: list[Row]) -> list[Row]:
 
 def dips(rows: list[Row]) -> list[Row]:
     """Count the local minima by kind of case over all chunks."""
-    counts = ("cases", "stepped", "gave_up", "differ", "other_outcome", "other_by_tight")
+    counts = ("cases", "stepped", "gave_up", "other_outcome", "other_by_tight")
     return [
         {"kind": kind}
         | {name: str(sum(int(row[name]) for row in rows_of_group)) for name in counts}
         for kind, rows_of_group in group_rows(rows, "kind").items()
     ]
+
+
+LONG_WALK_COLUMNS = ("tolerance", "steps", "distance", "clock_error_s", "share")
+"""Columns of the table of long walks on the page."""
 
 
 def as_table(rows: list[Row]) -> str:
@@ -482,7 +493,15 @@ def draw(
         "dips": ("dips", lambda rows: as_table(dips(rows))),
         "between": ("between", corners),
         "limits": ("limits", limits),
-        "long_walk": ("long_walk", lambda rows: as_table(select_last_rows(rows, "tolerance"))),
+        "long_walk": (
+            "long_walk",
+            lambda rows: as_table(
+                [
+                    {name: row[name] for name in LONG_WALK_COLUMNS}
+                    for row in select_last_rows(rows, "tolerance")
+                ]
+            ),
+        ),
         "apart": ("apart", as_table),
     }
     for mark, (name, text) in result_by_name.items():

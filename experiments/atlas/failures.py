@@ -4,7 +4,7 @@
 
 Each case is a module of experiments/atlas/cases with its reference. A row of the table contains a
 method's result, its error, its message and its cost. The pages docs/verification/failures.md and
-hybrid_problems.md contain the rows. With `--only` the given cases run again.
+hybrid_problems.md contain summaries. With `--only` the given cases run again.
 """
 
 import importlib
@@ -84,20 +84,16 @@ def anchor(title: str) -> str:
     return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", plain).strip().lower())
 
 
-def summarize_by_method(rows: list[dict[str, str]]) -> list[list[str]]:
-    """Return a line for each method of a case, with its worst result."""
-    lines, severities = [], list(VERDICT_LABELS)
-    for method, rows_of_method in group_rows(rows, "method").items():
-        size = lambda row: math.inf if row["error"] == "-" else float(row["error"])
-        worst = max(rows_of_method, key=lambda row: (severities.index(row["verdict"]), size(row)))
-        says = next((row["says"] for row in [worst, *rows_of_method] if row["says"]), "")
-        lines.append(
-            [
-                method.replace("ours", "vrw_jax"), VERDICT_LABELS[worst["verdict"]],
-                worst["quantity"], worst["error"], says,
-            ]
-        )  # fmt: skip
-    return lines
+def summarize_by_method(rows: list[dict[str, str]]) -> list[tuple[str, str]]:
+    """Return each method of a case with its worst verdict."""
+    severities = list(VERDICT_LABELS)
+    return [
+        (
+            method.replace("ours", "vrw_jax"),
+            VERDICT_LABELS[max((row["verdict"] for row in rows_of_method), key=severities.index)],
+        )
+        for method, rows_of_method in group_rows(rows, "method").items()
+    ]
 
 
 def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
@@ -113,9 +109,9 @@ def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()) -> None:
-    """Write the tables of both pages: a line for each case, and for each method of a case.
+    """Write the table of results and that of origins, with a line for each case.
 
-    Blocks of the cases that were measured now get a new line of command, commit, machine and date.
+    If several cases were measured now, both get a new line of command, commit, machine and date.
     """
     results, origins = [], []
     for name, selection in group_rows(rows, "case").items():
@@ -124,22 +120,17 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
             float(row["error"]) / float(row["condition"]) for row in select_exact_rows(selection)
         ]
         method_cells = [
-            "; ".join(m for m, verdict, *_ in methods if verdict == label)
+            "; ".join(m for m, verdict in methods if verdict == label)
             for label in VERDICT_LABELS.values()
         ]
         link = f"[{case.title}]({PROBLEMS.name}#{anchor(case.title)})"
         results.append([link, *method_cells, f"{max(errors):.0e}" if errors else "-"])
-        origins.append([link, case.breaks, case.reference, case.source])
-        header = ["method", "worst result", "of", "error", "report"]
-        table = format_markdown(header, methods)
-        measured = name in measured_names
-        source = describe_run(f"experiments.atlas.failures --only {name}") if measured else None
-        replace_block(PROBLEMS, f"failure {name}", table, source)
+        origins.append([f"[{case.title}](#{anchor(case.title)})", case.reference, case.source])
     header = ["problem", *VERDICT_LABELS.values(), "error of vrw_jax over condition"]
     source = describe_run("experiments.atlas.failures") if len(measured_names) > 1 else None
     replace_block(OVERVIEW, "failures", format_markdown(header, results), source)
-    header = ["problem", "difficulty", "reference", "origin"]
-    replace_block(OVERVIEW, "origins of failures", format_markdown(header, origins), source)
+    header = ["problem", "reference", "origin"]
+    replace_block(PROBLEMS, "origins of failures", format_markdown(header, origins), source)
 
 
 def draw(name: str, rows: list[dict[str, str]]) -> None:

@@ -17,7 +17,6 @@ import numpy as np
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
 
 BOX = {
@@ -156,13 +155,10 @@ def reasons(n: int, seed: int) -> tuple[list[tuple[str, int, str]], np.ndarray, 
         closer = closer[~which]
     reason_rows.append(("no reason found", len(unexplained_lanes), ""))
     spread = "median {:.1e}, 99th percentile {:.1e}, largest {:.1e}".format(*quantiles)
-    codes = np.unique(lanes[0], return_counts=True)
-    each = zip(*codes, strict=True)
-    names = ", ".join(f"{count:,} {Outcome(int(code)).name}" for code, count in each)
     return (
         reason_rows,
         unexplained_lanes,
-        f"Outcomes: {names}. Differences of equal outcomes: {spread}.",
+        f"Differences of equal outcomes: {spread}.",
     )
 
 
