@@ -592,33 +592,27 @@ def describe_bounds(bounds: np.ndarray) -> str:
 
 
 def summarize_comparisons(rows: Sequence[Row]) -> str:
-    """Return a table in Markdown: medians of two thirds of the gaits, and rank correlations.
+    """Return a table in Markdown: indices of gaits of equal speed.
 
-    The thirds are those of the least and the largest DLS fraction. The steepest slope has too few
-    gaits for medians.
+    It lists rigid wheels, medians of the thirds of the gaits with the least and the largest DLS
+    fraction, and rank correlations.
     """
-    lines = []
-    for comparison, group in group_by_comparison(rows).items():
-        if comparison == f"slope {EQUAL_SLOPES[-1]:g} rad":
+    group = group_by_comparison(rows)[f"speed {EQUAL_SPEED:g} m/s"]
+    gaits = sorted(select_compliant(group), key=lambda row: float(row["dls_fraction"]))
+    third = len(gaits) // 3
+    rigid = {row["wheel"]: row for row in group if row["wheel"] in HAS_HELD_LANDING}
+    dls, lines = read_column(gaits, "dls_fraction"), []
+    for name, label in {"dls_fraction": "DLS fraction", **COMPARED_COLUMNS}.items():
+        if name in ("speed", "damper_share"):
             continue
-        gaits = sorted(select_compliant(group), key=lambda row: float(row["dls_fraction"]))
-        third = len(gaits) // 3
-        rigid = {row["wheel"]: row for row in group if row["wheel"] in HAS_HELD_LANDING}
-        dls = read_column(gaits, "dls_fraction")
-        for name, label in {"dls_fraction": "DLS fraction", **COMPARED_COLUMNS}.items():
-            if name == comparison.split()[0] or not gaits[0].get(name):
-                continue
-            values = read_column(gaits, name)
-            is_constant = np.ptp(values) < 1e-4 * np.abs(values).max()
-            lines.append([
-                comparison, label, len(gaits),
-                *(shorten_number(rigid[model][name]) if model in rigid else "no gait"
-                  for model in HAS_HELD_LANDING),
-                f"{np.median(values[:third]):.3g}", f"{np.median(values[-third:]):.3g}",
-                "–" if is_constant or name == "dls_fraction"
-                else f"{stats.spearmanr(dls, values).statistic:+.2f}",
-            ])  # fmt: skip
-    header = ("at", "index", "gaits", *HAS_HELD_LANDING, "median, least DLS", "median, most DLS",
+        values = read_column(gaits, name)
+        correlation = stats.spearmanr(dls, values).statistic
+        lines.append([
+            label, *(shorten_number(rigid[model][name]) for model in HAS_HELD_LANDING),
+            f"{np.median(values[:third]):.3g}", f"{np.median(values[-third:]):.3g}",
+            "–" if name == "dls_fraction" else f"{correlation:+.2f}",
+        ])  # fmt: skip
+    header = ("index", *HAS_HELD_LANDING, "median, least DLS", "median, most DLS",
               "rank correlation with DLS")  # fmt: skip
     return format_markdown(header, lines)
 
@@ -629,16 +623,19 @@ def group_by_comparison(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return {name: [row for row in rows if row["comparison"] == name] for name in names}
 
 
-LIFE_COLUMNS = ("wheel", "damping", "stiffness", "dls_fraction", "spectral_radius", "mean_steps",
-                "walk_end")  # fmt: skip
-CONTACT_COLUMNS = ("wheel", "slope", "friction_needed", "dls_fraction", "speed", "contact_end",
-                   "contact_dls_fraction", "contact_speed", "contact_friction_share")  # fmt: skip
+LIFE_COLUMNS = ("wheel", "dls_fraction", "spectral_radius", "mean_steps")
+CONTACT_COLUMNS = (
+    "wheel", "friction_needed", "dls_fraction", "speed", "contact_dls_fraction", "contact_speed",
+)  # fmt: skip
 
 
-def format_life(row: Row) -> str:
-    """Return a mean number of steps with its error, if it has one."""
-    mean, error = float(row["mean_steps"]), float(row["mean_steps_error"])
-    return f"{mean:.3g} ± {error:.1g}" if np.isfinite(error) else "not estimated"
+def format_lives(rows: Sequence[Row]) -> list[Row]:
+    """Return the wheels whose mean number of steps has an error, with this error."""
+    return [
+        row | {"mean_steps": f"{float(row['mean_steps']):.3g} ± {float(error):.1g}"}
+        for row in rows
+        if np.isfinite(float(error := row["mean_steps_error"]))
+    ]
 
 
 def summarize_table(rows: Sequence[Row], columns: Sequence[str]) -> str:
@@ -652,7 +649,7 @@ def summarize_table(rows: Sequence[Row], columns: Sequence[str]) -> str:
 
 def make_blocks() -> dict[str, tuple[str, str]]:
     """Return the part that computes each block of the page, and its text from stored tables."""
-    lives = [row | {"mean_steps": format_life(row)} for row in read_table(LIVES_TABLE)]
+    lives = format_lives(read_table(LIVES_TABLE))
     return {
         "double_support_gaits": ("gaits", summarize_comparisons(read_table(GAITS_TABLE))),
         "double_support_lives": ("lives", summarize_table(lives, LIFE_COLUMNS)),

@@ -147,13 +147,11 @@ def summarize_maps(rows: list[Row]) -> str:
             )
             lines.append([
                 f"{float(panel[0]):.2f}", f"{float(panel[1]):.2f}", n_peaks, len(group),
-                int(np.sum(read_column(group, "spectral_radius") >= 1.0)),
                 *(describe_range(group, name) for name in ("first_peak_to_touchdown",
-                  "peak_distance", "bounces", "step_bounces", "dls_fraction")),
+                  "dls_fraction")),
                 "–" if depth is None else f"{depth:.1%}",
             ])  # fmt: skip
-    header = ("damping ratio", "L*, m", "peaks", "gaits", "unstable", "first peak to touchdown",
-              "first peak to second", "single support", "step", "DLS fraction",
+    header = ("damping ratio", "L*, m", "peaks", "gaits", "first peak to touchdown", "DLS fraction",
               "deepest trough / peak")  # fmt: skip
     return format_markdown(header, lines)
 
@@ -172,13 +170,11 @@ def summarize_comparisons() -> str:
     for label, rows in groups:
         gaits = [row for row in rows if row["n_force_peaks"]]
         n_peaks = np.array([count_separated_peaks(row) for row in gaits])
-        with_trough = [row for row, n in zip(gaits, n_peaks, strict=True) if n > 1]
         lines.append([
-            label, len(rows), len(gaits), *(int(np.sum(n_peaks == n)) for n in range(2)),
-            len(with_trough), describe_range(with_trough, "dls_fraction"),
+            label, len(gaits), *(int(np.sum(n_peaks == n)) for n in range(2)),
+            int(np.sum(n_peaks > 1)),
         ])  # fmt: skip
-    header = ("map", "wheels", "gaits", "no peak", "one peak", "two or more with a trough",
-              "DLS fraction of those with a trough")  # fmt: skip
+    header = ("map", "gaits", "no peak", "one peak", "two or more with a trough")
     return format_markdown(header, lines)
 
 
@@ -193,11 +189,9 @@ def summarize_curve() -> str:
     difference = interpolate(read_column(bisected, "stiffness_number")) - read_column(
         bisected, "slope"
     )
-    header = ("points", "k L0 / (M g)", "slope, rad", "unstable", "bisected wheels",
-              "largest difference of slopes, rad")  # fmt: skip
-    line = [len(curve), describe_range(curve, "stiffness_number"), describe_range(curve, "slope"),
-            int(np.sum(read_column(curve, "spectral_radius") >= 1.0)), len(bisected),
-            f"{np.abs(difference).max():.0e}"]  # fmt: skip
+    header = ("k L0 / (M g)", "slope, rad", "bisected wheels", "largest difference of slopes, rad")
+    line = [describe_range(curve, "stiffness_number"), describe_range(curve, "slope"),
+            len(bisected), f"{np.abs(difference).max():.0e}"]  # fmt: skip
     return format_markdown(header, [line])
 
 
@@ -223,10 +217,10 @@ def summarize_bisections() -> str:
             lines.append([
                 natural_length, label, len(group),
                 *(describe_range(group, name) for name in ("stiffness_number", "slope",
-                  "first_peak_to_touchdown", "trough_to_peak", "dls_fraction")),
+                  "first_peak_to_touchdown")),
             ])  # fmt: skip
     header = ("L*, m", "end of the second peak", "wheels", "k L0 / (M g)", "slope, rad",
-              "first peak to touchdown", "trough / peak", "DLS fraction")  # fmt: skip
+              "first peak to touchdown")  # fmt: skip
     return format_markdown(header, lines)
 
 

@@ -46,6 +46,10 @@ MAX_PERIOD = 12
 PERIODICITY_TOLERANCE = 1e-6
 """Largest change of the section state over one period, chosen far above the error of a step."""
 
+SHOWN_COLUMNS = ("contact", "c, N s/m", "friction", "period, steps", "double support, %",
+                 "rear foot slides, %", "fore foot in the air, %")  # fmt: skip
+"""Columns of the table on the page."""
+
 AIR = 0  # index of the contact mode in which a foot is in the air
 
 
@@ -122,7 +126,7 @@ def main() -> None:
     lines += [describe_contact_walk(*wheel) for wheel in CONTACT_WHEELS]
     write_named_rows(TABLE, lines)
     rows = read_table(TABLE)
-    text = format_markdown(rows[0], [row.values() for row in rows])
+    text = format_markdown(SHOWN_COLUMNS, [[row[name] for name in SHOWN_COLUMNS] for row in rows])
     replace_block(PAGE, "corrections", text, describe_run("experiments.paper.corrections"))
 
 

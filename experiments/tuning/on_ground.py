@@ -107,6 +107,7 @@ def main() -> None:
         "studies/double_support.md",
         FIGURES / "tuning_on_ground.csv",
         "experiments.tuning.on_ground",
+        ("scene", "damping", "natural_length", "ending", "dls_fraction", "speed", "slip"),
     )
 
 
