@@ -45,8 +45,6 @@ def main() -> None:
         ["", "value"],
         [
             (f"wheels with a mean, of {N_VALUES**2} in the map", len(mean_steps)),
-            ("smallest mean number of steps", f"{np.min(mean_steps):.3g}"),
-            ("largest mean number of steps", f"{np.max(mean_steps):.3g}"),
             ("processor time per wheel, s", f"{seconds_per_wheel:.2f}"),
             (
                 f"extrapolated: {N_LARGE_MAP_WHEELS:,} wheels on two busy cores, minutes",

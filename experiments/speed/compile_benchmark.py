@@ -80,7 +80,6 @@ def measure_program(function: Callable, arguments: tuple) -> dict[str, float]:
 
 TABLE_COLUMNS = {
     "program": "program",
-    "trace_s": "trace, s",
     "compile_with_s": "compile with, s",
     "compile_without_s": "without",
     "run_with_ms": "run with, ms",

@@ -32,7 +32,7 @@ FIRST_GAIT_SCRIPT = """
 import time; began = time.time(), time.process_time()
 import jax
 import vrw_jax as vrw
-{start}
+vrw.start_jax()
 gradient = jax.jit(jax.grad(lambda p: vrw.limit_cycle(p).{measure}))(vrw.WheelParams())
 jax.block_until_ready(gradient)
 print(time.time() - began[0], time.process_time() - began[1])
@@ -52,23 +52,18 @@ def measure_least_seconds(function: Callable, *arguments: object) -> float:
         return measure_cpu_seconds(lambda: function(*arguments), reduction=min)
 
 
-STARTS = {
-    "cold": "vrw.start_jax()",
-    "warm cache": "vrw.start_jax()",
-    "cold, without `start_jax`": 'jax.config.update("jax_enable_x64", True)',
-}
-"""How a process begins; the first two share a cache."""
+STARTS = ("cold", "warm cache")
+"""States of the cache that two processes share."""
 
 
 def measure_first_gait(measure: str) -> list[tuple[float, float]]:
     """Return wall and CPU seconds of a process that computes one gradient, for each of `STARTS`."""
     rows = []
     with tempfile.TemporaryDirectory() as cache:
-        for start in STARTS.values():
-            environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
-            if "start_jax" in start:
-                environment["JAX_COMPILATION_CACHE_DIR"] = cache
-            command = [sys.executable, "-c", FIRST_GAIT_SCRIPT.format(measure=measure, start=start)]
+        environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+        environment["JAX_COMPILATION_CACHE_DIR"] = cache
+        for _ in STARTS:
+            command = [sys.executable, "-c", FIRST_GAIT_SCRIPT.format(measure=measure)]
             out = subprocess.run(
                 command, env=environment, capture_output=True, text=True, check=True
             )

@@ -1,4 +1,4 @@
-"""Measure the cost of a step's derivatives, in batches, for one wheel, and for a first call.
+"""Measure the cost of a step's derivatives, in batches and for one wheel.
 
     python -m experiments.speed.derivative_benchmark [--lanes 2048] [--repeats 9]
 
@@ -10,11 +10,7 @@ phi are compared with other programs as speed over error. The command writes thr
 `docs/benchmarks/steps.md`, and a chart.
 """
 
-import itertools
 import os
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -45,14 +41,6 @@ LABELS = (
 )
 COMPARED_ERROR = 1e-8
 """Error at which methods are compared."""
-FIRST_CALL_SCRIPT = """
-import time; began = time.perf_counter()
-import jax, vrw_jax as vrw
-vrw.start_jax()
-params, x = vrw.WheelParams(), vrw.paper_start()
-jax.block_until_ready({call}(params, x))
-print(time.perf_counter() - began)
-"""
 SINGLE_WHEEL_CALLS = {
     "return_map": "jax.jit(vrw.return_map)",
     "Jacobian of return_map, state": "jax.jit(jax.jacfwd(vrw.return_map, 1))",
@@ -94,37 +82,19 @@ def in_batches(n: int, repeats: int) -> list[tuple]:
             return result, 1e6 * measure_cpu_seconds(run, repeats, reduction=min) / n
 
     for tolerance in (1e-6, 1e-8, 1e-10):
-        choose = lambda factor, at=tolerance: vrw.StepOptions(
-            rtol=at, atol=at, derivative_tightening=factor
-        )
-        batch_result, seconds_without_derivatives = timed(choose(1.0), ())
+        options = vrw.StepOptions(rtol=tolerance, atol=tolerance)
+        batch_result, seconds = timed(options, ())
         values = np.concatenate([batch_result.section_state, batch_result.durations], 1)
         error = np.quantile(np.max(np.abs(values - reference), 1), 0.99)
-        row = (
-            f"{tolerance:.0e}",
-            "",
-            "none",
-            f"{seconds_without_derivatives:.2f}",
-            "1",
-            f"{error:.1e}",
-        )
-        table.append((*row, ""))
-        for factor, (name, requested) in itertools.product((1.0, 20.0), COLUMNS.items()):
-            batch_result, seconds_with_derivatives = timed(choose(factor), requested)
+        table.append((f"{tolerance:.0e}", "none", f"{seconds:.2f}", f"{error:.1e}"))
+        for name, requested in COLUMNS.items():
+            batch_result, seconds = timed(options, requested)
             away = np.abs(
                 flatten_derivatives(batch_result.derivatives, requested)[selection]
                 - flatten_derivatives(exact.derivatives, requested)
             )
-            row = (f"{tolerance:.0e}", f"{factor:g}", name, f"{seconds_with_derivatives:.2f}")
             off = np.quantile(np.max(away, (1, 2)), 0.99)
-            table.append(
-                (
-                    *row,
-                    f"{seconds_with_derivatives / seconds_without_derivatives:.1f}",
-                    "",
-                    f"{off:.1e}",
-                )
-            )
+            table.append((f"{tolerance:.0e}", name, f"{seconds:.2f}", f"{off:.1e}"))
     return table
 
 
@@ -219,24 +189,9 @@ def find_fastest(table: list[dict]) -> list[tuple]:
 
 
 def measure_single_calls() -> list[tuple]:
-    """Return call, microseconds, seconds of a first call with an empty cache, and with a filled
-    cache.
-
-    Python has its bytecode of every module, as after any installation.
-    """
+    """Return each call and its microseconds."""
     params, x, table = vrw.WheelParams(), vrw.paper_start(), []
-    installed = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    subprocess.run([sys.executable, "-c", "import vrw_jax, xarray"], env=installed, check=True)
     for name, call in SINGLE_WHEEL_CALLS.items():
-        with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-c", FIRST_CALL_SCRIPT.format(call=call)]
-            where = installed | {"JAX_COMPILATION_CACHE_DIR": folder}
-            evaluate = lambda command=command, where=where: (
-                subprocess.run(
-                    command, env=where, check=True, capture_output=True, text=True
-                ).stdout
-            )
-            cold, warm = float(evaluate()), float(evaluate())
         function = eval(call, {"jax": jax, "vrw": vrw})  # The source of this file.
         jax.block_until_ready(function(params, x))
         times = []
@@ -244,7 +199,7 @@ def measure_single_calls() -> list[tuple]:
             began = time.perf_counter()
             jax.block_until_ready(function(params, x))
             times.append(time.perf_counter() - began)
-        table.append((name, f"{1e6 * np.median(times):.0f}", f"{cold:.1f}", f"{warm:.1f}"))
+        table.append((name, f"{1e6 * np.median(times):.0f}"))
     return table
 
 
@@ -253,15 +208,9 @@ def main() -> None:
     parser.add_argument("--lanes", type=int, default=2048)
     parser.add_argument("--repeats", type=int, default=9)
     chosen = parse_and_start_jax(parser)
-    header = (
-        "tolerance", "tightened by", "columns", "µs per element", "multiple of the values' time",
-        "p99 error of values", "p99 error of derivatives",
-    )  # fmt: skip
+    header = ("tolerance", "columns", "µs per element", "p99 error")
     batches = format_markdown(header, in_batches(chosen.lanes, chosen.repeats))
-    one = format_markdown(
-        ("one wheel", "µs", "first result of a process, s", "first result with cached code, s"),
-        measure_single_calls(),
-    )
+    one = format_markdown(("one wheel", "µs"), measure_single_calls())
     others = compare_with_others(chosen.lanes, chosen.repeats)
     draw_chart(others)
     header = ("method", "tolerance", "p99 error", "steps with 7 columns per second and core",
