@@ -150,10 +150,9 @@ def measures_page() -> str:
     for title, table, what in _GROUPS:
         lines += ["", f"## {title}", "", what, ""]
         rows = [
-            (f"`{m.name}`", f"${m.mathtext.strip()}$", m.unit, _meaning(m), m.equation)
-            for m in table.values()
+            (f"`{m.name}`", f"${m.mathtext.strip()}$", m.unit, _meaning(m)) for m in table.values()
         ]
-        lines += format_markdown_table(("name", "symbol", "unit", "meaning", "in the paper"), rows)
+        lines += format_markdown_table(("name", "symbol", "unit", "meaning"), rows)
     return "\n".join(lines) + "\n"
 
 
@@ -193,4 +192,6 @@ _GROUPS = (
 
 def _meaning(measure: Measure) -> str:
     breaks = f" Below zero: {measure.violation_text}." if measure.violation_text else ""
-    return f"{measure.long_name[0].upper()}{measure.long_name[1:]}. {measure.description}{breaks}"
+    place = f" In the paper: {measure.equation}." if measure.equation else ""
+    name = f"{measure.long_name[0].upper()}{measure.long_name[1:]}"
+    return f"{name}. {measure.description}{breaks}{place}"
