@@ -501,7 +501,6 @@ def draw(
                 ]
             ),
         ),
-        "apart": ("apart", as_table),
     }
     for mark, (name, text) in result_by_name.items():
         if name in known_by_name:

@@ -131,12 +131,11 @@ def get_panel(row: Row) -> tuple[str, str]:
 
 
 def summarize_maps(rows: list[Row]) -> str:
-    """Return a table in Markdown: one line per map and number of peaks."""
+    """Return a table in Markdown: one line per damping ratio and number of peaks."""
     lines = []
-    for panel in dict.fromkeys(map(get_panel, rows)):
-        gaits = select_gaits(rows, panel)
-        for n_peaks in sorted({row["n_force_peaks"] for row in gaits}):
-            group = [row for row in gaits if row["n_force_peaks"] == n_peaks]
+    for damping_ratio, wheels in group_rows(rows, "damping_ratio").items():
+        for n_peaks in sorted({row["n_force_peaks"] for row in wheels if row["n_force_peaks"]}):
+            group = [row for row in wheels if row["n_force_peaks"] == n_peaks]
             depth = (
                 max(
                     read_column(group, "force_trough_depth")
@@ -146,12 +145,12 @@ def summarize_maps(rows: list[Row]) -> str:
                 else None
             )
             lines.append([
-                f"{float(panel[0]):.2f}", f"{float(panel[1]):.2f}", n_peaks, len(group),
+                f"{float(damping_ratio):.2f}", n_peaks, len(group),
                 *(describe_range(group, name) for name in ("first_peak_to_touchdown",
                   "dls_fraction")),
                 "–" if depth is None else f"{depth:.1%}",
             ])  # fmt: skip
-    header = ("damping ratio", "L*, m", "peaks", "gaits", "first peak to touchdown", "DLS fraction",
+    header = ("damping ratio", "peaks", "gaits", "first peak to touchdown", "DLS fraction",
               "deepest trough / peak")  # fmt: skip
     return format_markdown(header, lines)
 
@@ -206,20 +205,18 @@ def is_cut_off(row: Row) -> bool:
 
 
 def summarize_bisections() -> str:
-    """Return a table in Markdown: one line per natural length and kind of border."""
-    lines = []
-    for natural_length in ("1", "1.02"):
-        borders = select_borders(natural_length)
-        for label, group in (
-            ("meets the trough", [row for row in borders if not is_cut_off(row)]),
-            ("touchdown at the peak", [row for row in borders if is_cut_off(row)]),
-        ):
-            lines.append([
-                natural_length, label, len(group),
-                *(describe_range(group, name) for name in ("stiffness_number", "slope",
-                  "first_peak_to_touchdown")),
-            ])  # fmt: skip
-    header = ("L*, m", "end of the second peak", "wheels", "k L0 / (M g)", "slope, rad",
+    """Return a table in Markdown: one line per kind of border."""
+    borders, lines = read_table(BISECTION_TABLE), []
+    for label, group in (
+        ("meets the trough", [row for row in borders if not is_cut_off(row)]),
+        ("touchdown at the peak", [row for row in borders if is_cut_off(row)]),
+    ):
+        lines.append([
+            label, len(group),
+            *(describe_range(group, name) for name in ("stiffness_number", "slope",
+              "first_peak_to_touchdown")),
+        ])  # fmt: skip
+    header = ("end of the second peak", "wheels", "k L0 / (M g)", "slope, rad",
               "first peak to touchdown")  # fmt: skip
     return format_markdown(header, lines)
 

@@ -3,10 +3,9 @@
     python -m experiments.speed.compile_benchmark
 
 The command compiles programs of this package with and without XLA's fusion emitters, which
-`vrw.start_jax` switches off. It writes `docs/figures/compile_benchmark.csv` and the table of
-`docs/benchmarks/compiling.md`. Times are CPU seconds of one core without a cache. The two ways take
-turns for each program. Limit cycles use machine code that XLA does not make; making this code
-counts as tracing.
+`vrw.start_jax` switches off. It writes `docs/figures/compile_benchmark.csv`. Times are CPU
+seconds of one core without a cache. The two ways take turns for each program. Limit cycles use
+machine code that XLA does not make; making this code counts as tracing.
 """
 
 import time
@@ -18,11 +17,7 @@ import jax.numpy as jnp
 import vrw_jax as vrw
 from experiments.shared.command import make_parser
 from experiments.shared.tables import (
-    DOCS,
     FIGURES,
-    describe_run,
-    format_markdown,
-    replace_block,
     write_named_rows,
 )
 from experiments.shared.timing import start_without_cache, use_one_core
@@ -78,15 +73,6 @@ def measure_program(function: Callable, arguments: tuple) -> dict[str, float]:
     return row
 
 
-TABLE_COLUMNS = {
-    "program": "program",
-    "compile_with_s": "compile with, s",
-    "compile_without_s": "without",
-    "run_with_ms": "run with, ms",
-    "run_without_ms": "without",
-}
-
-
 def main() -> None:
     make_parser(__doc__).parse_args()
     rows = []
@@ -98,11 +84,6 @@ def main() -> None:
             )
             print(rows[-1], flush=True)
     write_named_rows(FIGURES / "compile_benchmark.csv", rows)
-    table = format_markdown(
-        TABLE_COLUMNS.values(), [[row[name] for name in TABLE_COLUMNS] for row in rows]
-    )
-    source = describe_run("experiments.speed.compile_benchmark")
-    replace_block(DOCS / "benchmarks" / "compiling.md", "compile times", table, source)
 
 
 if __name__ == "__main__":

@@ -256,10 +256,11 @@ def table(rows: list[Row]) -> str:
             for selected_rows in (ours, rows):
                 row = best(selected_rows, group, is_for_one_wheel, target)
                 if row is None:
-                    tried = best(selected_rows, group, is_for_one_wheel, math.inf) is not None
-                    cells += ["none" if tried else "not measured", "–"]
+                    cells += ["none", "–"]
                 else:
                     cells += [f"{label_of(row)}, {row['setting']}", format_time(time_of(row, unit))]
+            if cells[2:] == ["none", "–", "none", "–"]:
+                continue
             if cells[2:4] == cells[4:]:
                 cells[4:] = "the same", ""
             if lines and [*lines[-1][:1], *lines[-1][2:]] == [method_name, *cells[2:]]:
