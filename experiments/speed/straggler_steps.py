@@ -5,8 +5,8 @@
 A group of eight lanes goes through each phase together. The figure is the number of steps of its
 slowest lane over the mean number of its lanes, which is 1 if none waits. The orders are: as given,
 by c/m, that of `vrw.step_batch`, and by the steps of SLS-I themselves, which are not known before.
-The experiment also prints fits of the steps of SLS-I, of which `work_order` has rounded powers. It
-writes a table into `docs/benchmarks/steps.md`.
+The experiment prints these figures, and fits of the steps of SLS-I, of which `work_order` has
+rounded powers.
 """
 
 import functools
@@ -17,7 +17,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from experiments.shared.tables import DOCS, describe_run, format_markdown, replace_block
+from experiments.shared.tables import format_markdown
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.engines_agree import draw_wheels
 from vrw_jax.flow import load_explicit_tableau
@@ -105,8 +105,6 @@ def main() -> None:
     table = format_markdown(
         ("wheels", "as given", "c/m", "`vrw.step_batch`", "SLS-I's steps"), result
     )
-    source = describe_run("experiments.speed.straggler_steps")
-    replace_block(DOCS / "benchmarks" / "steps.md", "waiting", table, source)
     print(table)
     print(format_markdown(("wheels", "c/m", "dtheta", "k/m", "theta", "Ls"), fits))
 
