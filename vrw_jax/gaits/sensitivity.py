@@ -20,7 +20,11 @@ from vrw_jax.gaits.finder_selection import (
 )
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.models.stepping import ModelLike, require_legs_in_turn_by_collocation
+from vrw_jax.models.stepping import (
+    ModelLike,
+    convert_model_argument,
+    require_legs_in_turn_by_collocation,
+)
 
 
 @announce_wait("the gait with its derivatives", "15 s")
@@ -63,7 +67,7 @@ def sensitivities(
     require_untraced_arguments("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
     guess = check_cycle_guess(guess)
     if not is_own_walker(model):
-        model = resolve_model(params, model)  # type: ignore[arg-type]
+        model = convert_model_argument(resolve_model(params, model))  # type: ignore[arg-type]
         require_legs_in_turn_by_collocation(model, "vrw.sensitivities")
     period_n = getattr(model, "leg_period", 1)
     gait_finder = resolve_finder(params, model, options, period_n, guess)
