@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 import pytest
-from support.leg_laws import PaperLeg, QuadraticDamper, make_wheel
+from support.leg_laws import BumpStop, PaperLeg, QuadraticDamper, make_wheel
 
 import vrw_jax as vrw
 
@@ -124,3 +124,19 @@ def test_a_law_changes_lives_basins_and_disturbances():
         lambda model: vrw.gait_sensitivity(PARAMS, ["period"], model=model).norm[0],
     ):
         assert abs(study(light) - study(heavy)) > 1e-3 * study(light)
+
+
+@pytest.mark.slow
+def test_samples_of_a_law_with_kinks_are_the_gaits_of_walks():
+    """The reference is 200 steps with tight tolerances, in which the gait attracts the wheel."""
+    design = vrw.grid({"leg.k2": [99.0, 100.0, 101.0], "damping": [150.0, 900.0]})
+    names, model = ["period", "d period / d leg.k2"], make_wheel(BumpStop(100.0))
+    scan = vrw.scan(design, names, model=model)
+    start, options = np.array([[0.11, 1.85, -0.1]]), vrw.StepOptions.tight()
+    walk = vrw.step_batch(PARAMS, start, 200, model=model, options=options)
+    period = scan.period.sel(damping=150.0)
+    assert float(period[1]) == pytest.approx(float(walk.durations.sum()), abs=1e-9)
+    rate = scan["d period / d leg.k2"].sel(damping=150.0)[1]
+    assert float(rate) == pytest.approx(float(period[2] - period[0]) / 2.0, rel=1e-5)
+    assert scan.friction_rear.sel(damping=150.0).notnull().all()
+    assert scan.period.sel(damping=900.0).isnull().all()

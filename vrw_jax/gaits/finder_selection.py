@@ -40,12 +40,8 @@ def make_finder(
     period_n: int = 1,
     cycle_options: CycleOptions | None = None,
     step_options: StepOptions | None = None,
-    stays_on_mesh: bool = False,
 ) -> AbstractGaitFinder:
-    """Return the gait finder for a model.
-
-    - `stays_on_mesh`: whether collocation finds gaits of a force with kinks too.
-    """
+    """Return the gait finder for a model."""
     if cycle_options is not None:
         check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
     resolved_model = convert_model_argument(model)
@@ -65,7 +61,7 @@ def make_finder(
             # default mesh then has errors of 3e-9.
             default_options = default_options.refine_mesh()
         search_options = {"cycle_options": cycle_options or default_options}
-        if resolved_model.has_kinks and not stays_on_mesh:
+        if resolved_model.has_kinks:
             finder_class = KinkedGaitFinder
     return finder_class(
         model=resolved_model,

@@ -120,7 +120,6 @@ class CollocationScanEngine:
             period_n=request.wheel_model.leg_period,
             cycle_options=request.cycle_options,
             step_options=request.step_options,
-            stays_on_mesh=True,
         )
         self.evaluate_cycles = self._make_cycle_function(self._finder)
         self.evaluate_steps: Callable = jax.vmap(
@@ -174,9 +173,7 @@ class CollocationScanEngine:
         model, params = finder.model.from_parameter_values(
             tuple(jax.device_put(list(rows.T))), finder.n_legs
         )
-        default_finder: Any = make_finder(
-            finder.model, finder.n_legs, period_n=finder.period_n, stays_on_mesh=True
-        )
+        default_finder: Any = make_finder(finder.model, finder.n_legs, period_n=finder.period_n)
         for _, indices, mesh_search in search_further(
             find_from_starts,
             finder,
@@ -371,6 +368,44 @@ def _read_gait_measures(
 ) -> dict[str, Array]:
     first_gait_step = jax.tree.map(lambda values_by_step: values_by_step[:, 0], gait_batch.steps)
     return eqx.filter_vmap(measure_reader)(gait_batch, first_gait_step)
+
+
+def evaluate_gaits_with_kinks(
+    evaluation_request: EvaluationRequest, samples_by_parameter: ParameterSamples
+) -> ValuesByVariable:
+    """Return the value of each variable for all samples of a force with kinks, by name.
+
+    Event-driven steps stop at the kinks. The gaits are found one after another.
+    """
+    finder: Any = make_finder(
+        evaluation_request.wheel_model.without_values(),
+        evaluation_request.base_wheel.n_legs,
+        cycle_options=evaluation_request.cycle_options,
+        step_options=evaluation_request.step_options,
+    )
+    rows = jnp.asarray(evaluation_request.stack_parameter_rows(samples_by_parameter))
+    cycles = jax.tree.map(lambda *x: jnp.stack(x), *map(finder.find_cycle_from_values, rows))
+    derivatives = list(filter(None, map(parse_derivative, evaluation_request.measure_names)))
+    names = [name for name in evaluation_request.measure_names if parse_derivative(name) is None]
+    reader = MeasureReader(finder.measure_reader, (*names, "spectral_radius"))
+    results = dict(_read_gait_measures(reader, cycles))
+    evaluate_steps = jax.jit(jax.vmap(functools.partial(_evaluate_step, finder, ()), (0, 0, None)))
+    *_, margins = evaluate_steps(rows, cycles.section_state, evaluation_request.step_options)
+    results |= margins
+    if derivatives:
+        names = list(dict.fromkeys(derivative.measure_name for derivative in derivatives))
+        jacobians = np.stack(
+            [
+                finder.measure_gait(row, state, tuple(names)).parameter_jacobian
+                for row, state in zip(rows, cycles.section_state, strict=True)
+            ]
+        )
+        for derivative in derivatives:
+            parameter_index = finder.model.parameter_names.index(derivative.parameter_name)
+            results[derivative.variable_name] = jacobians[
+                :, names.index(derivative.measure_name), parameter_index
+            ]
+    return mask_failed_samples(np.asarray(cycles.outcome), results)
 
 
 PAPER_MEASURES_BY_CONTACT_MEASURE: dict[str, tuple[str, ...]] = {
@@ -604,4 +639,6 @@ def make_scan_engine(
         return ModelSelectionScanEngine(evaluation_request, n_threads)
     if model.batch_kernel == "legs":
         return functools.partial(evaluate_contact_gaits, evaluation_request, n_threads)
+    if model.has_kinks:
+        return functools.partial(evaluate_gaits_with_kinks, evaluation_request)
     return CollocationScanEngine(evaluation_request, n_threads)

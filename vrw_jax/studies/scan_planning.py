@@ -227,7 +227,6 @@ def plan_scan(
             period_n=model.leg_period,
             cycle_options=cycle_options,
             step_options=options,
-            stays_on_mesh=True,
         )
     dtype = np.dtype(jnp.result_type(*jax.tree.leaves(base)))
     options.check_tolerances(dtype)
