@@ -21,6 +21,9 @@ MEAN_FORCE = vrw.measure("mean_rear_force", unit="N", phase="DLS", reduction="me
 IMPULSE = vrw.measure("rear_impulse", unit="N s", phase="DLS", reduction="integral")(rear_force)
 
 
+SPEED = vrw.measure("speed")(lambda step, params: 1.0 / step.duration)
+
+
 @vrw.measure("cost_of_transport", meaning="energy lost per weight and distance")
 def cost_of_transport(step, params):
     lost = step.energy.landing + step.energy.stopper + step.energy.damping
@@ -176,4 +179,29 @@ def test_a_branch_of_a_wheel_has_the_measure_of_each_gait():
 )
 def test_a_wrong_measure_is_refused_in_one_sentence(call, message):
     with pytest.raises((TypeError, ValueError), match=message):
+        call()
+
+
+def test_a_wheel_with_a_motor_has_measures_of_ones_own():
+    """The mean force on the rear foot changes by the torque as a difference of gaits says."""
+    level = vrw.WheelParams(slope=0.0)
+    make_model = lambda torque: vrw.ViscoelasticWheel(hub_torque=torque)
+    evaluate = lambda torque: vrw.limit_cycle(level, model=make_model(torque)).measure(MEAN_FORCE)
+    table = vrw.sensitivities(level, measures=[MEAN_FORCE], model=make_model(47.23))
+    difference = 5.0 * (evaluate(47.33) - evaluate(47.13))  # its error is 1e-5 relative
+    derivative = table.derivative.sel(measure="mean_rear_force", parameter="hub.torque")
+    assert float(derivative) == pytest.approx(float(difference), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: vrw.measure("period")(lambda step, params: step.duration),
+        lambda: vrw.sensitivities(WHEEL, measures=[SPEED]),
+        lambda: vrw.scan(vrw.samples(damping=[150.0]), [SPEED]),
+        lambda: vrw.continue_branch(WHEEL, "damping", (140.0, 150.0), measures=[SPEED]),
+    ],
+)
+def test_a_measure_with_the_name_of_another_is_refused(call):
+    with pytest.raises(ValueError, match="which the library uses"):
         call()

@@ -282,7 +282,7 @@ def test_each_function_of_the_table_takes_a_walker_or_says_that_it_is_for_wheels
             )(0.4),
             "have no derivatives",
         ),
-        (lambda: vrw.limit_cycle({"kick": 1.0}, model=BALL_SYSTEM), "reads the parameter 'ball'"),
+        (lambda: vrw.limit_cycle({"kick": 1.0}, model=BALL_SYSTEM), "of the walker reads 'ball'"),
         (lambda: vrw.walk({"kick": 1.0}, [2.0], 2, model=JuggledBall()), "contains kick: add it"),
         (lambda: vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM).measure("x"), "height"),
     ],

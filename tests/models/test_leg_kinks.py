@@ -202,16 +202,22 @@ def test_legs_in_turn_have_kinks_of_their_own():
         np.testing.assert_allclose(section_state, expected, atol=1e-10)
 
 
-class ShapelessKinks(BumpStop):
-    def kinks(self, L, dL, params):
-        return (jnp.sum(L),)
-
-
-def test_kinks_that_are_no_functions_of_each_leg_are_refused():
+@pytest.mark.parametrize(
+    "kinks",
+    [
+        lambda law, L, dL, params: (jnp.sum(L),),
+        lambda law, L, dL, params: L - 0.9,
+        lambda law, L, dL, params: (L > 0.9,),
+        lambda law, L, dL, params: (L - 0.9,) if L > 0.5 else (),
+    ],
+    ids=["sum", "no tuple", "no real number", "branch"],
+)
+def test_kinks_that_are_no_functions_of_each_leg_are_refused(kinks):
     with pytest.raises(ValueError, match="kinks of leg_force do not act element by element"):
-        make_wheel(ShapelessKinks())
+        make_wheel(type("OddBumpStop", (BumpStop,), {"kinks": kinks})())
 
 
-def test_unilateral_contact_refuses_kinks():
-    with pytest.raises(ValueError, match="a UnilateralWheel does not stop at them"):
-        vrw.UnilateralWheel(leg_force=BumpStop())
+@pytest.mark.parametrize("model_class", [vrw.UnilateralWheel, vrw.LadderWheel])
+def test_unilateral_contact_refuses_kinks(model_class):
+    with pytest.raises(ValueError, match="steps with unilateral contact do not stop there"):
+        model_class(leg_force=BumpStop())

@@ -1,5 +1,7 @@
 """Steps of a wheel with a motor on its hub, against a five-coordinate code."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -89,6 +91,16 @@ def test_the_work_of_a_torque_of_the_angle_is_in_the_energy_of_damping():
     work = integrate(step.section_state[0]) - integrate(step.post_impact[0])
     dissipated = np.trapezoid(walk.damping_power, walk.time)
     assert abs(float(step.energy.damping) - (dissipated - float(work))) < 1e-4
+
+
+def test_a_torque_with_further_arguments_that_have_defaults_depends_on_the_rate():
+    expected = vrw.step(PARAMS, START, model=make_wheel(lambda dtheta, params: 10.0 - dtheta))
+    for torque in (
+        lambda dtheta, params, stall=10.0: stall - dtheta,
+        functools.partial(lambda dtheta, params, stall: stall - dtheta, stall=10.0),
+    ):
+        step = vrw.step(PARAMS, START, model=make_wheel(torque))
+        np.testing.assert_array_equal(step.section_state, expected.section_state)
 
 
 def test_unilateral_contact_refuses_a_torque_of_the_angle():

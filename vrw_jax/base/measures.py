@@ -81,11 +81,28 @@ class Measure:
         return f"{float(np.asarray(measured_value)):.6g} {self.display_unit}".strip()
 
 
-def find_own_measures(measures: Any) -> dict[str, Measure]:
-    """Return the measures of the user among names and measures, by name."""
+USED_NAMES = ("outcome", "period", "section_state", "x")
+"""Names of variables beside the measures in results for any walker."""
+
+
+def find_own_measures(measures: Any, taken_names: Sequence[str] = ()) -> dict[str, Measure]:
+    """Return the measures of the user among names and measures, by name.
+
+    Raise a `ValueError` if the library has a measure with one of the names, the `taken_names`.
+    """
     given = (measures,) if isinstance(measures, Measure) else measures
     given = given if isinstance(given, list | tuple) else ()
-    return {measure.name: measure for measure in given if isinstance(measure, Measure)}
+    own = {measure.name: measure for measure in given if isinstance(measure, Measure)}
+    for name in own:
+        _require_unused_name(name, taken_names)
+    return own
+
+
+def _require_unused_name(name: str, used_names: Sequence[str]) -> None:
+    if name in used_names:
+        raise ValueError(
+            f"a measure of your own has the name {name}, which the library uses: give another name."
+        )
 
 
 def select_measures(measures: Any, known: Sequence[Measure]) -> tuple[Measure, ...]:
@@ -149,6 +166,7 @@ def measure(
         >>> frequency.unit
         '1/s'
     """
+    _require_unused_name(name, USED_NAMES)
     if phase:
         check_choice("reduction", reduction, ("integral", "mean"))
     elif reduction:

@@ -196,8 +196,8 @@ def name_missing_parameters(params: Any) -> Iterator[None]:
         if not isinstance(name, str) or name in names:
             raise
         raise ValueError(
-            f"the walker reads the parameter {name!r}, but params contains {', '.join(names)}: "
-            "add it to params."
+            f"a function of the walker reads {name!r}, but params contains {', '.join(names)}: "
+            "add it to params, or correct the function."
         ) from error
 
 

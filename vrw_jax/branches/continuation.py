@@ -26,7 +26,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure, select_measures
+from vrw_jax.base.measures import Measure, find_own_measures, select_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
@@ -548,6 +548,7 @@ def _check_branches(
     gait_finder = make_finder(
         model, n_legs, period_n=period_n, cycle_options=cycle_options, step_options=step_options
     )
+    find_own_measures(own_measures, tuple(MEASURES))
     has_force_peaks = FORCE_PEAK_MEASURES.keys() <= set(gait_finder.differentiable_measures)
     if check_bool("force_peaks", measures_force_peaks) and not has_force_peaks:
         raise ValueError(
@@ -557,7 +558,8 @@ def _check_branches(
     if own_measures and not gait_finder.supports_cold_start:
         raise ValueError(
             f"{own_measures[0].name} is a measure of your own, but it is known for gaits of the "
-            "paper's model and of your own walkers only: take model=vrw.ViscoelasticWheel()."
+            "paper's model and of your own walkers only: take vrw.ViscoelasticWheel() without "
+            "declared kinks of the legs."
         )
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))

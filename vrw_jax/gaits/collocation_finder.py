@@ -264,6 +264,23 @@ class KinkedGaitFinder(ReturnMapFinder):
     therefore only finds the start of Newton's method on the return map.
     """
 
+    readable_measures: ClassVar[tuple[str, ...]] = tuple(
+        measure_name
+        for measure_name in CollocationFinder.readable_measures
+        if measure_name in ReturnMapFinder.readable_measures or measure_name in MARGIN_MEASURES
+    )
+    differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
+        measure_name
+        for measure_name in readable_measures
+        if measure_name in CollocationFinder.differentiable_measures
+        # Derivatives of multipliers are second derivatives of a step.
+        and measure_name not in ("spectral_radius", "spectral_margin", "stability_margin")
+    )
+    default_measures: ClassVar[tuple[str, ...]] = tuple(
+        measure_name
+        for measure_name in differentiable_measures
+        if measure_name in CollocationFinder.default_measures
+    )
     cycle_options: CycleOptions = eqx.field(static=True, default_factory=CycleOptions)
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:

@@ -293,7 +293,8 @@ class AbstractCycle(AbstractPrintable):
         """Return the value of a measure of the user, which is undefined without a gait."""
         raise ValueError(
             f"{measure.name} is a measure of your own, but it is known for gaits of the paper's "
-            "model and of your own walkers only: take model=vrw.ViscoelasticWheel()."
+            "model and of your own walkers only: take model=vrw.ViscoelasticWheel(), without "
+            "declared kinks of the legs."
         )
 
     @property

@@ -48,7 +48,8 @@ def make_finder(
     if period_n % resolved_model.leg_period:
         raise ValueError(
             f"period_n is {period_n}, but the legs alternate, so that a gait repeats after an even "
-            "number of steps: give period_n=2, or one law for all legs where there is no period_n."
+            "number of steps: give period_n=2 where there is such an argument, or one law for all "
+            "legs."
         )
     kernel = resolved_model.batch_kernel
     finder_class: Any = UnilateralFinder if kernel == "legs" else ReturnMapFinder

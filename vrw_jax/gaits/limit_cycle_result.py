@@ -234,7 +234,7 @@ class LimitCycle(AbstractCycle):
         ]
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@eqx.filter_jit
 def evaluate_own_measure(
     measure: Measure,
     system: CollocationSystem,

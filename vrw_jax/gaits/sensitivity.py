@@ -76,7 +76,11 @@ def sensitivities(
         if measures is None
         else check_names("measures", name_measures(measures))
     )
-    own_measures = find_own_measures(measures) if gait_finder.model.is_wheel else {}
+    own_measures = (
+        find_own_measures(measures, gait_finder.readable_measures)
+        if gait_finder.model.is_wheel
+        else {}
+    )
     unknown_names = sorted(
         set(measure_names) - set(gait_finder.differentiable_measures) - own_measures.keys()
     )

@@ -273,7 +273,8 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         """
         raise ValueError(
             f"force peaks are measured for a {type(self).__name__}, but its steps have no such "
-            "measures: take vrw.UnilateralWheel(), or gaits of vrw.ViscoelasticWheel()."
+            "measures: take vrw.UnilateralWheel(), or gaits of vrw.ViscoelasticWheel() whose legs "
+            "declare no kinks."
         )
 
     @abc.abstractmethod

@@ -62,17 +62,19 @@ FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
 """Meaning of infinite friction: limit of large friction, or rule (A1)-(A4) of the paper."""
 
 
-def _convert_smooth_leg_force(leg_force: Any) -> Any:
+def convert_smooth_leg_force(leg_force: Any) -> Any:
+    """Return a law of the legs as `convert_leg_force` does, or raise an error if it has kinks."""
     leg_force = convert_leg_force(leg_force)
     if count_kinks(leg_force):
         raise ValueError(
-            "leg_force declares kinks, but a UnilateralWheel does not stop at them: give a law "
-            "without the method kinks, or take vrw.ViscoelasticWheel."
+            "leg_force declares kinks, but steps with unilateral contact do not stop there: give a "
+            "law without the method kinks, or take vrw.ViscoelasticWheel."
         )
     return leg_force
 
 
-def _convert_torque_of_rate(hub_torque: Any) -> Any:
+def convert_torque_of_rate(hub_torque: Any) -> Any:
+    """Return a law of the hub, or raise an error if it depends on the angle."""
     hub_torque = convert_hub_torque(hub_torque)
     if takes_angle(hub_torque):
         raise ValueError(
@@ -242,8 +244,8 @@ class UnilateralWheel(AbstractContactWheel):
     stoppers: str = eqx.field(static=True, default=STOPPERS_BILATERAL)
     restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
     infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
-    leg_force: Any = eqx.field(converter=_convert_smooth_leg_force, default=None)
-    hub_torque: Any = eqx.field(converter=_convert_torque_of_rate, default=None)
+    leg_force: Any = eqx.field(converter=convert_smooth_leg_force, default=None)
+    hub_torque: Any = eqx.field(converter=convert_torque_of_rate, default=None)
     uneven: UnevenGround | None = None
 
     if TYPE_CHECKING:

@@ -482,8 +482,15 @@ def _check_walker_on_random_ground(
     walker: AbstractWalker, params: Any, ground_sd: Any, sd_name: str
 ) -> None:
     """Raise an error if the walker can't be simulated on random ground."""
+    if isinstance(params, WheelParams):
+        raise TypeError(
+            "params is a WheelParams, but model is a walker of yours: give the walker's parameters."
+        )
     require_untraced_arguments(
-        "vrw.first_passage", "means of a walker of yours have no derivatives", params, ground_sd
+        "vrw.first_passage",
+        "take differences of its means, which have no derivatives",
+        params,
+        ground_sd,
     )
     property_name = sd_name.removesuffix("_sd")
     if property_name not in walker.ground:
@@ -662,8 +669,8 @@ def _estimate_passage_by_sampling(
     succeeds.
     """
     limit_cycle_result: Any = limit_cycle(params, model=model)
+    kind = "wheel" if model.is_wheel else "walker"
     if int(limit_cycle_result.outcome) != Outcome.STEPPED:
-        kind = "wheel" if model.is_wheel else "walker"
         raise ValueError(
             f"this {kind} has no gait from which a walk could begin: {limit_cycle_result.why} "
             f"Take a {kind} for which vrw.limit_cycle finds a gait."
@@ -685,7 +692,7 @@ def _estimate_passage_by_sampling(
     except ExtinctGroupError as error:
         raise ValueError(
             f"{sd_name} is {ground_sd:g} {SD_UNITS[sd_name]}, with which hardly any step of this "
-            "wheel succeeds: give a smaller one."
+            f"{kind} succeeds: give a smaller one."
         ) from error
     derivative_by_name = {}
     if differentiated_parameter_names:

@@ -380,6 +380,7 @@ def evaluate_gaits_with_kinks(
     finder: Any = make_finder(
         evaluation_request.wheel_model.without_values(),
         evaluation_request.base_wheel.n_legs,
+        period_n=evaluation_request.wheel_model.leg_period,
         cycle_options=evaluation_request.cycle_options,
         step_options=evaluation_request.step_options,
     )
@@ -388,7 +389,7 @@ def evaluate_gaits_with_kinks(
     derivatives = list(filter(None, map(parse_derivative, evaluation_request.measure_names)))
     names = [name for name in evaluation_request.measure_names if parse_derivative(name) is None]
     reader = MeasureReader(finder.measure_reader, (*names, "spectral_radius"))
-    results = dict(_read_gait_measures(reader, cycles))
+    results: dict[str, Any] = dict(_read_gait_measures(reader, cycles))
     evaluate_steps = jax.jit(jax.vmap(functools.partial(_evaluate_step, finder, ()), (0, 0, None)))
     *_, margins = evaluate_steps(rows, cycles.section_state, evaluation_request.step_options)
     results |= margins

@@ -151,7 +151,10 @@ def parse_constraint_margins(
     the smallest allowed value of the negative measure.
     """
     if constraints is None:
-        return dict(default_margins(params)) if gait_finder.supports_cold_start else {}
+        model, readable = gait_finder.model, gait_finder.readable_measures
+        if not model.is_wheel or model.batch_kernel != "phases":
+            return {}
+        return {name: x for name, x in default_margins(params).items() if name in readable}
     constraint_margins = {}
     if isinstance(constraints, Mapping):
         for measure_name, bound_or_range in constraints.items():

@@ -715,7 +715,7 @@ def _parse_objective_function(
         return CycleObjective(operator.methodcaller("measure", objective)), objective.name
     objective = objective.name if isinstance(objective, Measure) else objective
     if callable(objective):
-        if gait_finder.model.is_wheel and not gait_finder.supports_cold_start:
+        if gait_finder.model.is_wheel and gait_finder.model.batch_kernel != "phases":
             raise TypeError(
                 "objective is a function, but with contact it must be a measure's name or "
                 f"weights of several: choose from {', '.join(gait_finder.differentiable_measures)}."

@@ -118,12 +118,12 @@ class SpringDamper(eqx.Module):
 
 def evaluate_kinks(law: Any, L: Elementwise, dL: Elementwise, params: LawParameters) -> tuple:
     """Return the values of the functions that change sign at the kinks of a law of a leg."""
-    return tuple(law.kinks(L, dL, params)) if hasattr(law, "kinks") else ()
+    return tuple(law.kinks(L, dL, params)) if callable(getattr(law, "kinks", None)) else ()
 
 
 def count_kinks(law: Any) -> int:
     """Return the number of kinks that a law of a leg declares."""
-    if not hasattr(law, "kinks"):
+    if not callable(getattr(law, "kinks", None)):
         return 0
     return len(_evaluate_kink_shapes(law, jax.ShapeDtypeStruct((), jnp.result_type(float))))
 
@@ -297,11 +297,16 @@ def number_legs(leg_template: Elementwise) -> np.ndarray:
 
 
 def takes_angle(hub_torque: Any) -> bool:
-    """Return whether a law of the hub is a function of three arguments, the first an angle."""
+    """Return whether a law of the hub requires three arguments, of which the first is an angle."""
     if isinstance(hub_torque, ScaledHubTorque):
         return takes_angle(hub_torque.law)
     function = hub_torque.function if isinstance(hub_torque, FunctionLaw) else hub_torque
-    return callable(function) and len(inspect.signature(function).parameters) == 3
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # a number, or a compiled function without a signature
+        return False
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(x.kind in positional and x.default is x.empty for x in parameters) == 3
 
 
 def evaluate_hub_torque(s: Symbols, dtheta: Elementwise, *sine_cosine: Elementwise) -> Elementwise:
@@ -316,8 +321,8 @@ def evaluate_hub_torque(s: Symbols, dtheta: Elementwise, *sine_cosine: Elementwi
 def _compute_angle(sine: Elementwise, cosine: Elementwise) -> Elementwise:
     """Return an angle between -pi/2 and pi/2, by primitives that have machine code.
 
-    A polynomial for the half angle (Abramowitz and Stegun 4.4.49) has an error of 1e-5. The sine of
-    its difference to the angle corrects it.
+    A polynomial for the half angle (Abramowitz and Stegun 4.4.49) has an error of 1e-5. One step of
+    Newton's method for the sine removes the error.
     """
     ratio = sine / (1.0 + cosine)
     square = ratio * ratio
@@ -448,8 +453,14 @@ def _check_result(law: Any, law_name: str, n_arguments: int) -> None:
                 f"{law_name} returns {result.dtype.name} of shape {result.shape} for arguments of "
                 f"shape {shape}, but it acts element by element: return one real number for each."
             )
-        kinks = _evaluate_kink_shapes(law, lengths)
-        if not all(getattr(kink, "shape", None) == shape for kink in kinks):
+        try:
+            kinks = _evaluate_kink_shapes(law, lengths)
+        except (TypeError, jax.errors.ConcretizationTypeError):
+            kinks = (None,)
+        if not all(
+            getattr(kink, "shape", None) == shape and jnp.issubdtype(kink.dtype, jnp.floating)
+            for kink in kinks
+        ):
             raise ValueError(
                 f"kinks of {law_name} do not act element by element: return a tuple of real "
                 "functions of L, dL and params, which change sign where the force has a kink."
