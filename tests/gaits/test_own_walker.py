@@ -39,6 +39,14 @@ def test_an_element_of_a_batch_without_a_gait_has_a_code_and_the_others_their_ga
     assert "BAD_INPUT" in gaits.why[1]
 
 
+@pytest.mark.parametrize("guess", [None, np.zeros((0, 1))])
+def test_an_empty_batch_has_no_gaits(guess):
+    params = BALL_PARAMS | {"kick": np.zeros(0)}
+    gaits = vrw.limit_cycles(params, model=BALL_SYSTEM, guess=guess)
+    assert gaits.section_state.shape == (0, 1)
+    assert gaits.outcome.shape == (0,)
+
+
 def test_a_batch_has_the_gaits_of_single_searches():
     slopes = np.array([0.009, 0.012])
     gaits = vrw.limit_cycles({"slope": slopes}, model=SIMPLEST_WALKER, guess=[0.2, -0.2])

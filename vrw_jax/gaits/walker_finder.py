@@ -35,7 +35,7 @@ from vrw_jax.base.walker import (
 )
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point_implicit
-from vrw_jax.lanes.batching import map_in_batches
+from vrw_jax.lanes.batching import map_in_batches, select_rows_on_device
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
@@ -142,6 +142,11 @@ def find_walker_gaits(
 
     For a batch, return the gaits, in which an element without a gait has a code.
     """
+    if is_batch and any(np.shape(leaf)[:1] == (0,) for leaf in jax.tree.leaves((params, guess))):
+        fill = lambda x: np.full((1, *np.shape(x)[1:]), np.nan) if np.shape(x)[:1] == (0,) else x
+        params, guess = jax.tree.map(fill, (params, guess))
+        gaits = find_walker_gaits(walker, params, guess, period_n, options, is_batch)
+        return select_rows_on_device(gaits, slice(0, 0))
     params, guesses, options = _check_search(walker, params, guess, period_n, options, is_batch)
     find_gaits = lambda params, guesses: call_compiled_program(
         _find_gaits if is_batch else find_gait_from_guesses,
