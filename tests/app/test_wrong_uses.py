@@ -377,7 +377,7 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "results at a URL": (("scan", "my.toml", "--out", "s3://wheels"), GRID_TABLE, "a URL"),
     "figures at a URL": (("reproduce", "--out", "gs://wheels"), GRID_TABLE, "a URL"),
-    "examples at a URL": (("init", "file:///wheels"), GRID_TABLE, "a URL"),
+    "examples at a URL": (("init", Path("/wheels").as_uri()), GRID_TABLE, "a URL"),
     "a config at a URL": (("gait", "https://wheels.org/my.toml"), GRID_TABLE, "a URL"),
     "results in nobody's home": (
         ("tune", "my.toml", "--out", "~nobody_of_this_name/x"),

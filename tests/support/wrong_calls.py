@@ -999,8 +999,8 @@ def register_wrong_calls() -> None:
     )
     urls = {
         url: (url, "ValueError")
-        for url in ("s3://wheels/scan.zarr", "gs://wheels", "memory://wheels", "file:///wheels",
-                    "simplecache::s3://wheels", Path("s3://wheels/scan.zarr"))
+        for url in ("s3://wheels/scan.zarr", "gs://wheels", "memory://wheels",
+                    Path("/wheels").as_uri(), "simplecache::s3://wheels", Path("s3://wheels/scan.zarr"))
     }  # fmt: skip
     for name, call in {
         "scan into": lambda v: scan(store=v), "open_scan of": vrw.open_scan,
