@@ -2,7 +2,11 @@
 
 from typing import Any
 
-from vrw_jax.base.printing import StatusCode, format_each_batch_element
+from vrw_jax.base.printing import (
+    StatusCode,
+    describe_step_ending,
+    format_each_batch_element,
+)
 
 
 class Outcome(StatusCode):
@@ -60,11 +64,8 @@ def describe_outcomes(outcomes: Any, section: str = "") -> Any:
 
     - `section`: name of the section of a walker of the user, which takes the place of a touchdown.
     """
-
-    def describe(outcome: Any) -> str:
-        sentence = Outcome(int(outcome)).meaning
-        if not section:
-            return sentence
-        return sentence.replace("touchdown", section).replace("The wheel", "The walker")
-
-    return format_each_batch_element(describe, outcomes)
+    sentences = describe_step_ending(outcomes, Outcome)
+    if not section:
+        return sentences
+    name_section = lambda x: x.replace("touchdown", section).replace("The wheel", "The walker")
+    return format_each_batch_element(name_section, sentences)

@@ -15,7 +15,7 @@ then evaluated with unilateral contact.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from threading import Lock
@@ -352,14 +352,25 @@ def _evaluate_contact_block(
             batch_size,
             gait_finder.find_gaits(jnp.asarray(rows), slow_gaits.section_state),
         )
-        for derivative in derivatives:
-            index = model.parameter_names.index(derivative.parameter_name)
-            results[derivative.variable_name] = jacobians[derivative.measure_name][:, index]
+        results |= _select_derivatives(derivatives, jacobians, model.parameter_names)
     # Samples without a gait may have any index.
     gait_indices = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
     outcomes, results = select_tree_rows((slow_gaits.outcome, results), gait_indices)
     outcomes = np.where(has_enough_friction, outcomes, Outcome.NO_CYCLE_FOUND)
     return mask_failed_samples(outcomes, results)
+
+
+def _select_derivatives(
+    derivatives: Sequence[Any], jacobians: Mapping[str, Any], parameter_names: Sequence[str]
+) -> dict[str, Any]:
+    """Return derivatives of measures by the names of their variables.
+
+    - `jacobians`: derivatives of each measure by all parameters, (samples, parameters).
+    """
+    return {
+        x.variable_name: jacobians[x.measure_name][:, parameter_names.index(x.parameter_name)]
+        for x in derivatives
+    }
 
 
 @eqx.filter_jit
@@ -386,13 +397,17 @@ def evaluate_gaits_with_kinks(
     )
     rows = jnp.asarray(evaluation_request.stack_parameter_rows(samples_by_parameter))
     cycles = jax.tree.map(lambda *x: jnp.stack(x), *map(finder.find_cycle_from_values, rows))
-    derivatives = list(filter(None, map(parse_derivative, evaluation_request.measure_names)))
     names = [name for name in evaluation_request.measure_names if parse_derivative(name) is None]
-    reader = MeasureReader(finder.measure_reader, (*names, "spectral_radius"))
-    results: dict[str, Any] = dict(_read_gait_measures(reader, cycles))
-    evaluate_steps = jax.jit(jax.vmap(functools.partial(_evaluate_step, finder, ()), (0, 0, None)))
-    *_, margins = evaluate_steps(rows, cycles.section_state, evaluation_request.step_options)
-    results |= margins
+    reader = MeasureReader(
+        finder.measure_reader, (*dict.fromkeys((*names, "spectral_radius", *MARGIN_MEASURES)),)
+    )
+    results = map_in_batches(
+        functools.partial(_read_gaits_with_kinks, finder, reader),
+        (batch_sizes.GAIT_READ_BATCH_SIZE,),
+        rows,
+        cycles,
+    )
+    derivatives = list(filter(None, map(parse_derivative, evaluation_request.measure_names)))
     if derivatives:
         names = list(dict.fromkeys(derivative.measure_name for derivative in derivatives))
         jacobians = np.stack(
@@ -401,12 +416,21 @@ def evaluate_gaits_with_kinks(
                 for row, state in zip(rows, cycles.section_state, strict=True)
             ]
         )
-        for derivative in derivatives:
-            parameter_index = finder.model.parameter_names.index(derivative.parameter_name)
-            results[derivative.variable_name] = jacobians[
-                :, names.index(derivative.measure_name), parameter_index
-            ]
+        jacobians_by_name = dict(zip(names, np.moveaxis(jacobians, 1, 0), strict=True))
+        results |= _select_derivatives(derivatives, jacobians_by_name, finder.model.parameter_names)
     return mask_failed_samples(np.asarray(cycles.outcome), results)
+
+
+@eqx.filter_jit
+def _read_gaits_with_kinks(
+    finder: Any, reader: MeasureReader, rows: Array, cycles: ReturnMapCycle
+) -> dict[str, Array]:
+    def read(row: Array, cycle: ReturnMapCycle) -> dict[str, Array]:
+        model, params = finder.model.from_parameter_values(row, finder.n_legs)
+        step = model.take_step_of_gait(params, cycle.section_state, finder.step_options)
+        return reader(cycle, step)
+
+    return eqx.filter_vmap(read)(rows, cycles)
 
 
 PAPER_MEASURES_BY_CONTACT_MEASURE: dict[str, tuple[str, ...]] = {

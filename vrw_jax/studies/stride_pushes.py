@@ -577,9 +577,11 @@ def _sample_wheel_stride(gait: StableGait, n_samples: int) -> _Stride:
     )
 
 
-@eqx.filter_jit
-def _differentiate_each(finish: Callable[[Array], Array], states: Array) -> Array:
+def _differentiate_by_states(finish: Callable[[Array], Array], states: Array) -> Array:
     return jax.vmap(lambda y: evaluate_with_jacobian(finish, y)[1])(states)
+
+
+_differentiate_each = eqx.filter_jit(_differentiate_by_states)
 
 
 @eqx.filter_jit
@@ -592,7 +594,7 @@ def _differentiate_rest(
         rest = compile_finish(system)(params, y, mode, options)
         return jnp.append(rest.section_state, rest.duration)
 
-    return jax.vmap(lambda y: evaluate_with_jacobian(finish, y)[1])(states)
+    return _differentiate_by_states(finish, states)
 
 
 def _sample_hybrid_stride(
