@@ -11,6 +11,7 @@ from reference_code import five_coordinates
 from reference_code import five_coordinates_equations as equations
 from reference_code.constrained_wheel import Wheel, run_phase
 from support.slow_variants import mark_slow
+from support.walkers import RIMLESS_WHEEL, SPOKE_HALF_ANGLE
 
 import vrw_jax as vrw
 from vrw_jax.studies.basins import compute_share_error
@@ -57,7 +58,7 @@ def test_an_own_walker_gets_one_sentence_on_what_is_missing():
     walker, cycle = SquaredOffset(), functools.partial(vrw.limit_cycle, {"gait": 0.0}, guess=[0.1])
     with pytest.raises(ValueError, match="it must contain all of offset: give each"):
         vrw.basin_share({"gait": 0.0}, {"x": (0.0, 1.0)}, model=walker, cycle=cycle(model=walker))
-    with pytest.raises(TypeError, match=r"SquaredOffset.*equations of the wheel"):
+    with pytest.raises(ValueError, match="SquaredOffset cannot begin within a step"):
         vrw.smallest_disturbance({"gait": 0.0}, model=walker, cycle=cycle(model=walker))
     with pytest.raises(ValueError, match="guess"):
         vrw.basin_share({"gait": 0.0}, {"offset": (0.0, 1.0)}, model=walker)
@@ -145,6 +146,24 @@ def test_the_smallest_disturbance_of_the_rigid_wheel_is_its_closed_form():
     exact = last - critical_rate(-HALF_ANGLE) / np.cos(2.0 * HALF_ANGLE)
     assert abs(result.backward_sizes[-1] / exact - 1.0) < 1e-5
     assert np.isinf(result.forward_sizes).all()
+
+
+def test_the_smallest_disturbance_of_an_own_walker_is_its_closed_form():
+    params = {"slope": 0.2}
+    gait = vrw.limit_cycle(params, model=RIMLESS_WHEEL)
+    find = functools.partial(vrw.smallest_disturbance, params, model=RIMLESS_WHEEL, cycle=gait)
+    result = find(coordinate="rate")
+    # The wheel has to reach the vertical, for which it needs the least energy just after an impact.
+    potential = GRAVITY * (1.0 - np.cos(0.2 - SPOKE_HALF_ANGLE))
+    exact = float(gait.section_state[0]) - np.sqrt(2.0 * potential)
+    assert abs(result.size - exact) < max(result.size_error, 1e-9)
+    assert result.size_error < 1e-7
+    assert (result.time, result.direction) == (0.0, -1)
+    assert f"smallest decrease of rate: {exact:.6g} rad/s" in repr(result)
+    with pytest.raises(ValueError, match="name one of angle, rate"):
+        find()
+    with pytest.raises(ValueError, match="angle"):
+        find(coordinate="speed")
 
 
 def finish_by_five_coordinates(params, phase, state):
@@ -318,7 +337,7 @@ def test_shares_with_unilateral_contact_are_plain_counts():
 
 def test_a_cycle_of_another_wheel_is_one_sentence():
     cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
-    with pytest.raises(ValueError, match="give a cycle of the same wheel and model"):
+    with pytest.raises(ValueError, match="give a cycle of the same parameters and model"):
         vrw.basin_share(TABLE_1, BOX, cycle=cycle)
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.slow_variants import mark_slow
+from support.walkers import BALL_PARAMS, GRAVITY, JuggledBall
 
 import vrw_jax as vrw
 from vrw_jax.gaits import compute_sensitivity_norms, make_finder, slope_response
@@ -121,6 +122,25 @@ def test_gradients_are_central_differences():
     gradient, h = float(jax.jit(jax.grad(norm))(180.0)), 0.05
     outer, inner = (float(norm(180.0 + k * h) - norm(180.0 - k * h)) / (2 * k * h) for k in (2, 1))
     assert abs(gradient / ((4.0 * inner - outer) / 3.0) - 1.0) < 1e-6
+
+
+@pytest.mark.parametrize("ground", ["slope", "height"])
+def test_norms_of_an_own_walker_are_those_of_a_geometric_series(ground):
+    """A kick e to one bounce changes the periods by 2 e / g times 1, r, r^2, ...
+
+    If the kick is the difference of two heights, the next bounce has the opposite kick.
+    """
+    walker = type("Ball", (JuggledBall,), {"ground": {ground: "kick"}})()
+    result = vrw.gait_sensitivity(BALL_PARAMS, "period", model=walker)
+    r, unit = BALL_PARAMS["ball"]["restitution"], 2.0 / GRAVITY
+    next_step = r if ground == "slope" else r - 1.0
+    later = abs(next_step) * r / np.sqrt(1.0 - r**2)
+    np.testing.assert_allclose(result.ending_step, [unit], rtol=1e-12)
+    np.testing.assert_allclose(result.beginning_step, [unit * next_step], rtol=1e-12)
+    np.testing.assert_allclose(result.later_steps, [unit * later], rtol=1e-12)
+    norm = unit * np.sqrt(1.0 + next_step**2 + later**2)
+    np.testing.assert_allclose(result.norm, [norm], rtol=1e-12)
+    assert ("s per rad" if ground == "slope" else "s per m") in repr(result)
 
 
 NORM_NAMES = ["gait_sensitivity_period", "gait_sensitivity_speed"]

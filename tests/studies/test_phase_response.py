@@ -3,10 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.walkers import SIMPLEST_WALKER
+from support.walkers import RIMLESS_WHEEL, SIMPLEST_WALKER
 
 import vrw_jax as vrw
-from vrw_jax.hybrid import Guard, HybridSystem, Mode
 
 TIGHT = vrw.StepOptions.tight()
 N_STEPS = 40  # after which the pushed walkers are on their gaits up to round-off
@@ -51,27 +50,9 @@ def test_a_pushed_wheel_lands_as_much_earlier_as_its_response_says(wheel_respons
 
 def test_a_push_along_the_flow_is_a_shift_in_time_on_both_sides_of_an_impact():
     """A rimless wheel whose speed follows from its energy, pushed at all instants of a step."""
-    alpha = np.pi / 8
-    wheel = HybridSystem(
-        modes={
-            "stance": Mode(
-                lambda y, p: jnp.stack([y[1], 9.81 * jnp.sin(y[0])]),
-                {
-                    "touchdown": Guard(
-                        lambda y, p: p["slope"] + alpha - y[0],
-                        lambda y, p: jnp.stack([p["slope"] - alpha, y[1] * np.cos(2 * alpha)]),
-                    )
-                },
-            )
-        },
-        section="touchdown",
-        state=("angle", "rate"),
-        project=lambda y, p: y[1:],
-        embed=lambda x, p: jnp.stack([p["slope"] - alpha, x[0]]),
-    )
     params = {"slope": 0.2}
-    gait = vrw.limit_cycle(params, model=wheel, guess=[1.5], options=TIGHT)
-    response = vrw.phase_response(params, model=wheel, cycle=gait, n_samples=5)
+    gait = vrw.limit_cycle(params, model=RIMLESS_WHEEL, options=TIGHT)
+    response = vrw.phase_response(params, model=RIMLESS_WHEEL, cycle=gait, n_samples=5)
     angle, rate = response.states.T
     flow = np.stack([rate, 9.81 * np.sin(angle)], 1)
     np.testing.assert_allclose(np.sum(response.delay * flow, 1), -1.0, atol=1e-9)

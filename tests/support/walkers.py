@@ -1,6 +1,7 @@
 """Walkers as users write them, for tests of several packages."""
 
 import jax.numpy as jnp
+import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, HybridSystem, Mode
@@ -44,6 +45,29 @@ SIMPLEST_WALKER = HybridSystem(
 """Simplest walking model of Garcia, Chatterjee, Ruina and Coleman (1998)."""
 
 GRAVITY = 9.81
+SPOKE_HALF_ANGLE = np.pi / 8
+RIMLESS_WHEEL = HybridSystem(
+    modes={
+        "stance": Mode(
+            lambda y, p: jnp.stack([y[1], GRAVITY * jnp.sin(y[0])]),
+            {
+                "touchdown": Guard(
+                    lambda y, p: p["slope"] + SPOKE_HALF_ANGLE - y[0],
+                    lambda y, p: jnp.stack(
+                        [p["slope"] - SPOKE_HALF_ANGLE, y[1] * np.cos(2.0 * SPOKE_HALF_ANGLE)]
+                    ),
+                )
+            },
+        )
+    },
+    section="touchdown",
+    state={"angle": "rad", "rate": "rad/s"},
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([p["slope"] - SPOKE_HALF_ANGLE, x[0]]),
+    starts=lambda p: jnp.array([1.5]),
+)
+"""Point mass on rigid spokes of 1 m, whose speed follows from its energy."""
+
 BALL_PARAMS = {"ball": {"restitution": 0.5}, "kick": 1.0}
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -165,6 +165,8 @@ class HybridSystem(AbstractWalker):
     ground: Mapping[str, str] = dataclasses.field(default_factory=dict)
     max_events: int = MAX_EVENTS_PER_STEP
 
+    can_start_within_gait_step: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_type("modes", self.modes, Mapping, "give a dictionary of Modes by name")
         check_int("max_events", self.max_events)
@@ -236,6 +238,11 @@ class HybridSystem(AbstractWalker):
     def guard_names(self) -> tuple[str, ...]:
         """Return the names of the guards of all modes, in the order of `HybridStep.events`."""
         return tuple(name for mode in self.modes.values() for name in mode.guards)
+
+    @property
+    def state_units(self) -> dict[str, str]:
+        """Return the units of the coordinates of the state by name, if they are given."""
+        return dict(self.state) if isinstance(self.state, Mapping) else {}
 
     @property
     def _start_modes(self) -> set[str]:

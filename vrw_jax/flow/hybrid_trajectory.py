@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -63,7 +63,7 @@ def sample_walk_of_system(
         time += float(end_times[-1])
     times, states, steps, modes = zip(*pieces, strict=True)
     repeat = lambda values: np.repeat(values, n_samples)
-    units = dict(system.state) if isinstance(system.state, Mapping) else {}
+    units = system.state_units
     columns = dict(zip(system.state, np.concatenate(states).T, strict=True))
     flags = {"flag_values": list(range(len(mode_names))), "flag_meanings": " ".join(mode_names)}
     return xr.Dataset(

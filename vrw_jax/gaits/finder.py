@@ -22,7 +22,13 @@ from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.slope_response import SlopeResponse, compute_step_slope_response
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.models.measures import FORCE_PEAK_MEASURES, get_measure
+from vrw_jax.models.measures import (
+    FORCE_PEAK_MEASURES,
+    MARGIN_MEASURES,
+    STEP_MEASURES,
+    UNILATERAL_STEP_MEASURES,
+    get_measure,
+)
 from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.wheel.params import WheelParams
 
@@ -280,6 +286,17 @@ class AbstractGaitFinder(eqx.Module):
         return compute_gait_measures(
             self.find_gait(parameter_values, start_state), self.measure_reader, measure_names
         )
+
+    @property
+    def step_measures(self) -> tuple[str, ...]:
+        """Return the names of the measures of a step that have derivatives."""
+        known = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
+        return tuple(name for name in self.differentiable_measures if name in known)
+
+    @property
+    def disturbance_unit(self) -> str:
+        """Return the unit of the ground's deviations in `compute_slope_response`."""
+        return "rad"
 
     def compute_slope_response(
         self, params: WheelParams, cycle: Any, measure_names: Sequence[str]

@@ -2,12 +2,14 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.base import batch_sizes
@@ -15,7 +17,11 @@ from vrw_jax.base.checks import check_int, check_reals, has_traced_leaf, require
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import ParameterDomain, list_tree_parameters
+from vrw_jax.base.parameters import (
+    ParameterDomain,
+    list_tree_parameters,
+    replace_tree_parameter,
+)
 from vrw_jax.base.printing import (
     format_each_batch_element,
     format_heading_and_rows,
@@ -35,6 +41,8 @@ from vrw_jax.base.walker import (
 )
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point_implicit
+from vrw_jax.gaits.slope_response import SlopeResponse
+from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_batches, select_rows_on_device
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
@@ -102,6 +110,11 @@ class HybridGait(NamedTuple):
     def spectral_radius(self) -> Any:
         """Return the largest modulus of a multiplier, which is below 1 for stable gaits."""
         return jnp.abs(self.multipliers[..., 0])
+
+    @property
+    def spectral_radius_value(self) -> Any:
+        """Return the spectral radius without derivatives."""
+        return lax.stop_gradient(self.spectral_radius)
 
     def measure(self, measure: str | Measure) -> Any:
         """Return the period, or one of the walker's measures, by its name or itself."""
@@ -346,6 +359,42 @@ class WalkerFinder(AbstractGaitFinder):
     def measure_step(self, params: Any, start: Any, step: Any) -> dict[str, Array]:
         x = getattr(start, "section_state", start)
         return self.model.walker.measure_step(params, jnp.asarray(x), step, self.step_options)
+
+    @property
+    def step_measures(self) -> tuple[str, ...]:
+        return ("period", *(measure.name for measure in self.model.walker.measures))
+
+    @property
+    def disturbance_unit(self) -> str:
+        return "rad" if "slope" in self.model.walker.ground else "m"
+
+    def compute_slope_response(
+        self, params: Any, cycle: HybridGait, measure_names: Sequence[str]
+    ) -> SlopeResponse:
+        walker, x = self.model.walker, cycle.section_state
+        ground_parameter = walker.ground.get("slope", walker.ground.get("height"))
+        if ground_parameter is None:
+            raise ValueError(
+                "the walker does not declare where the ground enters: give it "
+                'ground={"slope": "slope"} or {"height": "rise"}, with the name of its parameter.'
+            )
+
+        def take_step(start_and_ground: Array) -> Array:
+            start, ground = start_and_ground[:-1], start_and_ground[-1]
+            step_params = replace_tree_parameter(params, ground_parameter, ground)
+            step = compile_step(walker)(step_params, start, self.step_options)
+            measures = {"period": step.duration} | self.measure_step(step_params, start, step)
+            values = [jnp.ravel(measures[name]) for name in measure_names]
+            return jnp.concatenate([step.section_state, *values])
+
+        ground = jnp.asarray(self.model.get_parameter(params, ground_parameter), x.dtype)
+        _, jacobian = evaluate_with_jacobian(take_step, jnp.append(x, ground))
+        # A slope belongs to one step. A height ends one step and begins the next.
+        by_next = jacobian[:, -1:]
+        by_last = jnp.zeros_like(by_next) if "slope" in walker.ground else -by_next
+        return SlopeResponse.from_jacobian(
+            jnp.concatenate([jacobian[:, :-1], by_last, by_next], 1), len(x)
+        )
 
     def find_cycle(self, params: Any, cycle_guess: Any = None) -> HybridGait:  # type: ignore[override]
         guesses = self.model.walker.starts(params) if cycle_guess is None else cycle_guess  # type: ignore[misc]

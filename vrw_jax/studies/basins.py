@@ -332,7 +332,7 @@ class StableGait(NamedTuple):
         require_untraced_arguments(
             caller_name, "map vrw.walk over the starts", params, options, cycle
         )
-        is_own = is_own_walker(model) and not changes_within_step
+        is_own = is_own_walker(model)
         if is_own:
             params = check_parameters(params)
         else:
@@ -341,8 +341,8 @@ class StableGait(NamedTuple):
         if changes_within_step and not model.can_start_within_gait_step:
             raise ValueError(
                 f"{type(model).__name__} cannot begin within a step, so that {changes_within_step} "
-                "within a step are not available: take ViscoelasticWheel() or RigidWheel(), or "
-                "disturb starts by vrw.basin_share."
+                "within a step are not available: take ViscoelasticWheel(), RigidWheel() or a "
+                "HybridSystem, or disturb starts by vrw.basin_share."
             )
         options = convert_step_options(options)
         options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
@@ -353,10 +353,12 @@ class StableGait(NamedTuple):
         check_type("cycle", cycle, cycle_type, "give vrw.limit_cycle(params, model=...)")
         if int(cycle.outcome) != Outcome.STEPPED:
             raise ValueError(
-                f"this wheel has no gait that could have a basin: {cycle.why} Take a wheel for "
-                "which vrw.limit_cycle finds a gait."
+                f"there is no gait that could have a basin: {cycle.why} Take parameters for which "
+                "vrw.limit_cycle finds a gait."
             )
-        spectral_radius = float(cycle.spectral_radius if is_own else cycle.spectral_radius_value)
+        spectral_radius = float(cycle.spectral_radius_value)
+        if is_own and model.invariants:  # Each has a multiplier of 1, which round-off may reduce.
+            spectral_radius = max(spectral_radius, 1.0)
         period_n = getattr(cycle, "period_n", 1)
         if changes_within_step and period_n > 1:
             raise ValueError(
@@ -366,7 +368,7 @@ class StableGait(NamedTuple):
         if not spectral_radius < 1.0:
             raise ValueError(
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable "
-                "and has no basin: take a wheel whose gait has a spectral radius below 1."
+                "and has no basin: take parameters whose gait has a spectral radius below 1."
             )
         section_states = [np.asarray(cycle.section_state)[None]]
         for k in range(period_n):
@@ -377,7 +379,7 @@ class StableGait(NamedTuple):
         if not stable_gait.is_on_gait(section_states[-1])[0]:
             raise ValueError(
                 f"cycle does not repeat after {period_n} step{'s' * (period_n > 1)} with "
-                f"{type(model).__name__}: give a cycle of the same wheel and model."
+                f"{type(model).__name__}: give a cycle of the same parameters and model."
             )
         return stable_gait
 

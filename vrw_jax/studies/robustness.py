@@ -21,11 +21,13 @@ from vrw_jax.base.checks import (
     require_known_name,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
+from vrw_jax.base.walker import is_own_walker
 from vrw_jax.branches.branch import Branch
 from vrw_jax.gaits.finder import AbstractGaitFinder
 from vrw_jax.gaits.finder_selection import UserCycleGuess, resolve_finder
@@ -33,13 +35,7 @@ from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.slope_response import compute_sensitivity_norms
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.measures import (
-    MARGIN_MEASURES,
-    MEASURES,
-    STEP_MEASURES,
-    UNILATERAL_STEP_MEASURES,
-    make_measure_attributes,
-)
+from vrw_jax.models.measures import MEASURES, make_measure_attributes
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.studies.basins import StableGait, StartBox, compute_basin_share, parse_start_box
@@ -55,6 +51,8 @@ class GaitSensitivity(AbstractPrintable):
     The norm is infinite if the gait is not stable. A line of the ground joins two footholds. The
     squares of `ending_step`, `beginning_step` and `later_steps` sum to the square of the norm.
 
+    For a walker of yours, a line is the slope of a step, or the height of a foothold in m.
+
     - `norm`: norms in the order of `measures`;
     - `ending_step`: signed response of the step that ends on a line to the slope of that line;
     - `beginning_step`: signed response of the step that begins on a line to the slope of that line;
@@ -63,7 +61,9 @@ class GaitSensitivity(AbstractPrintable):
     - `spectral_radius`: spectral radius of the gait's return map;
     - `outcome`: Outcome.STEPPED, or the reason why there is no gait; without a gait, all other
       numbers are zero;
-    - `measures`: names of the measures.
+    - `measures`: names of the measures;
+    - `described_measures`, `disturbance_unit`: unit and meaning of each measure, and the unit of
+      the disturbance.
 
     Examples:
         >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period"]))
@@ -79,6 +79,8 @@ class GaitSensitivity(AbstractPrintable):
     spectral_radius: Scalar
     outcome: Int[Array, ""]
     measures: tuple[str, ...] = eqx.field(static=True)
+    described_measures: tuple[Measure, ...] = eqx.field(static=True)
+    disturbance_unit: str = eqx.field(static=True)
 
     @property
     def ending(self) -> str:
@@ -96,9 +98,9 @@ class GaitSensitivity(AbstractPrintable):
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
         share_text_rows = []
-        for measure_index, measure_name in enumerate(self.measures):
-            measure_definition = MEASURES[measure_name]
-            sensitivity_unit = f"{measure_definition.display_unit} per rad".strip()
+        for measure_index, measure_definition in enumerate(self.described_measures):
+            unit = measure_definition.display_unit
+            sensitivity_unit = f"{unit} per {self.disturbance_unit}".strip()
             norm_parts_text = (
                 "step that ends on the disturbed line: "
                 f"{float(self.ending_step[measure_index]):.6g}, "
@@ -119,7 +121,7 @@ class GaitSensitivity(AbstractPrintable):
 
 @announce_wait("the gait and its response to slopes", "15 s")
 def gait_sensitivity(
-    params: WheelParams,
+    params: Any,
     measures: str | Sequence[str],
     *,
     model: ModelLike | None = None,
@@ -138,9 +140,14 @@ def gait_sensitivity(
     derivatives of a gait step, whose compilation takes minutes. With unilateral contact, norms have
     no derivatives.
 
+    A walker of yours declares by `ground` which of its parameters is the slope of a step or the
+    rise of a foothold, see `AbstractWalker`. If it declares no slope, heights of the footholds are
+    independent.
+
     Args:
-        params: parameters of the wheel; the slope is the mean slope.
-        measures: names of measures of a gait step, such as "period", "speed" or a margin.
+        params: parameters of the wheel, or of a walker of yours; the slope is the mean slope.
+        measures: names of measures of a gait step, such as "period", "speed" or a margin. For a
+            walker of yours, "period" and its own measures.
         model: model of the wheel; by default the paper's, `ViscoelasticWheel()`.
         guess: as in `limit_cycle`.
         options: as in `limit_cycle`.
@@ -149,7 +156,7 @@ def gait_sensitivity(
         A `GaitSensitivity`: the norm of each measure, and its parts.
 
     Raises:
-        TypeError, ValueError: if an argument is invalid or the wheel has no gait.
+        TypeError, ValueError: if an argument is invalid or there is no gait.
 
     Examples:
         >>> print(vrw.gait_sensitivity(vrw.WheelParams(), ["period", "speed"]).norm.round(3))
@@ -158,8 +165,9 @@ def gait_sensitivity(
         >>> print(f"{jax.grad(norm)(vrw.WheelParams()).damping:.5f} s/rad per N s/m")
         0.01431 s/rad per N s/m
     """
-    model = resolve_model(params, model)
-    cycle_finder = resolve_finder(params, model, options)
+    if not is_own_walker(model):
+        model = resolve_model(params, model)
+    cycle_finder = resolve_finder(params, model, options, guess=guess)
     measure_names = parse_sensitivity_measures(cycle_finder, measures)
     limit_cycle_result: Any = limit_cycle(params, guess=guess, model=model, options=options)
     if (
@@ -167,8 +175,8 @@ def gait_sensitivity(
         and int(limit_cycle_result.outcome) != Outcome.STEPPED
     ):
         raise ValueError(
-            "this wheel has no gait whose sensitivity could be computed: "
-            f"{limit_cycle_result.why} Take a wheel for which vrw.limit_cycle finds a gait."
+            f"there is no gait whose sensitivity could be computed: {limit_cycle_result.why} Take "
+            "parameters for which vrw.limit_cycle finds a gait."
         )
     return compute_gait_sensitivity(cycle_finder, params, limit_cycle_result, measure_names)
 
@@ -178,24 +186,18 @@ def parse_sensitivity_measures(
 ) -> tuple[str, ...]:
     """Return the names of measures of a gait step; raise an error for names of other kinds."""
     measure_names = check_names("measures", measures)
-    step_measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES
-    known_measure_names = tuple(
-        measure_name
-        for measure_name in cycle_finder.differentiable_measures
-        if measure_name in step_measures
-    )
+    known_names = cycle_finder.step_measures
     for measure_name in measure_names or ("nothing",):
-        require_known_name(
-            measure_name,
-            known_measure_names,
-            f"measure of a step of {cycle_finder.model.model_name} wheels",
-        )
+        kind = f"measure of a step of {cycle_finder.model.model_name} wheels"
+        if not cycle_finder.model.is_wheel:
+            kind = "measure of a step of this walker"
+        require_known_name(measure_name, known_names, kind)
     return measure_names
 
 
 def compute_gait_sensitivity(
     cycle_finder: AbstractGaitFinder,
-    params: WheelParams,
+    params: Any,
     limit_cycle_result: Any,
     measure_names: tuple[str, ...],
 ) -> GaitSensitivity:
@@ -215,6 +217,8 @@ def compute_gait_sensitivity(
         spectral_radius=zero_without_gait(limit_cycle_result.spectral_radius_value),
         outcome=limit_cycle_result.outcome,
         measures=measure_names,
+        described_measures=tuple(map(cycle_finder.get_measure, measure_names)),
+        disturbance_unit=cycle_finder.disturbance_unit,
     )
 
 

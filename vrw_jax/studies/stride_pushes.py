@@ -3,11 +3,10 @@
 A small push changes the time until the next section and the section state there. Both changes are
 exact across events. The later steps follow from the return map, so that the asymptotic change of
 the phase is the product of an adjoint vector with the changes at the section. The smallest
-disturbance that takes a wheel out of the basin of its gait is found by search.
+disturbance that takes a walker out of the basin of its gait is found by search.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,44 +16,43 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.base import batch_sizes
-from vrw_jax.base.checks import check_int, check_positive, check_type
+from vrw_jax.base.checks import check_int, check_positive, check_type, require_known_name
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText
+from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.flow.hybrid_system import HybridSystem, compile_finish
+from vrw_jax.base.walker import AdvanceResult, compile_step
+from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem, compile_finish
 from vrw_jax.flow.phase_integration import sample_phase
-from vrw_jax.gaits.gait_search import limit_cycle
-from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
-from vrw_jax.lanes.batching import concatenate_tree_rows, map_in_batches, select_tree_rows
+from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.models.stepping import ModelLike
 from vrw_jax.studies.basins import StableGait, walk_until_on_gait
 
 DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
-"""Signs of the change of the angular velocity in backward and forward disturbances, in this order.
-"""
-DISTURBED_PHASE_NAMES = ("DLS", "SLS-I", "SLS-II")
-ANGULAR_VELOCITY_INDEX = 3
-"""Index of the angular velocity dtheta in a state (theta, L1, L2, dtheta, dL1, dL2)."""
+"""Signs of the change in backward and forward disturbances, in this order."""
+WHEEL_PHASE_NAMES = ("DLS", "SLS-I", "SLS-II")
+WHEEL_COORDINATES = ("theta", "L1", "L2", "dtheta", "dL1", "dL2")
 
 
 class SmallestDisturbance(AbstractPrintable):
-    """Smallest change of the angular velocity within a step that takes the state out of the basin.
+    """Smallest change of a coordinate within a step that takes the state out of the basin.
 
-    - `size`: smallest change, rad/s; infinite if no change up to `max_size` suffices;
-    - `size_error`: error estimate of `size`, rad/s;
-    - `direction`: 1 if the change makes the wheel faster, -1 if slower;
-    - `time`: instant of the disturbance after the landing, s;
-    - `phase_index`: phase of that instant, 0, 1, 2 for DLS, SLS-I, SLS-II;
+    For the wheel, the coordinate is the angular velocity, and sizes are in rad/s.
+
+    - `size`: smallest change; infinite if no change up to `max_size` suffices;
+    - `size_error`: error estimate of `size`;
+    - `direction`: 1 if the change increases the coordinate, -1 if it decreases it;
+    - `time`: instant of the disturbance after the start of the step, s;
+    - `phase_index`: index of the phase or mode of that instant in `phase_names`;
     - `outcome`: Outcome that ends the walk after a slightly larger disturbance; STEPPED if the walk
       continues, but not on this gait;
-    - `profile_times`: instants of the profile of sizes, after the landing, s, shape (instants,);
+    - `profile_times`: instants of the profile of sizes, s, shape (instants,);
     - `profile_phase_indices`: index of the phase at each instant of the profile, shape (instants,);
     - `backward_sizes`, `forward_sizes`: smallest sufficient change in each direction at each
-      instant of the profile, rad/s, shape (instants,);
-    - `max_size`: largest change that the search tried, rad/s.
+      instant of the profile, shape (instants,);
+    - `max_size`: largest change that the search tried;
+    - `coordinate`, `unit`: name and unit of the coordinate.
 
     Examples:
         >>> result = vrw.smallest_disturbance(vrw.WheelParams())
@@ -73,6 +71,9 @@ class SmallestDisturbance(AbstractPrintable):
     backward_sizes: Float[np.ndarray, " instants"]
     forward_sizes: Float[np.ndarray, " instants"]
     max_size: float
+    phase_names: tuple[str, ...] = eqx.field(static=True, default=WHEEL_PHASE_NAMES)
+    coordinate: str = eqx.field(static=True, default="dtheta")
+    unit: str = eqx.field(static=True, default="rad/s")
 
     @property
     def ending(self) -> str:
@@ -80,20 +81,20 @@ class SmallestDisturbance(AbstractPrintable):
         if not np.isfinite(self.size):
             return "No disturbance of the tried sizes leaves the basin."
         if self.outcome == Outcome.STEPPED:
-            return "The wheel walks on, but not on this gait."
+            return "The walker walks on, but not on this gait."
         return Outcome(int(self.outcome)).meaning
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for size, direction, instant and outcome."""
         if not np.isfinite(self.size):
-            return [("largest tried size", f"{self.max_size:.6g} rad/s"), ("ending", self.ending)]
-        direction_text = "faster" if self.direction > 0 else "slower"
+            max_size = format_quantity(self.max_size, self.unit)
+            return [("largest tried size", max_size), ("ending", self.ending)]
+        change = "increase" if self.direction > 0 else "decrease"
+        size_text = f"{format_quantity(self.size, self.unit)} (error {self.size_error:.1g})"
+        phase_name = self.phase_names[self.phase_index]
         return [
-            ("size", f"{self.size:.6g} rad/s {direction_text} (error {self.size_error:.1g})"),
-            (
-                "instant",
-                f"{self.time:.6g} s after the landing, {DISTURBED_PHASE_NAMES[self.phase_index]}",
-            ),
+            (f"smallest {change} of {self.coordinate}", size_text),
+            ("instant", f"{self.time:.6g} s after the start of the step, {phase_name}"),
             ("ending", self.ending),
         ]
 
@@ -107,38 +108,43 @@ def smallest_disturbance(
     options: StepOptions | None = None,
     max_size: float | None = None,
     max_steps: int = 200,
+    coordinate: str | None = None,
 ) -> SmallestDisturbance:
-    """Return the smallest disturbance within a step that takes the wheel out of its gait's basin.
+    """Return the smallest disturbance within a step that takes a walker out of its gait's basin.
 
-    A disturbance is a sudden change of the angular velocity dtheta at one instant of the gait's
-    step. The instant lies between a landing and the next landing. The size of the disturbance is
-    the modulus of the change, rad/s. Positions do not change. In double support the two feet stay
-    on the ground, so that dtheta determines the rates of the legs. In single support the rates of
-    the legs do not change. The disturbed state is outside the basin if the walk from it does not
-    arrive at the gait (see `basin_share`). With the paper's model, a departure from the sequence of
-    phases, which need not be a fall, ends the walk.
+    A disturbance of the wheel is a sudden change of the angular velocity dtheta at one instant of
+    the gait's step. The instant lies between a landing and the next landing. The size of the
+    disturbance is the modulus of the change, rad/s. Positions do not change. In double support the
+    two feet stay on the ground, so that dtheta determines the rates of the legs. In single support
+    the rates of the legs do not change. For a `HybridSystem`, name the `coordinate` of its state
+    that changes, and no other coordinate changes.
 
-    The search considers 17 instants of each phase, and forward and backward disturbances. A grid of
+    The disturbed state is outside the basin if the walk from it does not arrive at the gait (see
+    `basin_share`). With the paper's model, a departure from the sequence of phases, which need not
+    be a fall, ends the walk.
+
+    The search considers 17 instants of each phase, and changes in both directions. A grid of
     sizes brackets the smallest sufficient size, and bisection in batches refines the bracket. Later
     passes refine the instants around the smallest size of each phase and direction. `size_error` is
     the sum of the width of the last bracket and the difference between sizes at neighboring
     instants of the last pass.
 
     Args:
-        params: parameters of the wheel.
-        model: model of the wheel: `ViscoelasticWheel()`, the paper's and the default, or
-            `RigidWheel()`.
+        params: parameters of the wheel, or of a `HybridSystem`.
+        model: `ViscoelasticWheel()`, the paper's wheel and the default, `RigidWheel()`, or a
+            `HybridSystem`.
         cycle: a gait of one step; by default the result of `limit_cycle`.
         options: numerical options of the gait steps.
-        max_size: largest change that the search tries, rad/s; by default twice the largest angular
-            velocity of the gait.
+        max_size: largest change that the search tries; by default twice the largest modulus of the
+            coordinate in the gait.
         max_steps: largest number of gait steps of a walk after the disturbance.
+        coordinate: for a `HybridSystem`, name of the coordinate that changes.
 
     Returns:
         A `SmallestDisturbance`: its size, its instant, and the outcome that it causes.
 
     Raises:
-        TypeError, ValueError: if an argument is invalid, or if the wheel has no stable gait.
+        TypeError, ValueError: if an argument is invalid, or if there is no stable gait.
 
     Examples:
         >>> result = vrw.smallest_disturbance(vrw.WheelParams(damping=150.0))
@@ -150,17 +156,37 @@ def smallest_disturbance(
         "vrw.smallest_disturbance", params, model, cycle, options, "disturbances"
     )
     max_size = None if max_size is None else check_positive("max_size", max_size)
-    return compute_smallest_disturbance(stable_gait, max_size, max_steps)
+    names = tuple(stable_gait.model.state) if _is_system(stable_gait) else ("dtheta",)
+    if coordinate is None and len(names) > 1:
+        raise ValueError(
+            f"coordinate is None, but the disturbance changes one coordinate of the state: name "
+            f"one of {', '.join(names)}."
+        )
+    coordinate = names[0] if coordinate is None else coordinate
+    require_known_name(coordinate, names, "coordinate")
+    return compute_smallest_disturbance(stable_gait, max_size, max_steps, coordinate)
+
+
+def _is_system(gait: StableGait) -> bool:
+    return isinstance(gait.model, HybridSystem)
+
+
+class _SampledStride(NamedTuple):
+    """States of a gait at instants of the phases of its step."""
+
+    phase_indices: np.ndarray  # phase or mode of each interval between events, (intervals,)
+    times: np.ndarray  # after the start of the step, s, (intervals, samples)
+    states: np.ndarray  # (intervals, samples, dim)
+    foot_distance: Array | None  # of a wheel, between the feet in double support, m
 
 
 class _DisturbedGait(NamedTuple):
     """Gait of one step, sampled within the step, and the limits of the search."""
 
     stable_gait: StableGait
-    sample_times: np.ndarray  # after the landing, s, (phase, sample)
-    sampled_states: np.ndarray  # (theta, L1, L2) and their rates, (phase, sample, 6)
-    foot_distance: Array  # between the feet in double support, m
-    max_size: float  # largest tried change, rad/s
+    stride: _SampledStride
+    coordinate_index: int  # of the coordinate that changes
+    max_size: float  # largest tried change
     max_steps: int  # largest number of gait steps after the disturbance
 
 
@@ -169,7 +195,7 @@ class _DirectedInstants(NamedTuple):
     (instants,).
     """
 
-    phase_indices: np.ndarray
+    interval_indices: np.ndarray
     sample_indices: np.ndarray
     disturbance_signs: np.ndarray
 
@@ -180,13 +206,13 @@ class _ExitSizeBrackets(NamedTuple):
     Each array has the shape (instants,).
     """
 
-    lower_disturbance_sizes: np.ndarray  # rad/s
-    upper_disturbance_sizes: np.ndarray  # rad/s, infinite if no tried size leaves the basin
+    lower_disturbance_sizes: np.ndarray
+    upper_disturbance_sizes: np.ndarray  # infinite if no tried size leaves the basin
     exit_outcomes: np.ndarray  # `Outcome` after a disturbance of the upper size
 
     @property
     def middle_disturbance_sizes(self) -> np.ndarray:
-        """Return the middle of each bracket, rad/s, shape (instants,)."""
+        """Return the middle of each bracket, shape (instants,)."""
         return 0.5 * (self.lower_disturbance_sizes + self.upper_disturbance_sizes)
 
 
@@ -205,31 +231,24 @@ EARLY_DISTURBANCE_TOLERANCE = 1e-5
 
 
 def compute_smallest_disturbance(
-    stable_gait: StableGait, max_size: float | None, max_steps: int
+    stable_gait: StableGait, max_size: float | None, max_steps: int, coordinate: str = "dtheta"
 ) -> SmallestDisturbance:
     """Return the `SmallestDisturbance` for a gait of one step and for checked arguments.
 
     Each pass of the search considers instants that are closer to each other than in the pass
     before.
     """
-    params, model, step_options, section_states = stable_gait
+    system = stable_gait.model if _is_system(stable_gait) else None
     n_phase_samples = N_INTERVALS_PER_PASS * SAMPLE_STRIDES[0] + 1  # both ends included
-    start_state = jnp.asarray(section_states[0])
-    trajectory = model.sample_step(params, start_state, step_options, n_phase_samples)
-    sampled_states = np.asarray(trajectory.state)
+    stride = _sample_stride(stable_gait, n_phase_samples)
+    coordinates = tuple(system.state) if system else WHEEL_COORDINATES
+    index = coordinates.index(coordinate)
     if max_size is None:
-        max_size = 2.0 * float(sampled_states[..., ANGULAR_VELOCITY_INDEX].max())
-    gait = _DisturbedGait(
-        stable_gait,
-        np.asarray(trajectory.time),
-        sampled_states,
-        jnp.asarray(model.take_step(params, start_state, step_options).step_length),
-        max_size,
-        max_steps,
-    )
-    occurring_phases = np.flatnonzero(np.asarray(trajectory.durations) > 0.0)
+        max_size = 2.0 * float(np.abs(stride.states[..., index]).max())
+    gait = _DisturbedGait(stable_gait, stride, index, max_size, max_steps)
     # Each pass considers a window of samples for each phase and direction.
-    n_windows = len(occurring_phases) * len(DISTURBANCE_SIGNS)
+    intervals = np.arange(len(stride.times))
+    n_windows = len(intervals) * len(DISTURBANCE_SIGNS)
     window_centers = np.full(n_windows, n_phase_samples // 2)
     half_intervals = N_INTERVALS_PER_PASS // 2
     first_pass_result = None
@@ -238,9 +257,9 @@ def compute_smallest_disturbance(
         n_instants = len(sample_offsets)
         window_samples = np.clip(window_centers[:, None] + sample_offsets, 0, n_phase_samples - 1)
         instants = _DirectedInstants(
-            np.repeat(occurring_phases, len(DISTURBANCE_SIGNS) * n_instants),
+            np.repeat(intervals, len(DISTURBANCE_SIGNS) * n_instants),
             window_samples.ravel(),
-            np.tile(np.repeat(DISTURBANCE_SIGNS, n_instants), len(occurring_phases)),
+            np.tile(np.repeat(DISTURBANCE_SIGNS, n_instants), len(intervals)),
         )
         is_last_pass = sample_stride == SAMPLE_STRIDES[-1]
         brackets = _bracket_exit_sizes(
@@ -255,7 +274,7 @@ def compute_smallest_disturbance(
     best_instant = int(exit_sizes.argmin())
     window_index, instant_index = divmod(best_instant, n_instants)
     size = float(exit_sizes[window_index, instant_index])
-    phase_index = int(instants.phase_indices[best_instant])
+    best_interval = instants.interval_indices[best_instant]
     sample_index = instants.sample_indices[best_instant]
     size_error = 0.0
     if np.isfinite(size):
@@ -270,22 +289,23 @@ def compute_smallest_disturbance(
             size_error += float(np.max(neighbor_sizes[np.isfinite(neighbor_sizes)]) - size)
     profile_instants, profile_brackets = first_pass_result
     is_backward = profile_instants.disturbance_signs < 0.0
-    profile_phase_indices = profile_instants.phase_indices[is_backward]
+    profile_intervals = profile_instants.interval_indices[is_backward]
     profile_sizes = profile_brackets.middle_disturbance_sizes
     return SmallestDisturbance(
         size=size,
         size_error=size_error,
         direction=int(instants.disturbance_signs[best_instant]),
-        time=float(gait.sample_times[phase_index, sample_index]),
-        phase_index=phase_index,
+        time=float(stride.times[best_interval, sample_index]),
+        phase_index=int(stride.phase_indices[best_interval]),
         outcome=np.asarray(brackets.exit_outcomes[best_instant]),
-        profile_times=gait.sample_times[
-            profile_phase_indices, profile_instants.sample_indices[is_backward]
-        ],
-        profile_phase_indices=profile_phase_indices,
+        profile_times=stride.times[profile_intervals, profile_instants.sample_indices[is_backward]],
+        profile_phase_indices=stride.phase_indices[profile_intervals],
         backward_sizes=profile_sizes[is_backward],
         forward_sizes=profile_sizes[~is_backward],
         max_size=max_size,
+        phase_names=tuple(system.modes) if system else WHEEL_PHASE_NAMES,
+        coordinate=coordinate,
+        unit=system.state_units.get(coordinate, "") if system else "rad/s",
     )
 
 
@@ -336,15 +356,14 @@ def _walk_after_disturbance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each walk after a disturbance misses the gait, and the `Outcome` of the walk.
 
-    The two arrays have the shape of `disturbance_sizes`, (instants, sizes). The unit of the sizes
-    is rad/s.
+    The two arrays have the shape of `disturbance_sizes`, (instants, sizes).
     """
-    stable_gait, n_sizes = gait.stable_gait, disturbance_sizes.shape[1]
-    phase_indices = np.repeat(instants.phase_indices, n_sizes)
+    stable_gait, stride, n_sizes = gait.stable_gait, gait.stride, disturbance_sizes.shape[1]
+    phase_indices = np.repeat(stride.phase_indices[instants.interval_indices], n_sizes)
     disturbed_states = np.repeat(
-        gait.sampled_states[instants.phase_indices, instants.sample_indices], n_sizes, 0
+        stride.states[instants.interval_indices, instants.sample_indices], n_sizes, 0
     )
-    disturbed_states[:, ANGULAR_VELOCITY_INDEX] += (
+    disturbed_states[:, gait.coordinate_index] += (
         instants.disturbance_signs[:, None] * disturbance_sizes
     ).ravel()
     walk_outcomes = np.empty(len(phase_indices), int)
@@ -352,7 +371,7 @@ def _walk_after_disturbance(
     for phase_index in np.unique(phase_indices):
         is_in_phase = phase_indices == phase_index
         finish_disturbed_batch = functools.partial(
-            _finish_disturbed_steps, stable_gait, int(phase_index), gait.foot_distance
+            _finish_steps, stable_gait, _key_phase(stable_gait, phase_index), stride.foot_distance
         )
         step_results: Any = map_in_batches(
             finish_disturbed_batch,
@@ -372,21 +391,39 @@ def _walk_after_disturbance(
     return leaves_basin.reshape(shape), walk_outcomes.reshape(shape)
 
 
-@eqx.filter_jit
-def _finish_disturbed_steps(
-    stable_gait: StableGait, phase_index: int, foot_distance: Array, phase_states: Array
-) -> AdvanceResult:
-    """Return the results of gait steps that begin at `phase_states`, within the phase
-    `phase_index`.
+def _key_phase(gait: StableGait, phase_index: Any) -> Any:
+    """Return the index of a phase: an array if one program serves all phases."""
+    return jnp.asarray(phase_index, jnp.int32) if _is_system(gait) else int(phase_index)
 
-    - `phase_states`: states (theta, L1, L2) and their rates after the disturbance, shape (states,
-      6).
-    """
-    params, model, options, _ = stable_gait
-    finish_step = lambda phase_state: model.finish_step(
-        params, phase_index, foot_distance, phase_state, options
-    )
-    return jax.vmap(finish_step)(phase_states)
+
+def _finish_step(
+    gait: StableGait, phase_index: Any, foot_distance: Array | None, y: Array
+) -> AdvanceResult | HybridStep:
+    """Return the rest of a step from a state within the phase or mode `phase_index`."""
+    params, model, options, _ = gait
+    if _is_system(gait):
+        return compile_finish(model)(params, y, phase_index, options)
+    return model.finish_step(params, phase_index, foot_distance, y, options)
+
+
+@eqx.filter_jit
+def _finish_steps(
+    gait: StableGait, phase_index: Any, foot_distance: Array | None, states: Array
+) -> AdvanceResult | HybridStep:
+    return jax.vmap(functools.partial(_finish_step, gait, phase_index, foot_distance))(states)
+
+
+@eqx.filter_jit
+def _differentiate_rest(
+    gait: StableGait, phase_index: Any, foot_distance: Array | None, states: Array
+) -> Array:
+    """Return the derivatives of (section state, remaining duration) by each state."""
+
+    def finish(y: Array) -> Array:
+        rest = _finish_step(gait, phase_index, foot_distance, y)
+        return jnp.append(rest.section_state, rest.duration)
+
+    return jax.vmap(lambda y: evaluate_with_jacobian(finish, y)[1])(states)
 
 
 class PhaseResponse(AbstractPrintable):
@@ -439,25 +476,6 @@ class PhaseResponse(AbstractPrintable):
         return rows
 
 
-class _Phase(NamedTuple):
-    """Samples of one phase of a stride, and the map from each instant to the section."""
-
-    times: np.ndarray
-    phase_indices: np.ndarray
-    states: np.ndarray
-    # Jacobian of (section state, remaining duration) by the state, (instants, n + 1, dim)
-    remaining_jacobians: np.ndarray
-
-
-class _Stride(NamedTuple):
-    """Sampled stride of a gait, and its return map."""
-
-    phases: list[_Phase]
-    return_map_jacobian: np.ndarray
-    measure_jacobians: dict[str, np.ndarray]  # derivatives of measures by the section state
-    period: float
-
-
 @announce_wait("steps and their derivatives", "30 s")
 def phase_response(
     params: Any,
@@ -498,140 +516,86 @@ def phase_response(
     n_samples, n_steps = check_int("n_samples", n_samples, 2), check_int("n_steps", n_steps)
     options = StepOptions.tight() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
-    if isinstance(model, HybridSystem):
-        cycle = limit_cycle(params, model=model) if cycle is None else cycle
-        check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
-        coordinates = tuple(model.state)
-        stride = _sample_hybrid_stride(model, params, cycle.section_state, n_samples, options)
-    else:
-        gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options, "pushes")
-        coordinates = ("theta", "L1", "L2", "dtheta", "dL1", "dL2")
-        stride = _sample_wheel_stride(gait, n_samples)
-    jacobian, samples = stride.return_map_jacobian, concatenate_tree_rows(*stride.phases)
-    if not np.max(np.abs(np.linalg.eigvals(jacobian))) < 1.0:
-        raise ValueError(
-            "the gait is unstable, so that a pushed walker does not return to it: give a stable "
-            "gait of one step."
-        )
-    # The adjoint vector: derivative of the sum of all later durations by the section state.
-    adjoint = np.linalg.solve(
-        (np.eye(len(jacobian)) - jacobian).T, stride.measure_jacobians["period"]
+    gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options, "pushes")
+    coordinates = tuple(gait.model.state) if _is_system(gait) else WHEEL_COORDINATES
+    stride = _sample_stride(gait, n_samples)
+    remaining_jacobians = np.concatenate(
+        [
+            _differentiate_rest(
+                gait, _key_phase(gait, index), stride.foot_distance, jnp.asarray(states)
+            )
+            for index, states in zip(stride.phase_indices, stride.states, strict=True)
+        ]
     )
-    by_section, by_time = np.split(samples.remaining_jacobians, [len(jacobian)], 1)
+    period, jacobian, measure_jacobians = _differentiate_stride(gait)
+    # The adjoint vector: derivative of the sum of all later durations by the section state.
+    adjoint = np.linalg.solve((np.eye(len(jacobian)) - jacobian).T, measure_jacobians["period"])
+    by_section, by_time = np.split(remaining_jacobians, [len(jacobian)], 1)
     delay = by_time[:, 0] + np.einsum("j,ijd->id", adjoint, by_section)
     section_changes = [by_section]
     for _ in range(n_steps - 1):
         section_changes.append(jacobian @ section_changes[-1])
     changes = np.stack(section_changes)
     return PhaseResponse(
-        samples.times,
-        samples.phase_indices,
-        samples.states,
-        -delay / stride.period,
-        stride.period,
+        stride.times.ravel(),
+        np.repeat(stride.phase_indices, n_samples),
+        np.concatenate(stride.states),
+        -delay / period,
+        period,
         np.swapaxes(changes, 2, 3),
         {
             name: np.einsum("j,kijd->kid", gradient, changes)
-            for name, gradient in stride.measure_jacobians.items()
+            for name, gradient in measure_jacobians.items()
         },
         coordinates,
     )
 
 
-def _sample_wheel_stride(gait: StableGait, n_samples: int) -> _Stride:
+def _differentiate_stride(gait: StableGait) -> tuple[float, np.ndarray, dict[str, np.ndarray]]:
+    """Return the period, and the derivatives of the return map and of measures."""
     params, model, options, section_states = gait
-    x = jnp.asarray(section_states[0])
-    trajectory = model.sample_step(params, x, options, n_samples)
 
     def measure(x: Array) -> tuple[Array, dict[str, Array]]:
+        if _is_system(gait):
+            step = compile_step(model)(params, x, options)
+            return step.section_state, {"period": step.duration}
         result = model.advance(params, x, options)
         length, period = model.compute_foot_distance(params, x), jnp.sum(result.durations)
         names = ("duration_dls", "duration_sls1", "duration_sls2")
         measures = {"period": period, "step_length": length, "speed": length / period}
         return result.section_state, measures | dict(zip(names, result.durations, strict=True))
 
-    (_, measures), (return_map_jacobian, measure_jacobians) = evaluate_with_jacobian(measure, x)
-    foot_distance = measures["step_length"]
-    phases: list[_Phase] = []
-    durations = np.asarray(trajectory.durations)
-    for index in np.flatnonzero(durations > 0.0).tolist():
+    x = jnp.asarray(section_states[0])
+    (_, measures), jacobians = evaluate_with_jacobian(measure, x)
+    return float(measures["period"]), *jax.tree.map(np.asarray, jacobians)
 
-        def finish(index: int, y: Array) -> Array:
-            result = model.finish_step(params, index, foot_distance, y, options)
-            return jnp.append(result.section_state, jnp.sum(result.durations))
 
-        states = jnp.asarray(trajectory.state[index])
-        phases.append(
-            _Phase(
-                np.asarray(trajectory.time[index]),
-                np.full(n_samples, index),
-                np.asarray(states),
-                np.asarray(_differentiate_each(functools.partial(finish, index), states)),
-            )
+def _sample_stride(gait: StableGait, n_samples: int) -> _SampledStride:
+    """Return samples of each phase that takes time in the step of a gait, both ends included."""
+    params, model, options, section_states = gait
+    x = jnp.asarray(section_states[0])
+    if not _is_system(gait):
+        trajectory = model.sample_step(params, x, options, n_samples)
+        phase_indices = np.flatnonzero(np.asarray(trajectory.durations) > 0.0)
+        return _SampledStride(
+            phase_indices,
+            np.asarray(trajectory.time)[phase_indices],
+            np.asarray(trajectory.state)[phase_indices],
+            model.compute_foot_distance(params, x),
         )
-    return _Stride(
-        phases,
-        np.asarray(return_map_jacobian),
-        jax.tree.map(np.asarray, measure_jacobians),
-        float(measures["period"]),
-    )
-
-
-def _differentiate_by_states(finish: Callable[[Array], Array], states: Array) -> Array:
-    return jax.vmap(lambda y: evaluate_with_jacobian(finish, y)[1])(states)
-
-
-_differentiate_each = eqx.filter_jit(_differentiate_by_states)
-
-
-@eqx.filter_jit
-def _differentiate_rest(
-    system: HybridSystem, params: Any, states: Array, mode: Array, options: StepOptions
-) -> Array:
-    """Return the derivatives of the end of a step by states in a mode, the same code for each."""
-
-    def finish(y: Array) -> Array:
-        rest = compile_finish(system)(params, y, mode, options)
-        return jnp.append(rest.section_state, rest.duration)
-
-    return _differentiate_by_states(finish, states)
-
-
-def _sample_hybrid_stride(
-    system: HybridSystem, params: Any, x: Array, n_samples: int, options: StepOptions
-) -> _Stride:
-
-    def advance(x: Array) -> tuple[Array, Array]:
-        step = system.step(params, x, options)
-        return step.section_state, step.duration
-
-    step = system.step(params, x, options)
-    jacobian, period_gradient = evaluate_with_jacobian(advance, x)[1]
-    start, n_events = system.embed(x, params), int(step.n_events)
-    simulation = system.simulate(params, start, events=n_events, options=options)
+    start, n_events = model.embed(x, params), int(model.step(params, x, options).n_events)
+    simulation = model.simulate(params, start, events=n_events, options=options)
     starts, durations = simulation.find_phases(start)
     times = np.concatenate([[0.0], np.asarray(simulation.times)])
-    phases: list[_Phase] = []
-    mode_names = tuple(system.modes)
-    for event in range(n_events):
-        mode = simulation.modes[event]
-        if not durations[event] > 0.0:
-            continue
-        vector_field: Any = system.modes[mode_names[int(mode)]].field
-        field = functools.partial(lambda field, y: field(y, params), vector_field)
-        states = sample_phase(field, starts[event], durations[event], n_samples, options)
-
-        phases.append(
-            _Phase(
-                np.linspace(times[event], times[event + 1], n_samples),
-                np.full(n_samples, int(mode)),
-                np.asarray(states),
-                np.asarray(_differentiate_rest(system, params, states, mode, options)),
-            )
-        )
-    return _Stride(
-        phases,
-        np.asarray(jacobian),
-        {"period": np.asarray(period_gradient)},
-        float(step.duration),
+    intervals = np.flatnonzero(np.asarray(durations) > 0.0)
+    modes, states = tuple(model.modes.values()), []
+    for i in intervals:
+        field: Any = modes[int(simulation.modes[i])].field
+        move = functools.partial(lambda field, y: field(y, params), field)
+        states.append(sample_phase(move, starts[i], durations[i], n_samples, options))
+    return _SampledStride(
+        np.asarray(simulation.modes)[intervals],
+        np.stack([np.linspace(times[i], times[i + 1], n_samples) for i in intervals]),
+        np.stack(states),
+        None,
     )
