@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support import walkers
 from support.machine_code import CodeRegistrySpy
 from support.walkers import SIMPLEST_WALKER
 
@@ -230,6 +231,15 @@ def test_other_values_of_parameters_compile_nothing(monkeypatch):
     BALL.step_batch({"gravity": 1.62, "restitution": 0.7}, 2.0 * np.ones((5, 1)))
     make_ball().step_batch({"gravity": 3.7, "restitution": 0.7}, 2.0 * np.ones((5, 1)))
     assert (spy.n_traces, spy.names) == (n_traces, names)
+
+
+@pytest.mark.filterwarnings("error")  # XLA would compute what has no machine code
+def test_a_simulation_of_many_events_is_machine_code():
+    simulation = walkers.BALL_SYSTEM.simulate(walkers.BALL_PARAMS, [0.0, 2.0], events=100)
+    assert int(simulation.n_events) == 100
+    flights = np.arange(1, 101) * 4.0 / walkers.GRAVITY
+    np.testing.assert_allclose(simulation.times, flights, rtol=1e-12)
+    np.testing.assert_allclose(simulation.states_after, np.tile([0.0, 2.0], (100, 1)), atol=1e-12)
 
 
 def test_a_step_that_never_reaches_the_section_has_a_code_and_finite_numbers():

@@ -495,7 +495,6 @@ def simulate_modes(
     def record_event(
         log: list[Array], n_events: Array, has_event: Array, event: Event
     ) -> list[Array]:
-        event_index = jnp.minimum(n_events, events - 1)
         time_errors = lax.switch(
             event.mode,
             [functools.partial(estimate_time_errors, mode_index=i) for i in range(len(modes))],
@@ -507,10 +506,11 @@ def simulate_modes(
             *event[2:],
         )
 
+        is_entry = has_event & (jnp.arange(events) == n_events)
+
         def write(record: Array, entry: Array) -> Array:
-            previous = lax.dynamic_index_in_dim(record, event_index, keepdims=False)
-            entry = jnp.where(has_event, entry, previous).astype(record.dtype)
-            return lax.dynamic_update_index_in_dim(record, entry, event_index, 0)
+            is_written = is_entry if record.ndim == 1 else is_entry[:, None]
+            return jnp.where(is_written, entry, record).astype(record.dtype)
 
         return list(map(write, log, entries))
 
