@@ -1,5 +1,7 @@
 """Branches of gaits of a user's own walker, against values of its paper and of closed forms."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -203,6 +205,30 @@ def test_an_oscillator_touches_its_stop_at_the_amplitude_of_the_linear_equation(
     assert abs(touch.value - amplitude) < 1e-12
     distance = branch.dataset["distance to the stop"].values
     np.testing.assert_allclose(distance, 1.0 - branch.values / amplitude, atol=1e-9)
+
+
+def test_the_curve_on_which_an_oscillator_touches_its_stop_is_that_of_the_linear_equation():
+    """At a point on the curve, the amplitude of the motion is 1 for every rate."""
+    oscillator, params = make_oscillator(has_stop=False), {"A": 0.3, "w": 0.7}
+    gait = vrw.limit_cycle(params, model=oscillator, guess=[0.3, 0.0], options=TIGHT)
+    follow = functools.partial(
+        vrw.continue_special_point,
+        "distance to the stop",
+        cycle=gait,
+        model=oscillator,
+        params=params,
+        margins={"distance to the stop": lambda y, p: 1.0 - y[0]},
+    )
+    curve = follow(parameters=("A", "w"), bounds={"A": (0.1, 1.0), "w": (0.6, 0.95)})
+    amplitude, rate = curve.values.T
+    np.testing.assert_allclose(amplitude, np.hypot(1.0 - rate**2, 0.1 * rate), atol=1e-9)
+    assert np.ptp(rate) == pytest.approx(0.35, abs=1e-9)  # all of the range
+    with pytest.raises(ValueError, match="bounds has no 'w'"):
+        follow(parameters=("A", "w"), bounds={"A": (0.1, 1.0)})
+    with pytest.raises(ValueError, match="two different ones"):
+        follow(parameters=("A", "A"), bounds={"A": (0.1, 1.0)})
+    with pytest.raises(ValueError, match=r"no special point 'distance to the stop'.*none"):
+        follow(parameters=("A", "w"), bounds={"A": (0.25, 0.35), "w": (0.69, 0.71)})
 
 
 def test_the_sequence_of_events_changes_where_a_second_leg_touches():

@@ -7,19 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.walkers import Henon
 
 import vrw_jax as vrw
 from experiments.gaits.both_sides import judge_curve
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationStatus
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.curve_problems import (
-    FOLD_MARGIN_OFFSET,
     AbstractCurveProblem,
     TwoParameterStep,
 )
 from vrw_jax.branches.map_branch import MapContinuation
 from vrw_jax.branches.special_point_curves import _check_parameter_plane, continue_special_points
-from vrw_jax.gaits.floquet import list_jury_margins
 
 CURVE_OPTIONS = ArclengthOptions(max_points=400, max_ds=0.05)
 
@@ -71,47 +70,21 @@ def test_a_closed_curve_is_continued_until_it_closes():
     assert 2.0 * np.pi < np.ptp(angle) < 2.2 * np.pi
 
 
-def evaluate_henon(x, p):
-    """x -> 1 - a x^2 + y, y -> b x over p = (a, b)."""
-    return jnp.stack([1.0 - p[0] * x[0] ** 2 + x[1], p[1] * x[0]])
-
-
-def find_fixed_point(a, b):
-    x = ((b - 1.0) + np.sqrt((1.0 - b) ** 2 + 4.0 * a)) / (2.0 * a)
-    return [x, b * x]
-
-
-def compute_jury_margin(place):
-    offset = FOLD_MARGIN_OFFSET if place == 0 else 0.0
-    return lambda jacobian, x, p: list_jury_margins(jacobian)[place] - offset
-
-
-def test_period_doublings_of_henon_are_on_their_parabola():
-    b = 0.3
-    a = 0.75 * (1.0 - b) ** 2
-    ends = (0.05, 3.5), (-1.4, 0.6)
-    first, second, strand = trace_curve(
-        evaluate_henon, compute_jury_margin(1), find_fixed_point(a, b), a, *ends, b
+@pytest.mark.parametrize(("name", "factor"), [("period_doubling", 0.75), ("fold", -0.25)])
+def test_bifurcations_of_henon_are_on_their_parabolas(name, factor):
+    params = {"a": 0.2, "b": 0.3}
+    curve = vrw.continue_special_point(
+        name,
+        ("a", "b"),
+        vrw.limit_cycle(params, model=Henon(), guess=[0.7, 0.2]),
+        model=Henon(),
+        params=params,
+        bounds={"a": (-1.0, 3.5), "b": (-1.4, 0.6)},
     )
-    np.testing.assert_allclose(first, 0.75 * (1.0 - second) ** 2, atol=1e-9)
-    assert np.ptp(second) > 1.0
-    # At b = -1 both multipliers are -1: a pair on the circle meets the border there.
-    (meeting,) = [
-        border for border in strand.special_points if border.name == "neimark_sacker"
-    ] or [None]
-    assert meeting is None or abs(meeting.value - 3.0) < 1e-6
-
-
-def test_folds_of_henon_are_on_their_parabola():
-    b = 0.3
-    a = -0.25 * (1.0 - b) ** 2
-    start = [(b - 1.0) / (2.0 * a), b * (b - 1.0) / (2.0 * a)]
-    ends = (-1.0, -0.02), (-0.9, 0.6)
-    first, second, _ = trace_curve(
-        evaluate_henon, compute_jury_margin(0), start, a + 1e-9, *ends, b
-    )
-    np.testing.assert_allclose(first, -0.25 * (1.0 - second) ** 2, atol=1e-9)
-    assert np.ptp(second) > 1.0
+    a, b = curve.values.T
+    np.testing.assert_allclose(a, factor * (1.0 - b) ** 2, atol=1e-9)
+    assert np.ptp(b) > 1.0
+    assert curve.dataset.x.shape == (len(a), 2)
 
 
 CURVE_PARAMETERS = ("damping", "stiffness")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from support.walkers import BALL_PARAMS, BALL_SYSTEM, GRAVITY, SIMPLEST_WALKER, JuggledBall
+from support.walkers import BALL_PARAMS, BALL_SYSTEM, GRAVITY, SIMPLEST_WALKER, Henon, JuggledBall
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode
@@ -227,6 +227,14 @@ CALLS = {
         (0.9, 1.1),
         model=BALL_SYSTEM,
         cycle=vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM),
+    ),
+    "vrw.continue_special_point": lambda: vrw.continue_special_point(
+        "period_doubling",
+        ("a", "b"),
+        vrw.limit_cycle({"a": 0.2, "b": 0.3}, model=Henon(), guess=[0.7, 0.2]),
+        model=Henon(),
+        params={"a": 0.2, "b": 0.3},
+        bounds={"a": (-1.0, 3.5), "b": (-1.4, 0.6)},
     ),
     "vrw.phase_response": lambda: vrw.phase_response(
         BALL_PARAMS,

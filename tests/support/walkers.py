@@ -108,3 +108,12 @@ BALL_SYSTEM = HybridSystem(
     measures=(flight_height,),
 )
 """Ball that a racket kicks: v' = e v + k, so that a gait has v = k / (1 - e)."""
+
+
+class Henon(vrw.AbstractWalker):
+    """x -> 1 - a x^2 + y, y -> b x."""
+
+    def advance(self, params, x, options):
+        x, y = x
+        end = jnp.stack([1.0 - params["a"] * x**2 + y, params["b"] * x])
+        return vrw.AdvanceResult(end, jnp.ones(1))

@@ -80,11 +80,12 @@ def _linearize_map(
         image, jacobians = evaluate_with_jacobian(evaluate, z[:n_continuous], p)
         by_z, by_p = (jacobian[:n_continuous] for jacobian in jacobians)
         defect = image - z
-        right_sides = jnp.stack([defect[:n_continuous], by_p], -1)
-        correction, tangent = jnp.linalg.solve(jnp.eye(n_continuous) - by_z, right_sides).T
+        right_sides = jnp.column_stack([defect[:n_continuous], by_p])
+        solutions = jnp.linalg.solve(jnp.eye(n_continuous) - by_z, right_sides).T
+        tangents = jnp.pad(solutions[1:], ((0, 0), (0, len(codes))))
         return NewtonStep(
-            jnp.concatenate([correction, defect[n_continuous:]]),
-            jnp.concatenate([tangent, 0.0 * codes]),
+            jnp.concatenate([solutions[0], defect[n_continuous:]]),
+            tangents if p.ndim else tangents[0],
             by_z,
         )
 
@@ -119,7 +120,7 @@ class MapProblem(AbstractContinuationProblem):
     """Continuation problem for the fixed points of a map x -> `function(args, x, p)`.
 
     JAX differentiates the map in forward mode. The map returns NaN where it is undefined. The
-    unknowns are x in the given units.
+    unknowns are x in the given units. If p is a vector, there is a tangent for each entry.
     """
 
     function: Callable[[Any, Array, Array], Array]

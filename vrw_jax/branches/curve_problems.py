@@ -53,6 +53,11 @@ class TwoParameterStep(NamedTuple):
     test_gradient: np.ndarray  # total derivatives by both parameters, (points, 2)
 
 
+# Finite difference of the section state and of the relative parameters, for derivatives of
+# quantities that an event-driven step determines.
+RELATIVE_DIFFERENCE_STEP = 1e-6
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AbstractCurveProblem(AbstractContinuationProblem):
     """Continuation problem for the curve on which a test function of two parameters is zero.
@@ -94,6 +99,55 @@ class AbstractCurveProblem(AbstractContinuationProblem):
         # The fraction adds a multiplier of zero, which has no effect.
         jacobian = np.pad(step.return_map_jacobian, ((0, 0), (0, 1), (0, 1)))
         return NewtonStep(correction, tangent, jacobian)
+
+    def gait_state(self, z: np.ndarray) -> np.ndarray:
+        """Return the section state of gaits, with which the unknowns z begin."""
+        return z
+
+    def measure_quantities(self, args: Any, z: np.ndarray, p: np.ndarray) -> np.ndarray:
+        """Return the quantities of gaits that `differentiate_quantities` differentiates.
+
+        - `z`, `p`: unknowns of the gaits, and both parameters, shape (points, 2).
+        """
+        raise NotImplementedError
+
+    def differentiate_quantities(
+        self,
+        args: Any,
+        z: np.ndarray,
+        p: np.ndarray,
+        correction: np.ndarray,
+        tangents: np.ndarray,
+        parameter_units: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return quantities at corrected gaits z, and their derivatives by both parameters.
+
+        Newton's method requires only a few digits of the derivatives. Finite differences of gait
+        steps are cheaper than automatic derivatives, and use the same machine code. Near a fold the
+        tangents and the correction grow without bound and become parallel. The differences are
+        therefore taken in the directions of an orthonormal basis of the tangents' plane. They start
+        from the point of that plane that is nearest to the trial.
+
+        - `parameter_units`: sizes of the parameters at each point, in which steps are measured.
+        """
+        section_state, n = self.gait_state, len(p)
+        units = parameter_units[:, :, None]
+        scaled_tangents = np.concatenate(
+            [units * section_state(tangents), np.broadcast_to(np.eye(2), (n, 2, 2))], 2
+        )
+        basis, factor = np.linalg.qr(np.swapaxes(scaled_tangents, 1, 2))
+        coefficients = units * np.linalg.inv(factor)
+        start = np.einsum("nki,nk->ni", basis[:, :-2], section_state(correction))
+        offsets = RELATIVE_DIFFERENCE_STEP * np.eye(3, 2, -1)
+        changes = np.einsum("nij,nkj->nki", coefficients, offsets - start[:, None])
+        trials = z[:, None] + changes @ tangents
+        repeated = jax.tree.map(lambda x: np.repeat(x, 3, 0), args)
+        quantities = self.measure_quantities(
+            repeated, trials.reshape(3 * n, -1), (p[:, None] + changes).reshape(3 * n, 2)
+        ).reshape(n, 3, -1)
+        rates = (quantities[:, 1:] - quantities[:, :1]) / RELATIVE_DIFFERENCE_STEP
+        gradient = np.swapaxes(factor, 1, 2) @ rates / units
+        return quantities[:, 0] + np.einsum("ni,niq->nq", start, rates), gradient
 
     def is_admissible(self, args: Any, y: np.ndarray, p: float) -> bool:
         return super().is_admissible(args, y, p) and bool(0.0 <= y[0] <= 1.0)
@@ -206,9 +260,6 @@ class CurveWheel(NamedTuple):
 
 # Largest round-off of a duration that is zero on a whole curve, s.
 MAX_DURATION_ROUNDOFF_S = 1e-9
-# Finite difference of the section state and of the relative parameters, for derivatives of
-# quantities that an event-driven step determines.
-RELATIVE_DIFFERENCE_STEP = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -262,51 +313,18 @@ class GaitCurveProblem(AbstractCurveProblem):
                 values = stack_bifurcation_margins(values)
             values, gradient = values + rates[:, 0], rates[:, 1:]
         else:
-            values, gradient = self._differentiate_step_quantities(
-                branch_wheels, z + correction, p, correction, tangents
+            values, gradient = self.differentiate_quantities(
+                branch_wheels, z + correction, p, correction, tangents, p
             )
         index = wheels.quantity_index
         return TwoParameterStep(
             correction, tangents, monodromy, values[rows, index], gradient[rows, :, index]
         )
 
-    def _differentiate_step_quantities(
-        self,
-        wheels: BranchWheel,
-        z: np.ndarray,
-        p: np.ndarray,
-        correction: np.ndarray,
-        tangents: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the step's quantities at corrected gaits z, and their derivatives by p.
+    def gait_state(self, z: np.ndarray) -> np.ndarray:
+        return self.gait_problem.section_state(z)
 
-        Newton's method requires only a few digits of the derivatives. Finite differences of gait
-        steps are cheaper than automatic derivatives, and use the same machine code. Near a fold the
-        tangents and the correction grow without bound and become parallel. The differences are
-        therefore taken in the directions of an orthonormal basis of the tangents' plane. They start
-        from the point of that plane that is nearest to the trial.
-        """
-        section_state, n = self.gait_problem.section_state, len(p)
-        scaled_tangents = np.concatenate(
-            [p[:, :, None] * section_state(tangents), np.broadcast_to(np.eye(2), (n, 2, 2))], 2
-        )
-        basis, factor = np.linalg.qr(np.swapaxes(scaled_tangents, 1, 2))
-        coefficients = p[:, :, None] * np.linalg.inv(factor)
-        start = np.einsum("nki,nk->ni", basis[:, :-2], section_state(correction))
-        offsets = RELATIVE_DIFFERENCE_STEP * np.eye(3, 2, -1)
-        changes = np.einsum("nij,nkj->nki", coefficients, offsets - start[:, None])
-        trials = z[:, None] + changes @ tangents
-        repeated = jax.tree.map(lambda x: np.repeat(x, 3, 0), wheels)
-        quantities = self.measure_step_quantities(
-            repeated, trials.reshape(3 * n, -1), (p[:, None] + changes).reshape(3 * n, 2)
-        ).reshape(n, 3, -1)
-        rates = (quantities[:, 1:] - quantities[:, :1]) / RELATIVE_DIFFERENCE_STEP
-        gradient = np.swapaxes(factor, 1, 2) @ rates / p[:, :, None]
-        return quantities[:, 0] + np.einsum("ni,niq->nq", start, rates), gradient
-
-    def measure_step_quantities(
-        self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray
-    ) -> np.ndarray:
+    def measure_quantities(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> np.ndarray:
         """Return the quantities of gaits that the collocation equations do not contain.
 
         They are either those of the gait's force, or those of an event-driven step that starts from

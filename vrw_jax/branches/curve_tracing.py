@@ -45,6 +45,7 @@ from vrw_jax.branches.curve_problems import (
     select_test_quantity,
 )
 from vrw_jax.branches.test_functions import BIFURCATIONS, BRANCH_POINT, FOLD, TestFunction
+from vrw_jax.branches.walker_curves import RANGE_EDGE
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.phase_collocation import CollocationSolution
@@ -52,14 +53,6 @@ from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
 from vrw_jax.models.provenance import collect_provenance_attributes
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.params import WheelParams
-
-RANGE_EDGE_COLUMN = "edge of the box"
-"""Name of the quantity that vanishes if the second parameter is at an end of its range."""
-
-DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
-"""Default continuation options of curves. The first continuation step is short because some curves
-are short.
-"""
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,7 @@ class CurveContinuation(AbstractContinuation):
 
     test_functions: ClassVar[Mapping[str, TestFunction]] = {
         **GAIT_TEST_FUNCTIONS,
-        RANGE_EDGE_COLUMN: TestFunction("lost", "The second parameter's range ends.", True),
+        RANGE_EDGE: TestFunction("lost", "The second parameter's range ends.", True),
         INITIAL_FORCE_FALL_NAME: TestFunction("lost", "The force begins to rise.", True),
     }
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
@@ -94,7 +87,7 @@ class CurveContinuation(AbstractContinuation):
         return quantities | {
             "lambda_4_plus": rear_force_sign * quantities["lambda_4_plus"],
             "second": problem.compute_second_parameter(points.z),
-            RANGE_EDGE_COLUMN: np.minimum(fraction, 1.0 - fraction),
+            RANGE_EDGE: np.minimum(fraction, 1.0 - fraction),
         }
 
     def mask_undefined_quantities(
@@ -390,7 +383,7 @@ class CurveTracer(NamedTuple):
         )
         codim2_points, new_seeds, end_reasons = [], [], branch_data.end_reasons
         for special_point in branch_data.special_points:
-            if special_point.name == RANGE_EDGE_COLUMN:
+            if special_point.name == RANGE_EDGE:
                 continue
             beside = special_point.cycle
             z, second = (

@@ -474,9 +474,10 @@ class HybridContinuation(AbstractMapContinuation):
             step = step_batch_of_walker(walker, params, states, options)
             if self.margins:
                 functions = tuple(function for _, function in self.margins)
-                step_minima = _measure_margins(
-                    walker, functions, params, states, step.n_events, options
-                )
+                step_minima = map_in_numpy_batches(
+                    functools.partial(_measure_margins, walker, functions, options),
+                    POINT_BATCH_SIZES, params, states, step.n_events,
+                )  # fmt: skip
                 minima = np.minimum(minima, step_minima)
             quantities["period"] = quantities["period"] + step.duration
             if self.measures:
@@ -514,14 +515,14 @@ def _measure_steps(
 
 
 @eqx.filter_jit
-@eqx.filter_vmap(in_axes=(None, None, 0, 0, 0, None))
+@eqx.filter_vmap(in_axes=(None, None, None, 0, 0, 0))
 def _measure_margins(
     system: HybridSystem,
     margins: tuple[Callable, ...],
+    options: StepOptions,
     params: Any,
     x: Array,
     n_events: Array,
-    options: StepOptions,
 ) -> Array:
     """Return the minimum of each margin over one step of `n_events` events."""
     start = system.embed(x, params)

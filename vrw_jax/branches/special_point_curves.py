@@ -20,6 +20,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.walker import AbstractWalker, is_own_walker
 from vrw_jax.branches.abstract_continuation import COARSE_MESH_END_NAME
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import SpecialPointCurve
@@ -30,14 +31,16 @@ from vrw_jax.branches.curve_problems import (
     LINEAR_MARGIN_SUBSTITUTES,
 )
 from vrw_jax.branches.curve_tracing import (
-    DEFAULT_CURVE_OPTIONS,
     CurveSeed,
     CurveTracer,
     TracedCurve,
     compute_distances_to_polyline,
 )
+from vrw_jax.branches.map_branch import MarginFunctions
 from vrw_jax.branches.test_functions import BIFURCATIONS
+from vrw_jax.branches.walker_curves import DEFAULT_CURVE_OPTIONS, continue_walker_special_point
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
+from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import MARGIN_MEASURES
@@ -59,11 +62,14 @@ DEFAULT_PARAMETER_BOUNDS: ParameterBounds = {
 def continue_special_point(
     name: str,
     parameters: tuple[str, str],
-    cycle: LimitCycle,
+    cycle: LimitCycle | HybridGait,
     *,
     bounds: ParameterBounds | None = None,
     options: ArclengthOptions | None = None,
     step_options: StepOptions | None = None,
+    model: AbstractWalker | None = None,
+    params: Any = None,
+    margins: MarginFunctions | None = None,
 ) -> SpecialPointCurve:
     """Continue the special point `name` as a curve in two parameters, near a gait of one gait step.
 
@@ -77,6 +83,10 @@ def continue_special_point(
     the points at which other special points occur. On the curve of an indicator, the other special
     points are indicators and bifurcations. On all other curves, they also include margins.
 
+    For a walker of yours, give `model`, its `params`, and `bounds` of both parameters. `name` is
+    that of a bifurcation or of one of the `margins`. A margin must be defined on both sides of the
+    curve: if an orbit touches a guard there, leave the guard out of the walker.
+
     Args:
         name: name of the special point.
         parameters: names of the two parameters.
@@ -84,6 +94,9 @@ def continue_special_point(
         bounds: bounds of the parameters, by name.
         options: `ArclengthOptions` of the curve.
         step_options: options of the event-driven steps that evaluate margins.
+        model: a walker of yours.
+        params: the parameters of this walker, which `cycle` has.
+        margins: functions of state and parameters by name, as in `continue_branch`.
 
     Returns:
         A `SpecialPointCurve`: the points of the curve in two parameters, and why it ends.
@@ -98,6 +111,15 @@ def continue_special_point(
         >>> [point.name for point in curve.codim2_points[-3:-1]]
         ['fold', 'hit_planted_impulse']
     """
+    if is_own_walker(model):
+        return continue_walker_special_point(
+            model, params, name, parameters, bounds, cycle, options, step_options, margins
+        )
+    if (model, params, margins) != (None, None, None):
+        raise ValueError(
+            "model, params and margins are for a walker of yours, but a wheel is known by its "
+            "cycle: leave them out."
+        )
     (curve,) = continue_special_points(
         (name,), parameters, cycle, bounds=bounds, options=options, step_options=step_options
     )
@@ -136,7 +158,7 @@ def _check_parameter_plane(
 def continue_special_points(
     names: tuple[str, ...],
     parameters: tuple[str, str],
-    cycle: LimitCycle,
+    cycle: Any,
     *,
     bounds: ParameterBounds | None = None,
     options: ArclengthOptions | None = None,

@@ -1,0 +1,250 @@
+"""Continue special points of any walker as curves in two parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from vrw_jax.base.checks import check_names, check_range, check_type
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
+from vrw_jax.base.walker import AbstractWalker, make_return_map
+from vrw_jax.branches.abstract_continuation import AbstractContinuation, QuantitiesByName
+from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
+from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
+from vrw_jax.branches.branch_location import continue_and_locate_special_points
+from vrw_jax.branches.continuation_problems import MapProblem
+from vrw_jax.branches.curve_problems import (
+    AbstractCurveProblem,
+    TwoParameterStep,
+    stack_bifurcation_margins,
+)
+from vrw_jax.branches.map_branch import (
+    HybridContinuation,
+    MarginFunctions,
+    check_arclength_options,
+    continue_hybrid_branch,
+    make_stability_variables,
+)
+from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
+from vrw_jax.gaits.fixed_points import estimate_state_units
+from vrw_jax.gaits.walker_finder import HybridGait
+
+RANGE_EDGE = "edge of the box"
+"""Name of the quantity that vanishes if the second parameter is at an end of its range."""
+
+
+DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
+"""Default continuation options of curves. The first continuation step is short because some curves
+are short.
+"""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WalkerCurveProblem(AbstractCurveProblem):
+    """Problem of a curve of special points of the gaits of any walker.
+
+    - `gaits`: continuation of the gaits in the first parameter, which measures them;
+    - `map_problem`: problem of the fixed points of the return map, in both parameters;
+    - `second_name`, `test_name`: names of the second parameter, and of what vanishes on the curve.
+    """
+
+    gaits: HybridContinuation
+    map_problem: MapProblem
+    second_name: str
+    test_name: str
+
+    def linearize_in_two_parameters(
+        self, params: Any, z: np.ndarray, p: np.ndarray
+    ) -> TwoParameterStep:
+        step: Any = self.map_problem.linearize(params, z, p)
+        correction, tangents = step.newton_correction, step.branch_tangent
+        bounds = np.array([self.gaits.parameter_bounds, self.second_bounds])
+        units = np.broadcast_to(np.ptp(bounds, 1), p.shape)
+        values, gradient = self.differentiate_quantities(
+            params, z + correction, p, correction, tangents, units
+        )
+        jacobian = step.return_map_jacobian
+        return TwoParameterStep(correction, tangents, jacobian, values[:, 0], gradient[:, :, 0])
+
+    def measure_quantities(self, params: Any, z: np.ndarray, p: np.ndarray) -> np.ndarray:
+        if self.test_name in BIFURCATIONS:
+            jacobians: Any = self.map_problem.linearize(params, z, p).return_map_jacobian
+            index = list(BIFURCATIONS).index(self.test_name)
+            return stack_bifurcation_margins(jacobians)[:, [index]]
+        points = ContinuationPoint(z, p[:, 0], z, p[:, 0], z, p[:, 0])
+        return self.measure_gaits(params, points, p[:, 1])[self.test_name][:, None]
+
+    def measure_gaits(
+        self, params: Any, points: ContinuationPoint, second: np.ndarray
+    ) -> QuantitiesByName:
+        """Return quantities of the gaits at points of the first parameter, by name."""
+        params = replace_tree_parameter(params, self.second_name, second)
+        return self.gaits.evaluate_point_quantities(params, points)
+
+
+@dataclass(frozen=True)
+class WalkerCurveContinuation(AbstractContinuation):
+    """Continuation of a special point of a walker as a curve in two parameters."""
+
+    continuation_problem: WalkerCurveProblem
+
+    @property
+    def test_functions(self) -> Mapping[str, TestFunction]:  # type: ignore[override]
+        edge = TestFunction("lost", "The second parameter's range ends.", True)
+        return {**self.continuation_problem.gaits.test_functions, RANGE_EDGE: edge}
+
+    @property
+    def parameter_unit(self) -> float:
+        return float(np.ptp(self.parameter_bounds))
+
+    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Any:
+        return lambda: point
+
+    def evaluate_point_quantities(self, params: Any, points: ContinuationPoint) -> QuantitiesByName:
+        problem, fraction = self.continuation_problem, points.z[:, 0]
+        second = problem.compute_second_parameter(points.z)
+        quantities = problem.measure_gaits(params, points._replace(z=points.z[:, 1:]), second)
+        return quantities | {"second": second, RANGE_EDGE: np.minimum(fraction, 1.0 - fraction)}
+
+    def mask_undefined_quantities(
+        self, quantities: QuantitiesByName, owners: np.ndarray
+    ) -> QuantitiesByName:
+        """Replace the quantity that is zero on the whole curve by NaN."""
+        name = self.continuation_problem.test_name
+        return quantities | {name: np.full(len(owners), np.nan)}
+
+    def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
+        return (quantities["outcome"] == Outcome.STEPPED) & ~(quantities[RANGE_EDGE] <= 0.0)
+
+
+def continue_walker_special_point(
+    walker: AbstractWalker,
+    params: Any,
+    name: str,
+    parameters: Any,
+    bounds: Any,
+    gait: Any,
+    options: ArclengthOptions | None,
+    step_options: StepOptions | None,
+    margins: MarginFunctions | None,
+) -> SpecialPointCurve:
+    """Return the curve of `continue_special_point` for a walker of the user."""
+    check_type("cycle", gait, HybridGait, "give vrw.limit_cycle(params, model=)")
+    options = check_arclength_options(DEFAULT_CURVE_OPTIONS if options is None else options)
+    step_options = StepOptions.tight() if step_options is None else step_options
+    names, limits = _check_plane(params, parameters, bounds)
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
+    values, start = _find_start(walker, params, name, names, limits, gait, step_options, margins)
+
+    def map_section_state(params: Any, x: Array, values: Array) -> Array:
+        for i, parameter_name in enumerate(names):
+            params = replace_tree_parameter(params, parameter_name, values[i])
+        return make_return_map(walker, params, step_options)(x)
+
+    def map_by_first(values: Array, x: Array, first: Array) -> Array:
+        return map_section_state(params, x, values.at[0].set(first))
+
+    x = np.asarray(start.point.section_state)
+    units = estimate_state_units(map_by_first, jnp.asarray(values), x, values[0], limits[0])
+    problem = MapProblem(map_section_state, tuple(units.tolist()))
+    wheels = jax.tree.map(lambda leaf: np.asarray(leaf)[None], params)
+    first_bounds = np.array(limits[0])
+    gaits = HybridContinuation(
+        problem, options, wheels, first_bounds, units, walker=walker, name=names[0], period_n=1,
+        step_options=step_options, margins=tuple((margins or {}).items()), measures=(),
+        component_units=(),
+    )  # fmt: skip
+    curve_problem = WalkerCurveProblem(
+        second_bounds=limits[1], gaits=gaits, map_problem=problem, second_name=names[1],
+        test_name=name,
+    )  # fmt: skip
+    fraction = (values[1] - limits[1][0]) / (limits[1][1] - limits[1][0])
+    (data,) = continue_and_locate_special_points(
+        WalkerCurveContinuation(curve_problem, options, wheels, first_bounds),
+        np.append(fraction, x / units)[None],
+        values[:1],
+        np.array([True]),
+    )
+    if data is None:
+        raise ValueError(
+            f"special point {name} at {start.value:.9g} can't be continued: give a gait nearer to "
+            "the special point."
+        )
+    quantities = data.quantities
+    columns = {"period": quantities["period"], **{key: quantities[key] for key in margins or {}}}
+    dataset = xr.Dataset(
+        {"x": (("point", "component"), quantities["x"])}
+        | {key: ("point", column) for key, column in columns.items()}
+        | make_stability_variables(data.points.return_map_jacobian[:, 1:, 1:]),
+        {names[0]: ("point", np.asarray(data.points.p)), names[1]: ("point", quantities["second"])},
+        {"title": f"Curve of {name} over {names[0]} and {names[1]}"},
+    )
+    codim2_points = tuple(
+        Codim2Point(
+            point.name,
+            (point.value, float(curve_problem.compute_second_parameter(point.cycle.z))),
+            point.ends_branch,
+        )
+        for point in data.special_points
+        if point.name != RANGE_EDGE
+    )
+    return SpecialPointCurve(name, names, dataset, codim2_points, data.end_reasons)
+
+
+def _check_plane(
+    params: Any, parameters: Any, bounds: Any
+) -> tuple[tuple[str, str], list[tuple[float, float]]]:
+    """Return the names and bounds of two parameters, or raise an error."""
+    names = check_names("parameters", parameters)
+    if len(set(names)) != 2 or len(names) != 2:
+        raise ValueError(
+            f"parameters are {names}, but a curve needs two different ones: give two names."
+        )
+    check_type("bounds", bounds, Mapping, "give (lower, upper) of each parameter by name")
+    for name in names:
+        find_tree_parameter(params, name)
+        if name not in bounds:
+            raise ValueError(f"bounds has no {name!r}: give (lower, upper) of each parameter.")
+    first, second = names
+    return (first, second), [check_range(f"bounds[{name!r}]", bounds[name]) for name in names]
+
+
+def _find_start(
+    walker: AbstractWalker,
+    params: Any,
+    name: str,
+    names: tuple[str, str],
+    limits: list[tuple[float, float]],
+    gait: HybridGait,
+    step_options: StepOptions,
+    margins: MarginFunctions | None,
+) -> tuple[np.ndarray, SpecialPoint]:
+    """Return the nearest special point on branches in either parameter, and both parameters."""
+    start_values = [
+        float(jax.tree.leaves(params)[find_tree_parameter(params, name)]) for name in names
+    ]
+    found: list[str] = []
+    for i, bounds in enumerate(limits):
+        branch = continue_hybrid_branch(
+            walker, params, names[i], bounds, gait, 1, step_options, None, margins, None, ()
+        )
+        points = [point for point in branch.special_points if point.name == name]
+        if points:
+            start = min(points, key=lambda point: abs(point.value - start_values[i]))
+            start_values[i] = start.value
+            return np.array(start_values), start
+        found += [point.name for point in branch.special_points]
+    raise ValueError(
+        f"no special point {name!r} on branches along {names[0]} and {names[1]} within their "
+        f"bounds, but {', '.join(sorted(set(found))) or 'none'}: give a gait nearer to it, or "
+        "wider bounds."
+    )
