@@ -60,6 +60,37 @@ def test_the_first_start_that_leads_to_a_gait_is_taken():
     assert vrw.limit_cycle(BALL_PARAMS, model=walker).converged
 
 
+class SlowReturn(vrw.AbstractWalker):
+    """Walker that returns to c at a bounded rate, so that Newton's method diverges from afar."""
+
+    coordinates = {"offset": "m"}  # noqa: RUF012
+
+    def advance(self, params, x, options):
+        return vrw.AdvanceResult(x - 0.9 * jnp.arctan(x - params["c"]), jnp.ones(1))
+
+    def starts(self, params):
+        return jnp.array([20.0])
+
+
+def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
+    walker, c = SlowReturn(), np.linspace(1.0, 19.0, 5)
+    in_jit = jax.jit(lambda p: vrw.limit_cycle(p, model=walker).outcome)({"c": 1.0})
+    assert in_jit == vrw.Outcome.NO_CYCLE_FOUND
+    gait = vrw.limit_cycle({"c": 1.0}, model=walker)
+    assert gait.section_state[0] == pytest.approx(1.0, rel=1e-9)
+    gaits = vrw.limit_cycles({"c": np.append(c, np.nan)}, model=walker)
+    np.testing.assert_allclose(gaits.section_state[:-1, 0], c, rtol=1e-9)
+    assert gaits.outcome.tolist() == [vrw.Outcome.STEPPED] * 5 + [vrw.Outcome.BAD_INPUT]
+    names = ["offset", "d offset / d c"]
+    scan = vrw.scan(vrw.samples(c=c), names, base={"c": 1.0}, model=walker)
+    np.testing.assert_allclose(scan.offset, c, rtol=1e-9)
+    np.testing.assert_allclose(scan["d offset / d c"], 1.0, rtol=1e-9)
+    table = vrw.sensitivities({"c": 1.0}, model=walker)
+    assert table.derivative.sel(measure="offset", parameter="c") == pytest.approx(1.0, rel=1e-9)
+    tuned = vrw.tune({"c": 1.0}, "offset", ["c"], {"c": (0.5, 3.0)}, model=walker)
+    assert tuned.value == pytest.approx(3.0, rel=1e-9)
+
+
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_sensitivities_are_the_derivatives_of_the_closed_form(walker):
     """v = k / (1 - e), T = 2 v / g and h = v^2 / 2 g."""

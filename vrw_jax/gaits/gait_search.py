@@ -144,8 +144,9 @@ def limit_cycle(
     to unilateral contact.
 
     For a `HybridSystem` or another walker of yours, `params` are its parameters. Newton's method
-    starts at the `guess`, section coordinates near the gait, or at the walker's `starts`. The
-    result is a `HybridGait`.
+    starts at the `guess`, section coordinates near the gait, or at the walker's `starts`. If it
+    fails, it starts again at the end of a walk from there, but not inside `jit`. The result is a
+    `HybridGait`.
 
     Args:
         params: the wheel.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from vrw_jax.gaits.finder_selection import (
 )
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.walker_finder import WalkerFinder
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -92,9 +94,16 @@ def sensitivities(
             f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )
     parameter_values = gait_finder.model.collect_parameter_values(params)
-    gait_measures = gait_finder.measure_gait(
-        parameter_values, guess, tuple(own_measures.get(name, name) for name in measure_names)
+    measure_gait = functools.partial(
+        gait_finder.measure_gait,
+        parameter_values,
+        measure_names=tuple(own_measures.get(name, name) for name in measure_names),
     )
+    gait_measures = measure_gait(guess)
+    if isinstance(gait_finder, WalkerFinder) and guess is None:
+        has_gait = int(gait_measures.outcome) == Outcome.STEPPED
+        start = None if has_gait else gait_finder.walk_to_start(params)
+        gait_measures = gait_measures if start is None else measure_gait(start)
     if int(gait_measures.outcome) != Outcome.STEPPED:
         failure_outcome = Outcome(int(gait_measures.outcome))
         raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")

@@ -41,9 +41,15 @@ from vrw_jax.base.walker import (
 )
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point_implicit
+from vrw_jax.gaits.gait_walks import walk_until_periodic
 from vrw_jax.gaits.slope_response import SlopeResponse
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
-from vrw_jax.lanes.batching import map_in_batches, select_rows_on_device
+from vrw_jax.lanes.batching import (
+    map_in_batches,
+    replace_rows,
+    select_rows_on_device,
+    select_tree_rows,
+)
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
@@ -169,7 +175,15 @@ def find_walker_gaits(
         options,
     )
     if not is_batch:
-        return find_gaits(params, guesses)
+        gait = find_gaits(params, guesses)
+        if has_traced_leaf(params, guesses, gait):
+            return gait
+        one = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
+        rows, starts = walk_to_starts(
+            walker, one(params), one(guesses), options, one(gait.outcome), period_n
+        )
+        found = find_gaits(params, starts[0]) if len(rows) else gait
+        return found if found.converged else gait
     lengths = {len(leaf) for leaf in jax.tree.leaves(params) if leaf.ndim}
     lengths |= {len(guesses)} if guesses.ndim == 3 else set()
     if len(lengths) != 1:
@@ -183,7 +197,49 @@ def find_walker_gaits(
     guesses = arrays.broadcast_to(guesses, (n, *guesses.shape[-2:]))
     if arrays is jnp:
         return find_gaits(params, guesses)
-    return map_in_batches(find_gaits, batch_sizes.GAIT_BATCH_SIZES, params, guesses)
+    find_each = functools.partial(map_in_batches, find_gaits, batch_sizes.GAIT_BATCH_SIZES)
+    gaits = find_each(params, guesses)
+    rows, starts = walk_to_starts(
+        walker, params, guesses, options, np.asarray(gaits.outcome), period_n
+    )
+    if not len(rows):
+        return gaits
+    found = find_each(select_tree_rows(params, rows), starts)
+    is_found = np.asarray(found.converged)
+    return replace_rows(gaits, rows[is_found], select_tree_rows(found, is_found))
+
+
+# Number of steps after which a walk that has not become periodic is given up.
+MAX_STEPS_TO_START = 200
+
+
+def walk_to_starts(
+    walker: AbstractWalker,
+    params: Any,
+    guesses: np.ndarray,
+    options: StepOptions,
+    outcomes: np.ndarray,
+    period_n: int = 1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return starts for another search where Newton's method has found no gait: ends of walks.
+
+    The first result contains the indices of elements whose walk from the first guess becomes
+    periodic. The starts have the shape of the guesses.
+
+    - `params`, `guesses`: parameters and guesses of a batch, (batch, starts, n);
+    - `outcomes`: outcomes of the first search.
+    """
+    is_searched = ~np.isin(outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT))
+    rows = np.flatnonzero(is_searched) if not walker.invariants else np.zeros(0, int)
+    if not len(rows):
+        return rows, guesses[:0]
+    ends = walk_until_periodic(
+        select_tree_rows(params, rows), guesses[rows, 0], walker, options, MAX_STEPS_TO_START,
+        period_n,
+    )  # fmt: skip
+    is_periodic = ends.period > 0
+    starts = np.broadcast_to(ends.orbit_states[:, :1], guesses[rows].shape)
+    return rows[is_periodic], starts[is_periodic]
 
 
 def _check_search(
@@ -405,6 +461,15 @@ class WalkerFinder(AbstractGaitFinder):
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
         _, params = self.model.from_parameter_values(parameter_values, 0)
         return jnp.atleast_2d(self.model.walker.starts(params))  # type: ignore[misc]
+
+    def walk_to_start(self, params: Any) -> Array | None:
+        """Return a start of another search, after one without a gait: a gait at the end of a walk.
+
+        Return None if no walk leads to a gait.
+        """
+        walker, period_n = self.model.walker, self.period_n
+        gait = find_walker_gaits(walker, params, None, period_n, self.step_options)
+        return gait.warm_start if gait.converged else None
 
     def read_step(self, cycle: Any) -> Any:
         return cycle.last_step

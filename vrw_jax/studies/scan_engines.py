@@ -39,7 +39,7 @@ from vrw_jax.gaits.further_search import MeshSearch, search_further
 from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
-from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder
+from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder, walk_to_starts
 from vrw_jax.lanes.batching import (
     choose_batch_size,
     concatenate_tree_rows,
@@ -573,9 +573,24 @@ def evaluate_own_gaits(
         [domain.contains_parameter_value(x) for domain, x in zip(domains, rows.T, strict=True)],
         axis=0,
     )
+    propose = functools.partial(_propose_starts, finder)
     evaluate = functools.partial(_evaluate_walkers, finder, evaluation_request.measure_names)
+
+    def evaluate_block(block: np.ndarray) -> ValuesByVariable:
+        guesses = map_in_numpy_batches(propose, (WALKER_BLOCK_SIZE,), block)
+        results = map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block, guesses)
+        params = finder.model.from_parameter_values(list(block.T), 0)[1]
+        failed, starts = walk_to_starts(
+            finder.model.walker, params, guesses, finder.step_options, results["outcome"]
+        )
+        if not len(failed):
+            return results
+        found = map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block[failed], starts)
+        is_found = found["outcome"] == Outcome.STEPPED
+        return replace_rows(results, failed[is_found], select_tree_rows(found, is_found))
+
     results = _evaluate_blocks(
-        lambda block: map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block),
+        evaluate_block,
         np.split(rows, range(WALKER_BLOCK_SIZE, len(rows), WALKER_BLOCK_SIZE)),
         n_threads,
     )
@@ -590,10 +605,15 @@ other samples. It is small, because a walker whose functions have no machine cod
 
 
 @eqx.filter_jit
+def _propose_starts(finder: WalkerFinder, rows: Any) -> Array:
+    return jax.vmap(finder.make_initial_guess)(rows)
+
+
+@eqx.filter_jit
 def _evaluate_walkers(
-    finder: WalkerFinder, variable_names: tuple[str, ...], rows: Any
+    finder: WalkerFinder, variable_names: tuple[str, ...], rows: Any, guesses: Any
 ) -> dict[str, Array]:
-    read, guesses = finder.measure_reader, jax.vmap(finder.make_initial_guess)(rows)
+    read = finder.measure_reader
     derivatives = {name: parse_derivative(name) for name in variable_names}
     if any(derivatives.values()):
         gaits = finder.find_gaits(rows, guesses)

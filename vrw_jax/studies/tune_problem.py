@@ -48,7 +48,7 @@ from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.gait_search import resolve_model
 from vrw_jax.gaits.margin_defaults import default_margins
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.gaits.walker_finder import make_walker_finder
+from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     SELECTION_MARGIN_NAMES,
@@ -337,13 +337,17 @@ class TuneProblem:
 
         Raise a ValueError if the trial is unusable.
         """
-        start_trial = self.evaluate_trial(normalized_parameters, None)
+        start_trial, finder = self.evaluate_trial(normalized_parameters, None), self.gait_finder
+        if not start_trial.has_gait_on_branch and isinstance(finder, WalkerFinder):
+            start = finder.walk_to_start(self.make_wheel(normalized_parameters))
+            if start is not None:
+                start_trial = self.evaluate_trial(normalized_parameters, None, start)
         if not start_trial.has_gait_on_branch:
             start_outcome = Outcome(int(start_trial.outcome))
             raise ValueError(
                 f"the start has no gait to tune ({start_outcome.name}: "
                 f"{start_outcome.meaning[:-1]}"
-                "): start from a wheel that walks, such as WheelParams()."
+                "): start from parameters with a gait, such as WheelParams()."
             )
         if not start_trial.has_finite_values:
             for constraint_name, value, gradient in zip(
@@ -368,11 +372,15 @@ class TuneProblem:
         return start_trial
 
     def evaluate_trial(
-        self, normalized_parameters: np.ndarray, neighbor_trial: EvaluatedTrial | None
+        self,
+        normalized_parameters: np.ndarray,
+        neighbor_trial: EvaluatedTrial | None,
+        guess: Any = None,
     ) -> EvaluatedTrial:
         """Evaluate one trial, or a batch with one trial for each row of `normalized_parameters`.
 
-        If `neighbor_trial` is given, the search for the gait begins at its gait.
+        If `neighbor_trial` is given, the search for the gait begins at its gait; else it begins at
+        `guess`, or at the finder's own guess.
         """
         gait_finder = self.gait_finder
         make_guess, find_gait, evaluate_measures = (
@@ -382,11 +390,9 @@ class TuneProblem:
         )
         numpy_values = self.denormalize_parameters(normalized_parameters)
         parameter_values = jnp.asarray(numpy_values)
-        initial_guess = (
-            make_guess(parameter_values)
-            if neighbor_trial is None
-            else neighbor_trial.gait.cycle.warm_start
-        )
+        initial_guess = make_guess(parameter_values) if guess is None else guess
+        if neighbor_trial is not None:
+            initial_guess = neighbor_trial.gait.cycle.warm_start
         gait = find_gait(parameter_values, initial_guess)
         values, jacobian = map(np.array, evaluate_measures(self.objective_and_constraints, gait))
         free_jacobian = np.swapaxes(jacobian[..., self.free_parameter_indices, :], -1, -2)
