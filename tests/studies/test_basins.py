@@ -11,7 +11,7 @@ from reference_code import five_coordinates
 from reference_code import five_coordinates_equations as equations
 from reference_code.constrained_wheel import Wheel, run_phase
 from support.slow_variants import mark_slow
-from support.walkers import RIMLESS_WHEEL, SPOKE_HALF_ANGLE
+from support.walkers import BALL_PARAMS, BALL_SYSTEM, RIMLESS_WHEEL, SPOKE_HALF_ANGLE
 
 import vrw_jax as vrw
 from vrw_jax.studies.basins import compute_share_error
@@ -162,8 +162,18 @@ def test_the_smallest_disturbance_of_an_own_walker_is_its_closed_form():
     assert f"smallest decrease of rate: {exact:.6g} rad/s" in repr(result)
     with pytest.raises(ValueError, match="name one of angle, rate"):
         find()
+    with pytest.raises(ValueError, match="walks need 20 steps to arrive: give max_steps=40"):
+        find(coordinate="rate", max_steps=10)
     with pytest.raises(ValueError, match="angle"):
         find(coordinate="speed")
+
+
+def test_a_change_beyond_the_guard_of_a_mode_is_no_disturbance():
+    """All heights of a bouncing ball lead to its gait, and a ball below the ground is none."""
+    find = functools.partial(vrw.smallest_disturbance, BALL_PARAMS, model=BALL_SYSTEM)
+    result = find(coordinate="height", max_size=0.1)
+    assert np.isinf(result.size)
+    assert np.isinf([*result.backward_sizes, *result.forward_sizes]).all()
 
 
 def finish_by_five_coordinates(params, phase, state):

@@ -230,7 +230,7 @@ def check_arguments(
     return params, x, options
 
 
-def find_batch_axes(params: Any, x: Array) -> tuple:
+def find_batch_axes(params: Any, x: Any) -> tuple:
     """Return the axes of parameters, section coordinates and options in a batch."""
     axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, params)
     return axes, 0 if x.ndim == 2 else None, None

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from vrw_jax import lanes
@@ -261,6 +262,12 @@ class HybridSystem(AbstractWalker):
         require_known_name(mode_name, names, "mode")
         return names.index(mode_name)
 
+    def is_inside_mode(self, params: Any, y: StateArray, mode_index: Array) -> Any:
+        """Return whether no guard of a mode is negative at a state."""
+        guard_values = [mode.guard_values for mode in self._bind_modes(params)]
+        are_inside = [lambda y, f=f: jnp.all(f(y) >= 0.0) for f in guard_values]
+        return lax.switch(mode_index, are_inside, y)
+
     def _bind_modes(self, params: Any) -> tuple[Mode, ...]:
         """Return the modes by index, with functions of the state alone."""
         bind = lambda function: lambda y: function(y, params)
@@ -383,8 +390,8 @@ class HybridSystem(AbstractWalker):
             )
             for mode in self._bind_modes(params)
         ]
-        samples = jax.lax.map(
-            lambda interval: jax.lax.switch(interval[0], samplers, *interval[1:]),
+        samples = lax.map(
+            lambda interval: lax.switch(interval[0], samplers, *interval[1:]),
             (modes, starts, durations),
         )
         columns = {name: samples[..., i] for i, name in enumerate(self.state)}

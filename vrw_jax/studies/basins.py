@@ -310,6 +310,7 @@ class StableGait(NamedTuple):
     model: Any
     step_options: StepOptions
     section_states: np.ndarray  # before the landing of each step, (period_n, m)
+    spectral_radius: float = 0.0  # 0 if it is unknown
 
     @classmethod
     def from_cycle(
@@ -375,7 +376,9 @@ class StableGait(NamedTuple):
             leg_model = leg_models[k % len(leg_models)]
             steps = step_batch(params, section_states[-1], model=leg_model, options=options)
             section_states.append(steps.section_state)
-        stable_gait = cls(params, model, options, np.concatenate(section_states[:-1]))
+        stable_gait = cls(
+            params, model, options, np.concatenate(section_states[:-1]), spectral_radius
+        )
         if not stable_gait.is_on_gait(section_states[-1])[0]:
             raise ValueError(
                 f"cycle does not repeat after {period_n} step{'s' * (period_n > 1)} with "

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 from vrw_jax.base.checks import require_known_name
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.walker import compile_step
 from vrw_jax.lanes.batching import map_in_batches, replace_rows, select_tree_rows
 from vrw_jax.studies.fit_data import HEIGHT_COLUMN
 
@@ -309,7 +310,7 @@ class FitProblem(eqx.Module):
                 columns = {name: columns[name] for name in self.names}
             return columns, durations, step
         if not walker.is_wheel:
-            step = walker.take_step(params, x, self.options)
+            step = compile_step(walker)(params, x, self.options)
             mode_names = getattr(walker, "modes", range(len(step.durations)))
             columns = {f"duration_{m}": d for m, d in zip(mode_names, step.durations, strict=True)}
             columns |= dict(zip(self.finder.coordinates, step.section_state, strict=True))

@@ -7,6 +7,7 @@ disturbance that takes a walker out of the basin of its gait is found by search.
 """
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,7 +28,7 @@ from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.models.stepping import ModelLike
-from vrw_jax.studies.basins import StableGait, walk_until_on_gait
+from vrw_jax.studies.basins import MAX_ARRIVAL_DISTANCE, StableGait, walk_until_on_gait
 
 DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
 """Signs of the change in backward and forward disturbances, in this order."""
@@ -117,7 +118,7 @@ def smallest_disturbance(
     disturbance is the modulus of the change, rad/s. Positions do not change. In double support the
     two feet stay on the ground, so that dtheta determines the rates of the legs. In single support
     the rates of the legs do not change. For a `HybridSystem`, name the `coordinate` of its state
-    that changes, and no other coordinate changes.
+    that changes. No other coordinate changes, and changes beyond a guard of the mode do not count.
 
     The disturbed state is outside the basin if the walk from it does not arrive at the gait (see
     `basin_share`). With the paper's model, a departure from the sequence of phases, which need not
@@ -156,6 +157,13 @@ def smallest_disturbance(
         "vrw.smallest_disturbance", params, model, cycle, options, "disturbances"
     )
     max_size = None if max_size is None else check_positive("max_size", max_size)
+    decay = stable_gait.spectral_radius
+    if decay**max_steps > MAX_ARRIVAL_DISTANCE:
+        n_steps = math.ceil(math.log(MAX_ARRIVAL_DISTANCE) / math.log(decay))
+        raise ValueError(
+            f"max_steps is {max_steps}, but deviations from the gait decay by {decay:.6g} in a "
+            f"step, so that walks need {n_steps} steps to arrive: give max_steps={2 * n_steps}."
+        )
     names = tuple(stable_gait.model.state) if _is_system(stable_gait) else ("dtheta",)
     if coordinate is None and len(names) > 1:
         raise ValueError(
@@ -373,14 +381,13 @@ def _walk_after_disturbance(
         finish_disturbed_batch = functools.partial(
             _finish_steps, stable_gait, _key_phase(stable_gait, phase_index), stride.foot_distance
         )
-        step_results: Any = map_in_batches(
+        section_states[is_in_phase], walk_outcomes[is_in_phase] = map_in_batches(
             finish_disturbed_batch,
             batch_sizes.DISTURBANCE_BATCH_SIZES,
             disturbed_states[is_in_phase],
         )
-        section_states[is_in_phase] = step_results.section_state
-        walk_outcomes[is_in_phase] = step_results.outcome
-    leaves_basin = np.ones(len(phase_indices), bool)
+    # A change beyond a guard of the mode, such as that of a speed at an apex, is not one within it.
+    leaves_basin = walk_outcomes != NOT_IN_PHASE
     has_stepped = np.flatnonzero(walk_outcomes == Outcome.STEPPED)
     if len(has_stepped):
         has_arrived, walk_outcomes[has_stepped], _ = walk_until_on_gait(
@@ -400,17 +407,31 @@ def _finish_step(
     gait: StableGait, phase_index: Any, foot_distance: Array | None, y: Array
 ) -> AdvanceResult | HybridStep:
     """Return the rest of a step from a state within the phase or mode `phase_index`."""
-    params, model, options, _ = gait
+    params, model, options, *_ = gait
     if _is_system(gait):
         return compile_finish(model)(params, y, phase_index, options)
     return model.finish_step(params, phase_index, foot_distance, y, options)
 
 
+NOT_IN_PHASE = -1
+"""Outcome of a step from a state beyond a guard of its mode."""
+
+
 @eqx.filter_jit
 def _finish_steps(
     gait: StableGait, phase_index: Any, foot_distance: Array | None, states: Array
-) -> AdvanceResult | HybridStep:
-    return jax.vmap(functools.partial(_finish_step, gait, phase_index, foot_distance))(states)
+) -> tuple[Array, Array]:
+    """Return the section states at the ends of steps, and their outcomes."""
+
+    def finish(y: Array) -> tuple[Array, Array]:
+        step = _finish_step(gait, phase_index, foot_distance, y)
+        outcome = jnp.asarray(step.outcome)
+        if _is_system(gait):
+            is_inside = gait.model.is_inside_mode(gait.params, y, phase_index)
+            outcome = jnp.where(is_inside, outcome, NOT_IN_PHASE)
+        return step.section_state, outcome
+
+    return jax.vmap(finish)(states)
 
 
 @eqx.filter_jit
@@ -553,7 +574,7 @@ def phase_response(
 
 def _differentiate_stride(gait: StableGait) -> tuple[float, np.ndarray, dict[str, np.ndarray]]:
     """Return the period, and the derivatives of the return map and of measures."""
-    params, model, options, section_states = gait
+    params, model, options, section_states, _ = gait
 
     def measure(x: Array) -> tuple[Array, dict[str, Array]]:
         if _is_system(gait):
@@ -572,7 +593,7 @@ def _differentiate_stride(gait: StableGait) -> tuple[float, np.ndarray, dict[str
 
 def _sample_stride(gait: StableGait, n_samples: int) -> _SampledStride:
     """Return samples of each phase that takes time in the step of a gait, both ends included."""
-    params, model, options, section_states = gait
+    params, model, options, section_states, _ = gait
     x = jnp.asarray(section_states[0])
     if not _is_system(gait):
         trajectory = model.sample_step(params, x, options, n_samples)
