@@ -118,10 +118,14 @@ def test_studies_of_robustness_with_the_papers_law_as_a_law_are_those_of_the_pap
 
 @pytest.mark.slow
 def test_a_law_changes_lives_basins_and_disturbances():
-    light, heavy = make_wheel(QuadraticDamper(0.0)), make_wheel(QuadraticDamper(200.0))
+    """The heavier damper has a gait, which ends near 101 N s^2/m^2, where the rear foot pulls."""
+    light, heavy = make_wheel(QuadraticDamper(0.0)), make_wheel(QuadraticDamper(90.0))
+    box = {"theta_post_impact": (-0.75, -0.6), "dtheta_post_impact": (0.9, 1.6)}
     for study in (
         lambda model: vrw.first_passage(PARAMS, 0.03, model=model, n_walkers=256).mean_steps,
         lambda model: vrw.gait_sensitivity(PARAMS, ["period"], model=model).norm[0],
+        lambda model: vrw.basin_share(PARAMS, box, model=model, n_starts=64).share,
+        lambda model: vrw.smallest_disturbance(PARAMS, model=model).size,
     ):
         assert abs(study(light) - study(heavy)) > 1e-3 * study(light)
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.walkers import RIMLESS_WHEEL, SIMPLEST_WALKER
+from support.walkers import BALL_SYSTEM, RIMLESS_WHEEL, SIMPLEST_WALKER
 
 import vrw_jax as vrw
 
@@ -91,10 +91,21 @@ def test_a_pushed_simplest_walker_strikes_as_much_earlier_as_its_response_says()
     assert response.delay[instant] @ np.asarray(flow) == pytest.approx(-1.0, abs=1e-8)
 
 
-@pytest.mark.slow
 def test_an_unstable_gait_is_refused():
+    """A racket that returns 1.5 of the velocity: the gait v = k / (1 - e) has the multiplier e."""
+    params = {"ball": {"restitution": 1.5}, "kick": -1.0}
+    unstable = vrw.limit_cycle(params, model=BALL_SYSTEM, guess=[2.1])
+    np.testing.assert_allclose(unstable.section_state, [2.0], rtol=1e-12)
+    with pytest.raises(ValueError, match="it is not stable"):
+        vrw.phase_response(params, model=BALL_SYSTEM, cycle=unstable)
+
+
+@pytest.mark.slow
+def test_the_unstable_gait_of_the_simplest_walker_is_refused():
+    """Its multipliers are those of an independent code."""
     unstable = vrw.limit_cycle(
         {"slope": 0.009}, model=SIMPLEST_WALKER, guess=[0.1939, -0.2039], options=TIGHT
     )
-    with pytest.raises(ValueError, match="the gait is unstable"):
+    np.testing.assert_allclose(unstable.multipliers, [4.00386435893, 0.4595895898], rtol=1e-9)
+    with pytest.raises(ValueError, match="it is not stable"):
         vrw.phase_response({"slope": 0.009}, model=SIMPLEST_WALKER, cycle=unstable)

@@ -29,10 +29,11 @@ SIMPLEST_WALKER = HybridSystem(
     modes={
         "swing": Mode(
             swing,
-            # The foot of a straight leg scuffs at mid-stance, which the model ignores.
+            # The foot of a straight leg scuffs at mid-stance, which the model ignores. In the
+            # unstable gait it rises through the ground at an angle of -0.0499.
             {
                 "heel_strike": Guard(
-                    lambda y, p: 2.0 * y[0] - y[2], strike, armed=lambda y, p: -0.05 - y[0]
+                    lambda y, p: 2.0 * y[0] - y[2], strike, armed=lambda y, p: -0.1 - y[0]
                 )
             },
         )
