@@ -277,12 +277,12 @@ def _solve_acceleration_level(w, q, v, feet, may, at_stopper, moving):
     return _ContactProblem(inverse, free, feet, may, unilateral, locked, rows, bias, scales)
 
 
-def _bring_to_rest(w, q, v, rows, force_directions):
-    """Rates with these rows exactly at rest, by impulses along those."""
+def _bring_to_rest(w, q, v, rows):
+    """Rates with these rows exactly at rest, by impulses along them: without friction."""
     if not len(rows):
         return v
     mass, _ = _mass_and_force(w, q, v)
-    turned = np.linalg.solve(mass, force_directions.T)
+    turned = np.linalg.solve(mass, rows.T)
     p, *_ = np.linalg.lstsq(rows @ turned, rows @ v, rcond=1e-11)
     return v - turned @ p
 
@@ -317,17 +317,8 @@ def _process_event(w, place, struck_foot, struck_leg):
         loaded_legs = {*problem.locked, *itertools.compress(problem.legs, is_active)}
         legs = [j for j in legs if j in loaded_legs or v[3 + j] > -REST_SPEED]
     resting_feet = [j for j in feet if abs(speeds[j, 0]) < REST_SPEED]
-    drag = [
-        0.0 if j in resting_feet else -np.sign(speeds[j, 0]) * w.friction_by_foot[j] for j in feet
-    ]
-    pushed = rows[feet, 1] + np.array(drag).reshape(-1, 1) * rows[feet, 0]
-    others = [rows[resting_feet, 0], _locked_rows(legs)]
-    v = _bring_to_rest(
-        w,
-        q,
-        v,
-        *(np.concatenate([pushed_array, *others]) for pushed_array in (rows[feet, 1], pushed)),
-    )
+    at_rest = [rows[feet, 1], rows[resting_feet, 0], _locked_rows(legs)]
+    v = _bring_to_rest(w, q, v, np.concatenate(at_rest))
     may = [
         (CONTACT_STICK, SLIP_DOWNHILL, SLIP_UPHILL, CONTACT_OFF)
         if j in resting_feet
