@@ -32,7 +32,10 @@ def read_peaks(gait, names=FORCE_PEAK_MEASURES):
 
 @pytest.mark.parametrize("wheel_name", ["two peaks", *mark_slow("Table 1")])
 def test_peaks_of_a_gait_are_those_of_the_second_formulation(gaits, wheel_name):
-    """The relative error is that of the step, 1e-10 per solver step, after some hundred steps."""
+    """The relative error is that of the step, 1e-10 per solver step, after some hundred steps.
+
+    The wheel in Table 1 has a fast gait on this ground, whose force falls from its landing on.
+    """
     gait, params = gaits[wheel_name], WHEELS[wheel_name]
     peaks = read_peaks(gait)
     wheel = complementarity.ComplementarityWheel(
@@ -45,12 +48,12 @@ def test_peaks_of_a_gait_are_those_of_the_second_formulation(gaits, wheel_name):
     expected = {
         "n_force_peaks": np.sum(fore.is_maximum),
         "peak_force": fore.largest_force,
-        "smooth_peak_force": fore.forces[fore.is_maximum].max(),
+        "smooth_peak_force": max(fore.forces[fore.is_maximum], default=np.nan),
         "force_trough_depth": fore.compute_trough_depth(),
         "second_peak_rate": max(fore.rate_maxima_after_peak, default=np.nan),
         "n_total_force_peaks": np.sum(total.is_maximum),
         "peak_total_force": total.largest_force,
-        "smooth_peak_total_force": total.forces[total.is_maximum].max(),
+        "smooth_peak_total_force": max(total.forces[total.is_maximum], default=np.nan),
         "landing_impulse": landing_impulse,
     }
     for name, value in expected.items():
@@ -99,14 +102,14 @@ def test_derivatives_of_peaks_are_central_differences_along_the_gait(gaits):
 @pytest.mark.slow  # the derivatives of a step with peaks compile for more than a minute
 def test_a_scan_with_unilateral_contact_has_the_peaks_of_each_gait():
     names = ["n_force_peaks", "peak_force", "landing_impulse", "d peak_force / d damping"]
-    scan = vrw.scan(vrw.grid(damping=[95.0, 100.0, 105.0]), names, base=TWO_PEAKS, model=MODEL)
+    scan = vrw.scan(vrw.grid(damping=[99.9, 100.0, 100.1]), names, base=TWO_PEAKS, model=MODEL)
     for i, damping in enumerate(scan.damping.values):
         wheel = dataclasses.replace(TWO_PEAKS, damping=jnp.asarray(damping))
         peaks = read_peaks(vrw.limit_cycle(wheel, model=MODEL), names[:3])
         for name, value in peaks.items():
             np.testing.assert_allclose(scan[name].values[i], value, rtol=1e-8, err_msg=name)
-    slope = np.polynomial.Polynomial.fit(scan.damping, scan.peak_force, 2).deriv()(100.0)
-    np.testing.assert_allclose(scan[names[3]][1], slope, rtol=1e-3)
+    difference = (scan.peak_force[2] - scan.peak_force[0]) / 0.2  # an error of 1.4 % at +-5 N s/m
+    np.testing.assert_allclose(scan[names[3]][1], difference, rtol=2e-5)
     assert scan.peak_force.attrs["units"] == "N"
 
 
