@@ -48,11 +48,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if distributes_tests and not config.getoption("collectonly"):
         return
     os.environ["VRW_PROGRESS"] = "0"  # Tests compare standard error, also of other processes.
-    gc.set_threshold(20_000, 10, 10)  # what JAX keeps of programs is looked through less often
     shape_checks.import_with_checks(PACKAGE_POSITIONS)
     import vrw_jax
 
     vrw_jax.start_jax(os.environ.get("VRW_TEST_CACHE", ROOT / ".jax_cache"))
+    gc.freeze()  # Collections skip what the imports have made.
+    gc.set_threshold(200_000, 10, 10)  # JAX keeps most objects that it makes.
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

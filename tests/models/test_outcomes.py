@@ -22,10 +22,11 @@ import vrw_jax as vrw
 from vrw_jax import Outcome
 
 
+@pytest.mark.parametrize("by_lanes", [*mark_slow(False), True], ids=["diffrax", "lanes"])
 @pytest.mark.parametrize("outcome", OUTCOME_CASES, ids=lambda o: o.name)
-def test_each_outcome_occurs(outcome):
+def test_each_outcome_occurs(outcome, by_lanes):
     parameter_rows, start = OUTCOME_CASES[outcome]
-    result = compute_full_steps(parameter_rows, start)
+    result = compute_full_steps(parameter_rows, start, uses_lane_engine=by_lanes)
     assert Outcome(int(result.outcome[0])) is outcome
 
 

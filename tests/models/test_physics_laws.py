@@ -16,9 +16,11 @@ from vrw_jax.wheel import Motion, compute_rear_foot_height, dynamics, make_paper
 STARTS = reference_values.stack_quantity("step", "start")
 
 
-@pytest.fixture(scope="module")
-def sample_steps():
-    return compute_full_steps(reference_values.REFERENCE_PARAMETERS, STARTS)
+@pytest.fixture(scope="module", params=[*mark_slow(False), True], ids=["diffrax", "lanes"])
+def sample_steps(request):
+    return compute_full_steps(
+        reference_values.REFERENCE_PARAMETERS, STARTS, uses_lane_engine=request.param
+    )
 
 
 def test_impacts_only_lose_energy(sample_steps):

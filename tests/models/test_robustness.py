@@ -3,9 +3,11 @@
 import equinox as eqx
 import jax
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.batched import BATCH_SIZE, NAMES, compute_full_steps
+from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 
@@ -27,8 +29,9 @@ start = st.tuples(st.floats(-1.0, 1.0), st.floats(0.0, 10.0), st.floats(-5.0, 5.
 OPTIONS = vrw.StepOptions(rtol=1e-6, atol=1e-6, max_solver_steps=2000)
 
 
-def assert_valid_outcomes(lanes):
-    result = compute_full_steps(*map(np.asarray, zip(*lanes, strict=True)), OPTIONS)
+def assert_valid_outcomes(lanes, by_lanes):
+    rows = map(np.asarray, zip(*lanes, strict=True))
+    result = compute_full_steps(*rows, OPTIONS, uses_lane_engine=by_lanes)
     assert np.all(np.isin(result.outcome, list(vrw.Outcome)))
     # The friction that collision II requires is infinite where the ground would have to pull.
     stopper_friction = result.required_friction.stopper
@@ -46,13 +49,20 @@ def make_batch(vector, x):
     return st.lists(st.tuples(vector, x), min_size=BATCH_SIZE, max_size=BATCH_SIZE)
 
 
+PARAMETRIZE_BY_ENGINE = pytest.mark.parametrize(
+    "by_lanes", [*mark_slow(False), True], ids=["diffrax", "lanes"]
+)
+
+
+@PARAMETRIZE_BY_ENGINE
 @settings(max_examples=5, deadline=None)
 @given(lanes=make_batch(sensible_parameters, start))
-def test_every_wheel_gets_an_outcome(lanes):
-    assert_valid_outcomes(lanes)
+def test_every_wheel_gets_an_outcome(by_lanes, lanes):
+    assert_valid_outcomes(lanes, by_lanes)
 
 
+@PARAMETRIZE_BY_ENGINE
 @settings(max_examples=10, deadline=None)
 @given(lanes=make_batch(any_parameters, st.tuples(any_float, any_float, any_float)))
-def test_every_invalid_input_gets_an_outcome(lanes):
-    assert_valid_outcomes(lanes)
+def test_every_invalid_input_gets_an_outcome(by_lanes, lanes):
+    assert_valid_outcomes(lanes, by_lanes)

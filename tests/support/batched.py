@@ -72,7 +72,7 @@ def _compute_full_steps(vectors, starts, options, model, uses_lane_engine):
     return jax.vmap(step_one)(vectors, starts)
 
 
-def compute_full_steps(vectors, starts, options=None, model=None, uses_lane_engine=False):
+def compute_full_steps(vectors, starts, options=None, model=None, uses_lane_engine=True):
     """Return the step results of wheels (rows of parameters) from section states."""
     count = max(np.atleast_2d(vectors).shape[0], np.atleast_2d(starts).shape[0])
     result = _compute_full_steps(
