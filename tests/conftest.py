@@ -48,6 +48,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if distributes_tests and not config.getoption("collectonly"):
         return
     os.environ["VRW_PROGRESS"] = "0"  # Tests compare standard error, also of other processes.
+    if config.getoption("markexpr") == "not slow":
+        # XLA compiles in two thirds of the time, as in JAX's own tests. The slow tests run the
+        # code that users run, and the library's machine code is the same in both.
+        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "true"
+        split = "--xla_cpu_parallel_codegen_split_count=1"  # Splitting helps on many cores only.
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {split}".strip()
     shape_checks.import_with_checks(PACKAGE_POSITIONS)
     import vrw_jax
 

@@ -1,5 +1,6 @@
 """Curves of special points in two parameters: turning points, closed curves and intersections."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from vrw_jax.branches.map_branch import MapContinuation
 from vrw_jax.branches.special_point_curves import _check_parameter_plane, continue_special_points
 
 CURVE_OPTIONS = ArclengthOptions(max_points=400, max_ds=0.05)
+BATCH_SIZE = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +33,12 @@ class MapCurveProblem(AbstractCurveProblem):
     quantity: Callable
 
     def linearize_in_two_parameters(self, args, z, p):
+        rows = np.minimum(np.arange(BATCH_SIZE), len(z) - 1)  # one program for all batches
+        results = self.linearize_batch(z[rows], p[rows])
+        return TwoParameterStep(*(np.asarray(result)[: len(z)] for result in results))
+
+    @functools.cached_property
+    def linearize_batch(self):
         def linearize(z, p):
             by_x, by_p = jax.jacfwd(self.function, argnums=(0, 1))(z, p)
             right = jnp.concatenate([(self.function(z, p) - z)[:, None], by_p], 1)
@@ -40,7 +48,7 @@ class MapCurveProblem(AbstractCurveProblem):
             result = value(z, p) + gz @ solved[:, 0]
             return solved[:, 0], solved[:, 1:].T, by_x, result, gp + gz @ solved[:, 1:]
 
-        return TwoParameterStep(*map(np.asarray, jax.vmap(linearize)(z, p)))
+        return jax.jit(jax.vmap(linearize))
 
 
 def trace_curve(function, quantity, z, p, bounds, seconds, second):

@@ -9,6 +9,7 @@ import pytest
 from reference_code import complementarity
 
 import vrw_jax as vrw
+from vrw_jax import lanes
 from vrw_jax.models.contact_impacts import ContactLaw, classify_event, project_motion, resolve_event
 from vrw_jax.models.contact_mechanics import (
     WheelMotion,
@@ -52,7 +53,8 @@ def make_random_impacts(has_one_sided_stoppers):
         return speed(motion), speed(change.motion), *energies, is_sound, change.normal_impulse.min()
 
     seeds = jnp.asarray(np.random.default_rng(RNG_SEED).random((N_IMPACTS, 22)))
-    return jax.jit(lambda *given: jax.vmap(lambda one: strikes(one, *given))(seeds))
+    strike_all = jax.vmap(lanes.jit(strikes), (0, None, None, None, None))
+    return lambda *given: strike_all(seeds, *map(jnp.asarray, given))
 
 
 @pytest.mark.parametrize("has_one_sided_stoppers", [False, True])
