@@ -58,6 +58,16 @@ def results_of_both_engines():
     return lanes, diffrax
 
 
+def test_model_and_solver_choose_the_engine_and_the_result_names_it(results_of_both_engines):
+    assert [result.engine for result in results_of_both_engines] == ["lanes", "diffrax"]
+    params, starts = vrw.WheelParams(), np.array([START])
+    assert vrw.step_batch(params, starts).engine == "lanes"
+    rigid_start = np.array([[0.39, 1.2, 0.0]])
+    assert vrw.step_batch(params, rigid_start, model=vrw.RigidWheel()).engine == "diffrax"
+    with pytest.raises(ValueError, match="explicit"):
+        vrw.step_batch(params, starts, options=vrw.StepOptions(solver="Kvaerno5"), engine="lanes")
+
+
 def test_engines_agree_on_outcomes_and_values(results_of_both_engines):
     lanes, diffrax = results_of_both_engines
     assert len(set(np.asarray(lanes.outcome))) >= 4  # the box is wide

@@ -228,21 +228,6 @@ def test_a_batched_walk_equals_single_walks_and_ends_at_its_first_failure():
     np.testing.assert_allclose(batch_result.section_state[0], last, atol=1e-8)
 
 
-def test_model_and_solver_choose_the_engine_and_the_result_names_it():
-    params, states = (
-        reference_values.make_wheels(make_parameter_rows()),
-        TABLE_1_SECTION_STATE[None],
-    )
-    assert vrw.step_batch(params, states).engine == "lanes"
-    assert vrw.step_batch(params, states, engine="diffrax").engine == "diffrax"
-    assert (
-        vrw.step_batch(params, np.asarray([[0.39, 1.2, 0.0]]), model=vrw.RigidWheel()).engine
-        == "diffrax"
-    )
-    with pytest.raises(ValueError, match="explicit"):
-        vrw.step_batch(params, states, options=vrw.StepOptions(solver="Kvaerno5"), engine="lanes")
-
-
 def test_results_are_new_arrays_and_arguments_are_not_modified():
     states = STARTS.copy()
     params = reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS)
