@@ -98,11 +98,6 @@ def integrate_by_diffrax(
         jnp.zeros_like(contact_interval_state.time_since_event),
         *contact_interval_state.interval_accumulators,
     )
-    if contact_mode_dynamics.measures_force_peaks:
-        raise ValueError(
-            "force peaks with unilateral contact are computed by diffrax, but only machine code "
-            "locates them, with first derivatives: take StepOptions() on a CPU with llvmlite."
-        )
     guard_layout = contact_mode_dynamics.guard_layout
     q, v = contact_interval_state.contact_interval_point[:2]
     start_rows = evaluate_dynamics(*stop_gradients((contact_mode_dynamics, q, v)))

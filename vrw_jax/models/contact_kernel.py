@@ -564,6 +564,11 @@ def run_walks(
     walk_settings: BatchWalkSettings, input_columns: Array, section_state: Array
 ) -> BatchWalkResult:
     """Return the results of all walks after `n_steps` landings of the foremost foot."""
+    if walk_settings.measures_force_peaks and walk_settings.tableau is None:
+        raise ValueError(
+            "force peaks with unilateral contact are computed by diffrax, but only machine code "
+            "locates them, with first derivatives: take StepOptions() on a CPU with llvmlite."
+        )
     input_columns = walk_settings.resolve_heights(input_columns, section_state)
     input_columns, lane_state = init_lane_states(walk_settings, input_columns, section_state)
     run_iteration = lambda lane_state: process_and_integrate(
