@@ -29,7 +29,7 @@ SLOW_PAGES = {
     "docs/explanation/numerics.md", "docs/explanation/tolerances.md",
     *(f"docs/gallery/{page}.md" for page in PAGES_OF_WALKERS),
     "docs/howto/add_a_measure.md", "docs/howto/basins.md", "docs/howto/cluster.md",
-    "docs/howto/export.md", "docs/howto/fit.md",
+    "docs/howto/export.md", "docs/howto/fit.md", "docs/howto/own_leg.md",
     "docs/howto/numpyro.md", "docs/howto/own_constraint.md", "docs/howto/robustness.md",
     "docs/howto/unilateral_contact.md",
     "docs/studies/beyond_the_border.md", "docs/studies/borders.md",
