@@ -220,14 +220,20 @@ def check_arguments(
     if not 1 <= x.ndim <= max_axes:
         shapes = "(n,)" if max_axes == 1 else "(n,) or (batch, n)"
         raise ValueError(f"{name} has shape {x.shape}, but its shape must be {shapes}.")
+    leaves, structure = jax.tree.flatten(params)
+    leaf_shapes = tuple((leaf.shape[max_axes - 1 :], leaf.dtype) for leaf in leaves)
     with name_missing_parameters(params):
-        walker.check_definition(
-            jax.tree.map(lambda p: jax.ShapeDtypeStruct(p.shape[max_axes - 1 :], p.dtype), params),
-            jax.ShapeDtypeStruct(x.shape[-1:], x.dtype),
-            name,
-        )
+        _check_definition(walker, structure, leaf_shapes, x.shape[-1:], x.dtype, name)
     options.check_tolerances(x.dtype)
     return params, x, options
+
+
+@functools.lru_cache  # Walks of many calls check the same shapes.
+def _check_definition(
+    walker: AbstractWalker, structure: Any, shapes: tuple, x_shape: tuple, x_dtype: Any, name: str
+) -> None:
+    params = structure.unflatten([jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    walker.check_definition(params, jax.ShapeDtypeStruct(x_shape, x_dtype), name)
 
 
 def find_batch_axes(params: Any, x: Any) -> tuple:

@@ -34,12 +34,10 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     AbstractWalker,
-    check_arguments,
     check_parameters,
-    compile_step,
-    find_batch_axes,
     is_own_walker,
     name_section,
+    step_batch_of_walker,
 )
 from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
@@ -246,10 +244,7 @@ def _step_batch_of_own_walker(
     def step_lanes(walking: np.ndarray, _: None, x: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
         of_step = jax.tree.map(lambda leaf: leaf[:, k] if leaf.ndim > 1 else leaf, arrays)
         rows = eqx.combine(select_tree_rows(of_step, walking), numbers)
-        if k == 0:
-            check_arguments(walker, rows, x.T, options, 2)
-        in_axes = find_batch_axes(rows, x.T)
-        step = compile_step(walker).batch(rows, x.T, options, in_axes=in_axes)
+        step = step_batch_of_walker(walker, rows, x.T, options)
         section_state = np.where(
             (step.outcome == Outcome.STEPPED)[:, None], step.section_state, 0.0
         )
