@@ -85,6 +85,7 @@ class AbstractWalker(abc.ABC):
     is_wheel: ClassVar[bool] = False
     """Whether the walker is a model of the wheel, for which functions have methods of their own."""
     can_start_within_gait_step: ClassVar[bool] = False
+    """Whether the walker has `finish_step`, so that pushes within a step can be computed."""
     coordinates: Mapping[str, str] = {}
     starts: Callable[..., Any] | None = None
     invariants: Sequence[Callable[..., Any]] = ()

@@ -100,8 +100,8 @@ class AbstractCurveProblem(AbstractContinuationProblem):
         jacobian = np.pad(step.return_map_jacobian, ((0, 0), (0, 1), (0, 1)))
         return NewtonStep(correction, tangent, jacobian)
 
-    def gait_state(self, z: np.ndarray) -> np.ndarray:
-        """Return the section state of gaits, with which the unknowns z begin."""
+    def select_section_state(self, z: np.ndarray) -> np.ndarray:
+        """Return the section state of gaits, with which their unknowns z begin."""
         return z
 
     def measure_quantities(self, args: Any, z: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -130,7 +130,7 @@ class AbstractCurveProblem(AbstractContinuationProblem):
 
         - `parameter_units`: sizes of the parameters at each point, in which steps are measured.
         """
-        section_state, n = self.gait_state, len(p)
+        section_state, n = self.select_section_state, len(p)
         units = parameter_units[:, :, None]
         scaled_tangents = np.concatenate(
             [units * section_state(tangents), np.broadcast_to(np.eye(2), (n, 2, 2))], 2
@@ -321,7 +321,7 @@ class GaitCurveProblem(AbstractCurveProblem):
             correction, tangents, monodromy, values[rows, index], gradient[rows, :, index]
         )
 
-    def gait_state(self, z: np.ndarray) -> np.ndarray:
+    def select_section_state(self, z: np.ndarray) -> np.ndarray:
         return self.gait_problem.section_state(z)
 
     def measure_quantities(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> np.ndarray:

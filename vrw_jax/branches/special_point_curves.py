@@ -115,10 +115,10 @@ def continue_special_point(
         return continue_walker_special_point(
             model, params, name, parameters, bounds, cycle, options, step_options, margins
         )
-    if (model, params, margins) != (None, None, None):
+    if any(argument is not None for argument in (model, params, margins)):
         raise ValueError(
-            "model, params and margins are for a walker of yours, but a wheel is known by its "
-            "cycle: leave them out."
+            "model, params and margins are for a walker of yours, but the cycle of a wheel "
+            "contains its model and parameters: leave them out."
         )
     (curve,) = continue_special_points(
         (name,), parameters, cycle, bounds=bounds, options=options, step_options=step_options
@@ -170,7 +170,12 @@ def continue_special_points(
     known_names = cycle.model.parameter_names if isinstance(cycle, LimitCycle) else PARAMETER_NAMES
     parameters, parameter_ranges = _check_parameter_plane(parameters, bounds, known_names)
     first_parameter_name, second_parameter_name = parameters
-    check_type("cycle", cycle, LimitCycle, "give vrw.limit_cycle(params)")
+    check_type(
+        "cycle",
+        cycle,
+        LimitCycle,
+        "give vrw.limit_cycle(params), or model= and params= of a walker of yours",
+    )
     if cycle.period_n != 1:
         raise ValueError(
             f"the gait has {cycle.period_n} steps, but a curve needs a gait of one step: give one."

@@ -11,7 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.base.checks import check_names, check_range, check_type
+from vrw_jax.base.checks import (
+    check_names,
+    check_range,
+    check_type,
+    require_known_name,
+    require_untraced_arguments,
+)
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
@@ -39,7 +45,8 @@ from vrw_jax.gaits.fixed_points import estimate_state_units
 from vrw_jax.gaits.walker_finder import HybridGait
 
 RANGE_EDGE = "edge of the box"
-"""Name of the quantity that vanishes if the second parameter is at an end of its range."""
+"""Name of the distance of the second parameter from its nearer bound, as a fraction of its range.
+"""
 
 
 DEFAULT_CURVE_OPTIONS = ArclengthOptions(initial_ds=5e-4)
@@ -81,7 +88,9 @@ class WalkerCurveProblem(AbstractCurveProblem):
             index = list(BIFURCATIONS).index(self.test_name)
             return stack_bifurcation_margins(jacobians)[:, [index]]
         points = ContinuationPoint(z, p[:, 0], z, p[:, 0], z, p[:, 0])
-        return self.measure_gaits(params, points, p[:, 1])[self.test_name][:, None]
+        quantities = self.measure_gaits(params, points, p[:, 1])
+        has_stepped = quantities["outcome"] == Outcome.STEPPED
+        return np.where(has_stepped, quantities[self.test_name], np.nan)[:, None]
 
     def measure_gaits(
         self, params: Any, points: ContinuationPoint, second: np.ndarray
@@ -139,8 +148,19 @@ def continue_walker_special_point(
 ) -> SpecialPointCurve:
     """Return the curve of `continue_special_point` for a walker of the user."""
     check_type("cycle", gait, HybridGait, "give vrw.limit_cycle(params, model=)")
+    require_untraced_arguments(
+        "vrw.continue_special_point", "differentiate vrw.limit_cycle", params, gait
+    )
+    check_type("margins", margins, (Mapping, type(None)), "give a dictionary of functions by name")
+    require_known_name(name, (*BIFURCATIONS, *(margins or {})), "special point or margin")
+    if np.any(np.asarray(gait.outcome) != Outcome.STEPPED) or walker.invariants:
+        raise ValueError(
+            "a curve needs a gait of a walker without invariants, but "
+            f"{'the walker has some' if walker.invariants else gait.why}: give another gait."
+        )
     options = check_arclength_options(DEFAULT_CURVE_OPTIONS if options is None else options)
     step_options = StepOptions.tight() if step_options is None else step_options
+    check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
     names, limits = _check_plane(params, parameters, bounds)
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
     values, start = _find_start(walker, params, name, names, limits, gait, step_options, margins)
@@ -156,11 +176,11 @@ def continue_walker_special_point(
     x = np.asarray(start.point.section_state)
     units = estimate_state_units(map_by_first, jnp.asarray(values), x, values[0], limits[0])
     problem = MapProblem(map_section_state, tuple(units.tolist()))
-    wheels = jax.tree.map(lambda leaf: np.asarray(leaf)[None], params)
+    params_batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], params)
     first_bounds = np.array(limits[0])
     gaits = HybridContinuation(
-        problem, options, wheels, first_bounds, units, walker=walker, name=names[0], period_n=1,
-        step_options=step_options, margins=tuple((margins or {}).items()), measures=(),
+        problem, options, params_batch, first_bounds, units, walker=walker, name=names[0],
+        period_n=1, step_options=step_options, margins=tuple((margins or {}).items()), measures=(),
         component_units=(),
     )  # fmt: skip
     curve_problem = WalkerCurveProblem(
@@ -169,7 +189,7 @@ def continue_walker_special_point(
     )  # fmt: skip
     fraction = (values[1] - limits[1][0]) / (limits[1][1] - limits[1][0])
     (data,) = continue_and_locate_special_points(
-        WalkerCurveContinuation(curve_problem, options, wheels, first_bounds),
+        WalkerCurveContinuation(curve_problem, options, params_batch, first_bounds),
         np.append(fraction, x / units)[None],
         values[:1],
         np.array([True]),
@@ -210,12 +230,20 @@ def _check_plane(
             f"parameters are {names}, but a curve needs two different ones: give two names."
         )
     check_type("bounds", bounds, Mapping, "give (lower, upper) of each parameter by name")
+    limits = []
     for name in names:
-        find_tree_parameter(params, name)
+        value = jax.tree.leaves(params)[find_tree_parameter(params, name)]
         if name not in bounds:
             raise ValueError(f"bounds has no {name!r}: give (lower, upper) of each parameter.")
+        lower, upper = check_range(f"bounds[{name!r}]", bounds[name])
+        if np.ndim(value) or not lower <= value <= upper:
+            raise ValueError(
+                f"{name} is {value}, but the curve is traced from a gait with one value within "
+                f"the bounds: give one in [{lower:g}, {upper:g}]."
+            )
+        limits.append((lower, upper))
     first, second = names
-    return (first, second), [check_range(f"bounds[{name!r}]", bounds[name]) for name in names]
+    return (first, second), limits
 
 
 def _find_start(
@@ -228,11 +256,14 @@ def _find_start(
     step_options: StepOptions,
     margins: MarginFunctions | None,
 ) -> tuple[np.ndarray, SpecialPoint]:
-    """Return the nearest special point on branches in either parameter, and both parameters."""
+    """Return the values of both parameters, and the special point nearest to the gait.
+
+    The point is on a branch in the first parameter, or else on one in the second.
+    """
     start_values = [
         float(jax.tree.leaves(params)[find_tree_parameter(params, name)]) for name in names
     ]
-    found: list[str] = []
+    found_names: list[str] = []
     for i, bounds in enumerate(limits):
         branch = continue_hybrid_branch(
             walker, params, names[i], bounds, gait, 1, step_options, None, margins, None, ()
@@ -242,9 +273,9 @@ def _find_start(
             start = min(points, key=lambda point: abs(point.value - start_values[i]))
             start_values[i] = start.value
             return np.array(start_values), start
-        found += [point.name for point in branch.special_points]
+        found_names += [point.name for point in branch.special_points]
     raise ValueError(
         f"no special point {name!r} on branches along {names[0]} and {names[1]} within their "
-        f"bounds, but {', '.join(sorted(set(found))) or 'none'}: give a gait nearer to it, or "
-        "wider bounds."
+        f"bounds, but {', '.join(sorted(set(found_names))) or 'none'}: give a gait nearer to it, "
+        "or wider bounds."
     )

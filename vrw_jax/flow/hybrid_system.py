@@ -135,7 +135,7 @@ class HybridSystem(AbstractWalker):
       from which the search for a gait begins if no guess is given;
     - `measures`: measures of its gaits, see `vrw.measure`;
     - `ground`: `{"height": name}` names the parameter that is the rise from the foothold of a step
-      to the next one;
+      to the next one, `{"slope": name}` the slope of a step;
     - `max_events`: largest number of events in one step.
 
     Examples:
@@ -263,7 +263,7 @@ class HybridSystem(AbstractWalker):
         return names.index(mode_name)
 
     def is_inside_mode(self, params: Any, y: StateArray, mode_index: Array) -> Any:
-        """Return whether no guard of a mode is negative at a state."""
+        """Return whether all guards of a mode are zero or positive at a state."""
         guard_values = [mode.guard_values for mode in self._bind_modes(params)]
         are_inside = [lambda y, f=f: jnp.all(f(y) >= 0.0) for f in guard_values]
         return lax.switch(mode_index, are_inside, y)

@@ -29,7 +29,7 @@ from vrw_jax.models.measures import (
     UNILATERAL_STEP_MEASURES,
     get_measure,
 )
-from vrw_jax.models.step_results import AbstractStep
+from vrw_jax.models.step_results import AbstractStep, combine_steps
 from vrw_jax.wheel.params import WheelParams
 
 STATE_AGREEMENT_TOLERANCE = 1e-8
@@ -211,7 +211,12 @@ class AbstractGaitFinder(eqx.Module):
         - `derivatives`: derivatives of the cycle with respect to the parameters on the branch, with
           a leading axis over the parameters.
         """
-        step, step_derivatives = self.read_step(cycle), jax.vmap(self.read_step)(derivatives)
+        step = self.read_step(cycle)
+        if self.leg_period == 1:
+            step_derivatives = jax.vmap(self.read_step)(derivatives)
+        else:  # Minima of margins are no linear functions of the steps.
+            read_numbers = lambda cycle: eqx.filter(self.read_step(cycle), eqx.is_inexact_array)
+            _, step_derivatives = compute_value_and_tangents(read_numbers, (cycle,), (derivatives,))
         n = self.n_coordinates
         coordinates = compute_value_and_tangents(
             lambda x, durations: jnp.concatenate([x[:n], durations]),
@@ -221,9 +226,15 @@ class AbstractGaitFinder(eqx.Module):
         point = GaitBranchPoint(*coordinates, jnp.ones(1), cycle.monodromy_value[:n, :n])
         return Gait(cycle, step, derivatives, step_derivatives, point)
 
+    @property
+    def leg_period(self) -> int:
+        """Return the number of steps after which the legs are in the same roles again."""
+        return getattr(self.model, "leg_period", 1)
+
     def read_step(self, cycle: Any) -> Any:
-        """Return the step of a cycle from which measures are read."""
-        return jax.tree.map(lambda x: x[0], cycle.steps)
+        """Return the step of a cycle from which measures are read, of all legs in turn as one."""
+        steps = [jax.tree.map(lambda x, k=k: x[k], cycle.steps) for k in range(self.leg_period)]
+        return functools.reduce(combine_steps, steps)
 
     @property
     def n_coordinates(self) -> int | None:

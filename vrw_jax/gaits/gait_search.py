@@ -145,8 +145,8 @@ def limit_cycle(
 
     For a `HybridSystem` or another walker of yours, `params` are its parameters. Newton's method
     starts at the `guess`, section coordinates near the gait, or at the walker's `starts`. If it
-    fails, it starts again at the end of a walk from there, but not inside `jit`. The result is a
-    `HybridGait`.
+    fails, a walk begins at the same start, and the method starts again at its end. JAX transforms
+    skip this walk. The result is a `HybridGait`.
 
     Args:
         params: the wheel.

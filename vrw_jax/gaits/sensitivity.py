@@ -102,7 +102,7 @@ def sensitivities(
     gait_measures = measure_gait(guess)
     if isinstance(gait_finder, WalkerFinder) and guess is None:
         has_gait = int(gait_measures.outcome) == Outcome.STEPPED
-        start = None if has_gait else gait_finder.walk_to_start(params)
+        start = None if has_gait else gait_finder.find_gait_by_walk(params)
         gait_measures = gait_measures if start is None else measure_gait(start)
     if int(gait_measures.outcome) != Outcome.STEPPED:
         failure_outcome = Outcome(int(gait_measures.outcome))

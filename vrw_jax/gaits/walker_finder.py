@@ -19,6 +19,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import (
     ParameterDomain,
+    find_tree_parameter,
     list_tree_parameters,
     replace_tree_parameter,
 )
@@ -178,9 +179,14 @@ def find_walker_gaits(
         gait = find_gaits(params, guesses)
         if has_traced_leaf(params, guesses, gait):
             return gait
-        one = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
-        rows, starts = walk_to_starts(
-            walker, one(params), one(guesses), options, one(gait.outcome), period_n
+        add_batch_axis = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
+        rows, starts = collect_walk_ends(
+            walker,
+            add_batch_axis(params),
+            add_batch_axis(guesses),
+            add_batch_axis(gait.outcome),
+            options,
+            period_n,
         )
         found = find_gaits(params, starts[0]) if len(rows) else gait
         return found if found.converged else gait
@@ -199,8 +205,8 @@ def find_walker_gaits(
         return find_gaits(params, guesses)
     find_each = functools.partial(map_in_batches, find_gaits, batch_sizes.GAIT_BATCH_SIZES)
     gaits = find_each(params, guesses)
-    rows, starts = walk_to_starts(
-        walker, params, guesses, options, np.asarray(gaits.outcome), period_n
+    rows, starts = collect_walk_ends(
+        walker, params, guesses, np.asarray(gaits.outcome), options, period_n
     )
     if not len(rows):
         return gaits
@@ -210,31 +216,31 @@ def find_walker_gaits(
 
 
 # Number of steps after which a walk that has not become periodic is given up.
-MAX_STEPS_TO_START = 200
+MAX_WALK_STEPS = 200
 
 
-def walk_to_starts(
+def collect_walk_ends(
     walker: AbstractWalker,
     params: Any,
     guesses: np.ndarray,
-    options: StepOptions,
     outcomes: np.ndarray,
-    period_n: int = 1,
+    options: StepOptions,
+    period_n: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return starts for another search where Newton's method has found no gait: ends of walks.
+    """Return ends of walks, from which Newton's method may find the gaits that it has missed.
 
     The first result contains the indices of elements whose walk from the first guess becomes
-    periodic. The starts have the shape of the guesses.
+    periodic. The ends have the shape of the guesses.
 
     - `params`, `guesses`: parameters and guesses of a batch, (batch, starts, n);
-    - `outcomes`: outcomes of the first search.
+    - `outcomes`: outcomes of the search that has failed.
     """
     is_searched = ~np.isin(outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT))
     rows = np.flatnonzero(is_searched) if not walker.invariants else np.zeros(0, int)
     if not len(rows):
         return rows, guesses[:0]
     ends = walk_until_periodic(
-        select_tree_rows(params, rows), guesses[rows, 0], walker, options, MAX_STEPS_TO_START,
+        select_tree_rows(params, rows), guesses[rows, 0], walker, options, MAX_WALK_STEPS,
         period_n,
     )  # fmt: skip
     is_periodic = ends.period > 0
@@ -435,6 +441,12 @@ class WalkerFinder(AbstractGaitFinder):
                 'ground={"slope": "slope"} or {"height": "rise"}, with the name of its parameter.'
             )
 
+        if walker.invariants:
+            raise ValueError(
+                "the walker conserves a quantity, so that deviations do not decay and no norm is "
+                "finite: take a walker without invariants."
+            )
+
         def take_step(start_and_ground: Array) -> Array:
             start, ground = start_and_ground[:-1], start_and_ground[-1]
             step_params = replace_tree_parameter(params, ground_parameter, ground)
@@ -443,13 +455,13 @@ class WalkerFinder(AbstractGaitFinder):
             values = [jnp.ravel(measures[name]) for name in measure_names]
             return jnp.concatenate([step.section_state, *values])
 
-        ground = jnp.asarray(self.model.get_parameter(params, ground_parameter), x.dtype)
+        ground = jax.tree.leaves(params)[find_tree_parameter(params, ground_parameter)]
         _, jacobian = evaluate_with_jacobian(take_step, jnp.append(x, ground))
-        # A slope belongs to one step. A height ends one step and begins the next.
-        by_next = jacobian[:, -1:]
-        by_last = jnp.zeros_like(by_next) if "slope" in walker.ground else -by_next
+        # A slope belongs to one step. The height of a foothold ends one step and begins the next.
+        own_column = jacobian[:, -1:]
+        previous_column = jnp.zeros_like(own_column) if "slope" in walker.ground else -own_column
         return SlopeResponse.from_jacobian(
-            jnp.concatenate([jacobian[:, :-1], by_last, by_next], 1), len(x)
+            jnp.concatenate([jacobian[:, :-1], previous_column, own_column], 1), len(x)
         )
 
     def find_cycle(self, params: Any, cycle_guess: Any = None) -> HybridGait:  # type: ignore[override]
@@ -462,8 +474,8 @@ class WalkerFinder(AbstractGaitFinder):
         _, params = self.model.from_parameter_values(parameter_values, 0)
         return jnp.atleast_2d(self.model.walker.starts(params))  # type: ignore[misc]
 
-    def walk_to_start(self, params: Any) -> Array | None:
-        """Return a start of another search, after one without a gait: a gait at the end of a walk.
+    def find_gait_by_walk(self, params: Any) -> Array | None:
+        """Return the section state of a gait to which a walk leads, shape (1, n).
 
         Return None if no walk leads to a gait.
         """
@@ -515,7 +527,8 @@ def make_walker_finder(
                 f"{parameter.name} has shape {parameter.value.shape}, but this function is for one "
                 "walker whose parameters are numbers: give one number."
             )
-        parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))
+        if not has_traced_leaf(parameter.value):
+            parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))
         named_domains.append((parameter.name, parameter.domain))
     if walker.starts is None and guess is None:
         raise ValueError(

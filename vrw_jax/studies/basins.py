@@ -310,7 +310,7 @@ class StableGait(NamedTuple):
     model: Any
     step_options: StepOptions
     section_states: np.ndarray  # before the landing of each step, (period_n, m)
-    spectral_radius: float = 0.0  # 0 if it is unknown
+    spectral_radius: Any = np.nan  # NaN if it is unknown
 
     @classmethod
     def from_cycle(
@@ -368,8 +368,8 @@ class StableGait(NamedTuple):
             )
         if not spectral_radius < 1.0:
             raise ValueError(
-                f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable "
-                "and has no basin: take parameters whose gait has a spectral radius below 1."
+                f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable: "
+                "take parameters whose gait has a spectral radius below 1."
             )
         section_states = [np.asarray(cycle.section_state)[None]]
         for k in range(period_n):
@@ -377,7 +377,7 @@ class StableGait(NamedTuple):
             steps = step_batch(params, section_states[-1], model=leg_model, options=options)
             section_states.append(steps.section_state)
         stable_gait = cls(
-            params, model, options, np.concatenate(section_states[:-1]), spectral_radius
+            params, model, options, np.concatenate(section_states[:-1]), np.array(spectral_radius)
         )
         if not stable_gait.is_on_gait(section_states[-1])[0]:
             raise ValueError(

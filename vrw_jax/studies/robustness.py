@@ -51,7 +51,8 @@ class GaitSensitivity(AbstractPrintable):
     The norm is infinite if the gait is not stable. A line of the ground joins two footholds. The
     squares of `ending_step`, `beginning_step` and `later_steps` sum to the square of the norm.
 
-    For a walker of yours, a line is the slope of a step, or the height of a foothold in m.
+    For a walker of yours, the deviations are those of the slopes of steps, in rad, or of the heights
+    of footholds, in m.
 
     - `norm`: norms in the order of `measures`;
     - `ending_step`: signed response of the step that ends on a line to the slope of that line;

@@ -39,7 +39,7 @@ from vrw_jax.gaits.further_search import MeshSearch, search_further
 from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
-from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder, walk_to_starts
+from vrw_jax.gaits.walker_finder import WalkerFinder, collect_walk_ends, make_walker_finder
 from vrw_jax.lanes.batching import (
     choose_batch_size,
     concatenate_tree_rows,
@@ -580,9 +580,10 @@ def evaluate_own_gaits(
         guesses = map_in_numpy_batches(propose, (WALKER_BLOCK_SIZE,), block)
         results = map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block, guesses)
         params = finder.model.from_parameter_values(list(block.T), 0)[1]
-        failed, starts = walk_to_starts(
-            finder.model.walker, params, guesses, finder.step_options, results["outcome"]
-        )
+        failed, starts = collect_walk_ends(
+            finder.model.walker, params, guesses, results["outcome"], finder.step_options,
+            finder.period_n,
+        )  # fmt: skip
         if not len(failed):
             return results
         found = map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block[failed], starts)

@@ -118,7 +118,8 @@ def smallest_disturbance(
     disturbance is the modulus of the change, rad/s. Positions do not change. In double support the
     two feet stay on the ground, so that dtheta determines the rates of the legs. In single support
     the rates of the legs do not change. For a `HybridSystem`, name the `coordinate` of its state
-    that changes. No other coordinate changes, and changes beyond a guard of the mode do not count.
+    that changes. No other coordinate changes. Changes that make a guard of the mode negative are
+    skipped.
 
     The disturbed state is outside the basin if the walk from it does not arrive at the gait (see
     `basin_share`). With the paper's model, a departure from the sequence of phases, which need not
@@ -157,12 +158,12 @@ def smallest_disturbance(
         "vrw.smallest_disturbance", params, model, cycle, options, "disturbances"
     )
     max_size = None if max_size is None else check_positive("max_size", max_size)
-    decay = stable_gait.spectral_radius
-    if decay**max_steps > MAX_ARRIVAL_DISTANCE:
-        n_steps = math.ceil(math.log(MAX_ARRIVAL_DISTANCE) / math.log(decay))
+    spectral_radius = float(stable_gait.spectral_radius)
+    if spectral_radius**max_steps > MAX_ARRIVAL_DISTANCE:
+        n_steps = math.ceil(math.log(MAX_ARRIVAL_DISTANCE) / math.log(spectral_radius))
         raise ValueError(
-            f"max_steps is {max_steps}, but deviations from the gait decay by {decay:.6g} in a "
-            f"step, so that walks need {n_steps} steps to arrive: give max_steps={2 * n_steps}."
+            f"max_steps is {max_steps}, but the gait has spectral radius {spectral_radius:.6g}, so "
+            f"that walks need {n_steps} steps to arrive: give max_steps={2 * n_steps}."
         )
     names = tuple(stable_gait.model.state) if _is_system(stable_gait) else ("dtheta",)
     if coordinate is None and len(names) > 1:
@@ -228,6 +229,9 @@ class _ExitSizeBrackets(NamedTuple):
 # The values are chosen because each pass then covers two intervals of the previous pass. The last
 # pass resolves a ten-thousandth of a phase.
 SAMPLE_STRIDES = (512, 64, 8, 1)
+# Fraction of the duration of a walker's phase at its last sample. The value is chosen because the
+# guard that ends the phase is positive there, up to an error of the state of 1e-10.
+LAST_SAMPLE_FRACTION = 1.0 - 1e-9
 # Number of intervals between the instants that one pass considers in a phase.
 N_INTERVALS_PER_PASS = 16
 # Width of a bracket of sizes in the last pass, relative to the size. The value is chosen as the
@@ -248,11 +252,16 @@ def compute_smallest_disturbance(
     """
     system = stable_gait.model if _is_system(stable_gait) else None
     n_phase_samples = N_INTERVALS_PER_PASS * SAMPLE_STRIDES[0] + 1  # both ends included
-    stride = _sample_stride(stable_gait, n_phase_samples)
+    stride = _sample_stride(stable_gait, n_phase_samples, LAST_SAMPLE_FRACTION)
     coordinates = tuple(system.state) if system else WHEEL_COORDINATES
     index = coordinates.index(coordinate)
     if max_size is None:
         max_size = 2.0 * float(np.abs(stride.states[..., index]).max())
+        if not max_size > 0.0:
+            raise ValueError(
+                f"{coordinate} is zero during the whole gait, so that its size gives no unit for "
+                "changes: give max_size, the largest change that is tried."
+            )
     gait = _DisturbedGait(stable_gait, stride, index, max_size, max_steps)
     # Each pass considers a window of samples for each phase and direction.
     intervals = np.arange(len(stride.times))
@@ -379,14 +388,17 @@ def _walk_after_disturbance(
     for phase_index in np.unique(phase_indices):
         is_in_phase = phase_indices == phase_index
         finish_disturbed_batch = functools.partial(
-            _finish_steps, stable_gait, _key_phase(stable_gait, phase_index), stride.foot_distance
+            _finish_steps,
+            stable_gait,
+            _convert_phase_index(stable_gait, phase_index),
+            stride.foot_distance,
         )
         section_states[is_in_phase], walk_outcomes[is_in_phase] = map_in_batches(
             finish_disturbed_batch,
             batch_sizes.DISTURBANCE_BATCH_SIZES,
             disturbed_states[is_in_phase],
         )
-    # A change beyond a guard of the mode, such as that of a speed at an apex, is not one within it.
+    # A change that crosses a guard of the mode, such as that of a speed at an apex, is skipped.
     leaves_basin = walk_outcomes != NOT_IN_PHASE
     has_stepped = np.flatnonzero(walk_outcomes == Outcome.STEPPED)
     if len(has_stepped):
@@ -398,7 +410,7 @@ def _walk_after_disturbance(
     return leaves_basin.reshape(shape), walk_outcomes.reshape(shape)
 
 
-def _key_phase(gait: StableGait, phase_index: Any) -> Any:
+def _convert_phase_index(gait: StableGait, phase_index: Any) -> Any:
     """Return the index of a phase: an array if one program serves all phases."""
     return jnp.asarray(phase_index, jnp.int32) if _is_system(gait) else int(phase_index)
 
@@ -414,7 +426,7 @@ def _finish_step(
 
 
 NOT_IN_PHASE = -1
-"""Outcome of a step from a state beyond a guard of its mode."""
+"""Outcome of a step from a state at which a guard of its mode is negative."""
 
 
 @eqx.filter_jit
@@ -423,7 +435,7 @@ def _finish_steps(
 ) -> tuple[Array, Array]:
     """Return the section states at the ends of steps, and their outcomes."""
 
-    def finish(y: Array) -> tuple[Array, Array]:
+    def finish_within_phase(y: Array) -> tuple[Array, Array]:
         step = _finish_step(gait, phase_index, foot_distance, y)
         outcome = jnp.asarray(step.outcome)
         if _is_system(gait):
@@ -431,11 +443,11 @@ def _finish_steps(
             outcome = jnp.where(is_inside, outcome, NOT_IN_PHASE)
         return step.section_state, outcome
 
-    return jax.vmap(finish)(states)
+    return jax.vmap(finish_within_phase)(states)
 
 
 @eqx.filter_jit
-def _differentiate_rest(
+def _differentiate_step_rest(
     gait: StableGait, phase_index: Any, foot_distance: Array | None, states: Array
 ) -> Array:
     """Return the derivatives of (section state, remaining duration) by each state."""
@@ -542,8 +554,8 @@ def phase_response(
     stride = _sample_stride(gait, n_samples)
     remaining_jacobians = np.concatenate(
         [
-            _differentiate_rest(
-                gait, _key_phase(gait, index), stride.foot_distance, jnp.asarray(states)
+            _differentiate_step_rest(
+                gait, _convert_phase_index(gait, index), stride.foot_distance, jnp.asarray(states)
             )
             for index, states in zip(stride.phase_indices, stride.states, strict=True)
         ]
@@ -573,7 +585,9 @@ def phase_response(
 
 
 def _differentiate_stride(gait: StableGait) -> tuple[float, np.ndarray, dict[str, np.ndarray]]:
-    """Return the period, and the derivatives of the return map and of measures."""
+    """Return the period, and the derivatives of the return map and of measures by the section
+    state.
+    """
     params, model, options, section_states, _ = gait
 
     def measure(x: Array) -> tuple[Array, dict[str, Array]]:
@@ -591,8 +605,13 @@ def _differentiate_stride(gait: StableGait) -> tuple[float, np.ndarray, dict[str
     return float(measures["period"]), *jax.tree.map(np.asarray, jacobians)
 
 
-def _sample_stride(gait: StableGait, n_samples: int) -> _SampledStride:
-    """Return samples of each phase that takes time in the step of a gait, both ends included."""
+def _sample_stride(
+    gait: StableGait, n_samples: int, last_sample_fraction: float = 1.0
+) -> _SampledStride:
+    """Return samples of each phase that takes time in the step of a gait, both ends included.
+
+    - `last_sample_fraction`: for a `HybridSystem`, fraction of a phase at its last sample.
+    """
     params, model, options, section_states, _ = gait
     x = jnp.asarray(section_states[0])
     if not _is_system(gait):
@@ -612,8 +631,9 @@ def _sample_stride(gait: StableGait, n_samples: int) -> _SampledStride:
     modes, states = tuple(model.modes.values()), []
     for i in intervals:
         field: Any = modes[int(simulation.modes[i])].field
-        move = functools.partial(lambda field, y: field(y, params), field)
-        states.append(sample_phase(move, starts[i], durations[i], n_samples, options))
+        rates = functools.partial(lambda field, y: field(y, params), field)
+        duration = last_sample_fraction * durations[i]
+        states.append(sample_phase(rates, starts[i], duration, n_samples, options))
     return _SampledStride(
         np.asarray(simulation.modes)[intervals],
         np.stack([np.linspace(times[i], times[i + 1], n_samples) for i in intervals]),

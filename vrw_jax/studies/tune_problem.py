@@ -339,7 +339,7 @@ class TuneProblem:
         """
         start_trial, finder = self.evaluate_trial(normalized_parameters, None), self.gait_finder
         if not start_trial.has_gait_on_branch and isinstance(finder, WalkerFinder):
-            start = finder.walk_to_start(self.make_wheel(normalized_parameters))
+            start = finder.find_gait_by_walk(self.make_wheel(normalized_parameters))
             if start is not None:
                 start_trial = self.evaluate_trial(normalized_parameters, None, start)
         if not start_trial.has_gait_on_branch:
@@ -347,7 +347,7 @@ class TuneProblem:
             raise ValueError(
                 f"the start has no gait to tune ({start_outcome.name}: "
                 f"{start_outcome.meaning[:-1]}"
-                "): start from parameters with a gait, such as WheelParams()."
+                "): start from parameters that have one."
             )
         if not start_trial.has_finite_values:
             for constraint_name, value, gradient in zip(
@@ -390,9 +390,9 @@ class TuneProblem:
         )
         numpy_values = self.denormalize_parameters(normalized_parameters)
         parameter_values = jnp.asarray(numpy_values)
-        initial_guess = make_guess(parameter_values) if guess is None else guess
         if neighbor_trial is not None:
-            initial_guess = neighbor_trial.gait.cycle.warm_start
+            guess = neighbor_trial.gait.cycle.warm_start
+        initial_guess = make_guess(parameter_values) if guess is None else guess
         gait = find_gait(parameter_values, initial_guess)
         values, jacobian = map(np.array, evaluate_measures(self.objective_and_constraints, gait))
         free_jacobian = np.swapaxes(jacobian[..., self.free_parameter_indices, :], -1, -2)
