@@ -560,7 +560,7 @@ def test_parallel_batches_give_the_same_results(
 
 TWO_DEVICE_SCRIPT = """
 import os, sys
-os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " {flag}"
 import jax, numpy as np
 import vrw_jax
 from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
@@ -584,7 +584,11 @@ def test_two_devices_give_bitwise_the_results_of_one(
     """Two batches, one for each device of a process that has two."""
     place = tmp_path / "told.npz"
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    code = TWO_DEVICE_SCRIPT.format(tests=str(Path(__file__).parents[1]), place=str(place))
+    code = TWO_DEVICE_SCRIPT.format(
+        tests=str(Path(__file__).parents[1]),
+        place=str(place),
+        flag="--xla_force_host_platform_device_count=2",
+    )
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": cache}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
     joint_result = np.load(place)
