@@ -21,6 +21,7 @@ import numpy as np
 from vrw_jax.lanes.arithmetic import emit_llvm_elementwise_primitive
 from vrw_jax.lanes.lazy_arrays import (
     EntryIndex,
+    JoinedArray,
     LazyArray,
     LlvmArray,
     MemoryArray,
@@ -282,6 +283,12 @@ class ArrayEmitter:
         if isinstance(array, UninitializedArray) or memory_array.contains_array(array):
             return
         start_index = start_index or (0,) * len(array.shape)
+        if isinstance(array, JoinedArray):
+            for part, part_start_index in zip(array.parts, array.start_indices, strict=True):
+                self.emit_array_stores(
+                    memory_array, part, self.emit_sum_of_indices(part_start_index, start_index)
+                )
+            return
         if isinstance(array, PendingArrayUpdate):
             # New entries may depend on the entries that they replace, so they are computed first.
             if memory_array.contains_array(array.base_array):

@@ -19,6 +19,7 @@ from vrw_jax.lanes.array_emitter import (
 )
 from vrw_jax.lanes.lazy_arrays import (
     EntryIndex,
+    JoinedArray,
     LazyArray,
     LlvmArray,
     MemoryArray,
@@ -235,10 +236,15 @@ def _concatenate_along_axis(
             )
         return selected_entry
 
-    return LazyArray(
+    return JoinedArray(
         result_shape,
         array_emitter.get_entry_type(primitive_call.result_aval),
         select_joined_array_entry,
+        nonempty_arrays,
+        [
+            tuple(start if axis == join_axis else 0 for axis in range(len(result_shape)))
+            for start in part_starts[:-1]
+        ],
     )
 
 

@@ -3,7 +3,7 @@
 Arrays that emit instructions have a reference to their `ArrayEmitter`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,6 +31,14 @@ class LazyArray:
 
 class UninitializedArray(LazyArray):
     """Large array whose entries are overwritten before they are read."""
+
+
+@dataclass(eq=False)
+class JoinedArray(LazyArray):
+    """Arrays that are joined along one axis, and can be stored one after another."""
+
+    parts: Sequence["LlvmArray"]
+    start_indices: Sequence[EntryIndex]  # index at which each part begins
 
 
 class PendingArrayUpdate(LazyArray):
