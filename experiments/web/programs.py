@@ -26,15 +26,14 @@ from vrw_jax.models import (
     advance_gait_step,
     compute_jacobian_columns,
 )
-from vrw_jax.models.contact_integrator import (
-    N_ACCUMULATOR_ROWS,
-    ContactIntervalPoint,
+from vrw_jax.models.contact_kernel import BatchWalkSettings, advance_to_events, init_lane_states
+from vrw_jax.models.contact_mechanics import (
+    compute_kinetic_energy,
+    compute_potential_energy,
     unpack_motion,
 )
-from vrw_jax.models.contact_kernel import BatchWalkSettings, init_lane_states, process_and_integrate
-from vrw_jax.models.contact_mechanics import compute_kinetic_energy, compute_potential_energy
 from vrw_jax.models.contact_section import compute_full_section_size, embed_section_state
-from vrw_jax.models.contact_state import ContactState
+from vrw_jax.models.contact_state import N_LOSSES, ContactState
 from vrw_jax.models.contact_step import sample_contact_interval
 from vrw_jax.models.phase_sequence import evaluate_phase_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
@@ -205,13 +204,10 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         coordinates, rates, contacts and stoppers, and how long it lasted; what the step tells so
         far; and its outcome, -1 while it goes on."""
         walk = on(tolerance)
-        past, after = process_and_integrate(
-            walk, columns(parameters, friction), _rebuild_tree(lane, form), waits_for_events=True
+        past, after = advance_to_events(
+            walk, columns(parameters, friction), _rebuild_tree(lane, form)
         )
-        (q, v, _), stance = (
-            past.contact_interval_state.contact_interval_point,
-            past.contact_interval_state.contact_state,
-        )
+        q, v, stance = past.q, past.v[:n], past.contact_state
         codes = [stance.contact_modes.astype(float), stance.is_leg_locked.astype(float)]
         step = walk.compute_step_result(after, columns(parameters, friction))
         result = (
@@ -219,9 +215,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
             step.energy_damping, step.energy_friction,
             *(getattr(step.margins, name) for name in STOPPER_MARGIN_MEASURES),
         )  # fmt: skip
-        stretch = jnp.concatenate(
-            [q, v, *codes, after.contact_interval_state.time_since_event[None]]
-        )
+        stretch = jnp.concatenate([q, v, *codes, after.interval_duration[None]])
         return _flat(after), stretch, _flat((step.section_state, *result)), after.walk_outcome
 
     def between(tolerance: Array, friction: Array, parameters: Array, stretch: Array) -> tuple:
@@ -235,16 +229,11 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
         walk, none = on(tolerance), locked & False
         stance = ContactState(contact, locked, none, none, none)
         flow = walk.make_lane_contact_dynamics(columns(parameters, friction), stance)
-        blank = jnp.zeros((N_ACCUMULATOR_ROWS, *q.shape[1:]), q.dtype)
-        motion = unpack_motion(ContactIntervalPoint(q, v, q))
-        rows = sample_contact_interval(
-            flow, motion, blank, stretch[-1], SAMPLES, walk.step_options, tableau
-        )
+        v = jnp.concatenate([v, jnp.zeros_like(q[:N_LOSSES])])
+        rows = sample_contact_interval(flow, q, v, stretch[-1], SAMPLES, walk.step_options, tableau)
 
         def row(row_values: Array) -> Array:
-            motion = unpack_motion(
-                ContactIntervalPoint(row_values[:n], row_values[n : 2 * n], row_values)
-            )
+            motion = unpack_motion(row_values[:n], row_values[n : 2 * n])
             energies = (
                 compute_kinetic_energy(flow.s, motion),
                 *compute_potential_energy(flow.s, motion),
@@ -252,7 +241,7 @@ def _on_ground(wheel: Callable[[Array], WheelParams], n_legs: int) -> dict[str, 
             return jnp.concatenate(
                 [
                     row_values[:n],
-                    row_values[2 * n + N_ACCUMULATOR_ROWS :],
+                    row_values[2 * n + N_LOSSES :],
                     jnp.stack(energies),
                 ]
             )

@@ -10,12 +10,8 @@ from scipy.integrate import solve_ivp
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.models.contact_integrator import (
-    PAINLEVE_ATOL,
-    PAINLEVE_RTOL_FACTOR,
-    EventBracket,
-    _find_earliest_root,
-)
+from vrw_jax.flow.event_location import _propose_earliest_event
+from vrw_jax.models.contact_integrator import PAINLEVE_ATOL, PAINLEVE_RTOL_FACTOR
 from vrw_jax.models.contact_mechanics import compute_leg_directions
 
 N_WHEELS, N_STEPS = 128, 60
@@ -33,10 +29,10 @@ def draw_wheels():
     return params, np.stack([draw(*bounds, N_WHEELS) for bounds in limits], 1)
 
 
-def find_walk_ends(friction, stoppers, tolerance):
+def find_walk_ends(friction, stoppers, tolerance, **settings):
     """Return the outcomes of the wheels that do not walk all steps."""
     params, starts = draw_wheels()
-    model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers)
+    model = vrw.UnilateralWheel(friction=friction, stoppers=stoppers, **settings)
     options = vrw.StepOptions(solver="Tsit5", rtol=tolerance, atol=tolerance)
     outcomes = np.asarray(
         vrw.step_batch(params, starts, N_STEPS, model=model, options=options).outcome
@@ -53,8 +49,12 @@ def test_outcomes_of_walks_do_not_depend_on_the_tolerance(tolerance):
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-12])
 def test_outcomes_with_one_sided_stoppers_do_not_depend_on_the_tolerance(tolerance):
-    """Without patience ten of 6,827 steps were lost at 1e-12 and high friction (see `ledger`)."""
-    assert find_walk_ends(INFINITE_FRICTION, "one-sided", tolerance) == FALL_OUTCOMES
+    """Without patience ten of 6,827 steps were lost at 1e-12 and high friction (see `ledger`).
+
+    At infinite friction and 1e-12, some chains of events are longer than 400, which is the default.
+    """
+    ends = find_walk_ends(INFINITE_FRICTION, "one-sided", tolerance, max_events=4000)
+    assert ends == FALL_OUTCOMES
     assert find_walk_ends(HIGH_FRICTION, "one-sided", tolerance) == PARADOX_OUTCOMES
 
 
@@ -105,11 +105,7 @@ def test_leg_directions_are_accurate_after_any_number_of_turns():
 def test_a_guard_that_is_already_negative_precedes_falling_guards():
     """The first stands on its own event, rises and is below at the end; the second falls there."""
     column = lambda *values: jnp.asarray(values)[:, None]
-    start, end, crossing = column(1e-14, 1.0), column(-1e-7, -0.1), column(True, True)
-    slope = column(-1e-7, -1.1)
-    first, _ = _find_earliest_root(start, slope, 0.0 * slope, crossing, column(True, False))
-    assert first[0] == -jnp.inf
-    none = jnp.zeros(1)
-    search = EventBracket(none > 0, crossing, *(none,) * 4, jnp.asarray([1.0]), 2.0 * end)
-    first, _ = search.find_earliest_secant_root(end, jnp.asarray([1.1]), crossing)
-    assert first[0] == -jnp.inf
+    time, guard_index = _propose_earliest_event(
+        column(-1e-7, -0.1), column(1e-7, -1.1), column(True, True)
+    )
+    assert (time[0], guard_index[0]) == (-jnp.inf, 0)

@@ -289,7 +289,7 @@ def integrate_free_flight(start, rate, acceleration=1.0, options=None):
     zero, one = jnp.zeros(8), jnp.ones(8)
     phase = BatchPhase(
         lambda q, v: StageAccelerations(q[0], q[0], (acceleration * jnp.ones_like(q[0]),)),
-        lambda place: (place.q[0],),
+        lambda place: place.q[0][None],
     )
     end = integrate_batch_phase(
         lambda constants, held: phase,

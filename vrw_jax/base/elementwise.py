@@ -20,11 +20,12 @@ from vrw_jax.base.types import Elementwise
 def select_entry_by_mask(entry_index: Array, stacked_entries: Array, axis: int = 0) -> Array:
     """Return the entry of `stacked_entries` at `entry_index` along an axis, using a masked sum.
 
-    In a batch, the masked sum is cheaper than a gather.
+    The index is a number, or an array whose axes are the last ones of `stacked_entries`. In a
+    batch, the masked sum is cheaper than a gather.
     """
-    is_selected = jnp.arange(stacked_entries.shape[axis]) == entry_index
-    is_selected = is_selected.reshape(-1, *(1,) * (stacked_entries.ndim - 1 - axis))
-    return jnp.sum(jnp.where(is_selected, stacked_entries, 0.0), axis)
+    indices = np.arange(stacked_entries.shape[axis], dtype=np.int32)
+    indices = indices.reshape(-1, *(1,) * (stacked_entries.ndim - 1 - axis))
+    return jnp.sum(jnp.where(indices == entry_index, stacked_entries, 0.0), axis)
 
 
 def run_if_any_element_active(

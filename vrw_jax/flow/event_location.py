@@ -1,18 +1,16 @@
 """Locate the earliest root of the guards inside a solver step, for each batch element."""
 
-import functools
-from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base.elementwise import select_trees_by_condition
+from vrw_jax.base.elementwise import select_entry_by_mask, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Vector
 from vrw_jax.flow.minima import MarginMinimaState
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
@@ -22,7 +20,7 @@ from vrw_jax.flow.tableaus import (
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
+from vrw_jax.flow.tangents import BatchPhase
 
 
 class IntegrationStatus(IntEnum):
@@ -33,18 +31,19 @@ class IntegrationStatus(IntEnum):
     FAILED = 2
     CROSSED = 3  # The last tried step crosses a guard.
     IDLE = 4  # The element is inactive, or its start is already an event.
+    PAUSED = 5  # The element waits for others that take their last solver step.
 
 
 class IntegratorState(NamedTuple):
     """State of the integration loop for each batch element."""
 
     state: StageState
-    guard_values: Vector  # guards at `state`
+    guard_values: Array  # guards at `state`, (guards, batch)
     next_step_length: Array
     elapsed_time: Array
     integration_status: Array  # an IntegrationStatus, after the last tried step
-    middle_guard_values: Vector  # guards at the middle stage of the last tried step
-    end_guard_values: Vector
+    middle_guard_values: Array  # guards at the middle stage of the last tried step
+    end_guard_values: Array
     n_tried_steps: Array
     # number of iterations after which half of the batch had ended
     n_iterations_until_half_ended: Array
@@ -53,6 +52,7 @@ class IntegratorState(NamedTuple):
     state_tangents: (
         Array | None
     )  # tangents of the state, (directions, components, batch), see `tangents`
+    is_arriving: Array | None = None  # whether the next solver step ends at the located event
 
     @property
     def is_running(self) -> Array:
@@ -139,16 +139,17 @@ def locate_event(
     """
     step_length = integrator_state.next_step_length
     end_time = integrator_state.elapsed_time + step_length
-    event_time_rtol = jnp.sqrt(options.rtol)
+    event_time_rtol, max_correction = jnp.sqrt(options.rtol), phase.max_event_correction
     locator = _EventLocator(
         phase,
         solver_step_function,
         tableau,
         integrator_state,
         options,
-        is_crossing=[guard_value <= 0.0 for guard_value in integrator_state.end_guard_values],
+        is_crossing=integrator_state.end_guard_values <= 0.0,
         max_extrapolation_time=jnp.maximum(
-            options.rtol * step_length, 1e3 * jnp.finfo(end_time.dtype).eps * end_time
+            (options.rtol if max_correction is None else max_correction) * step_length,
+            1e3 * jnp.finfo(end_time.dtype).eps * end_time,
         )
         if phase.has_exact_events
         else 0.1 * event_time_rtol * step_length,
@@ -164,8 +165,12 @@ def locate_event(
     extrapolate = lambda x, y: x + search.remaining_time_to_event * y
     event_state = search.end_state
     event_state = event_state._replace(
-        q=tuple(map(extrapolate, event_state.q, event_state.v)),
-        v=tuple(map(extrapolate, event_state.v, event_state.acceleration.acceleration)),
+        q=jax.tree.map(extrapolate, event_state.q, event_state.v[: len(event_state.q)]),
+        v=jax.tree.map(
+            extrapolate,
+            event_state.v,
+            event_state.acceleration.acceleration[: len(event_state.v)],
+        ),
     )
     return search._replace(
         is_event_unresolved=is_failed | search.is_event_unresolved,
@@ -183,29 +188,24 @@ class _EventLocator(NamedTuple):
     tableau: ButcherTableau
     step_start: IntegratorState
     options: StepOptions
-    is_crossing: list[Array]  # whether each guard crosses zero in the solver step
+    is_crossing: Array  # whether each guard crosses zero in the solver step
     max_extrapolation_time: Array  # longest time to the event that ends the search, s
     max_short_step_duration: Array  # s
 
     def begin(self) -> EventSearch:
         """Return the search before its first iteration."""
         step_start, step_length = self.step_start, self.step_start.next_step_length
-        first_crossing_fraction = jnp.ones_like(step_length)
-        for is_crossing_guard, *crossing_values in zip(
+        fractions_to_zero = _find_parabola_zeros(
+            self.tableau,
+            self.phase.guards_rising_at_start is not None,
             self.is_crossing,
             step_start.guard_values,
             step_start.middle_guard_values,
             step_start.end_guard_values,
-            strict=True,
-        ):
-            fraction_to_zero = _find_parabola_zero(
-                self.tableau, is_crossing_guard, *crossing_values
-            )
-            first_crossing_fraction = jnp.where(
-                is_crossing_guard,
-                jnp.minimum(first_crossing_fraction, fraction_to_zero),
-                first_crossing_fraction,
-            )
+        )
+        first_crossing_fraction = jnp.min(
+            jnp.where(self.is_crossing, fractions_to_zero, 1.0), axis=0
+        )
         return EventSearch.begin(
             step_start, step_length * first_crossing_fraction, self.phase.has_exact_events
         )
@@ -220,25 +220,24 @@ class _EventLocator(NamedTuple):
         time_to_event, guard_index = _propose_earliest_event(
             guard_values, guard_rates, self.is_crossing
         )
-        is_before_event = jnp.ones(step_length.shape, bool)
-        is_guard_straight = jnp.ones(step_length.shape, bool)
-        for start_guard_value, guard_value, guard_rate, is_crossing_guard in zip(
-            self.step_start.guard_values, guard_values, guard_rates, self.is_crossing, strict=True
-        ):
-            has_crossed, is_guard_curved = _classify_guard_crossing(
-                start_guard_value, guard_value, guard_rate, step_length
-            )
-            is_before_event = is_before_event & ~(is_crossing_guard & has_crossed)
-            is_guard_straight = is_guard_straight & ~(is_crossing_guard & is_guard_curved)
+        is_before_event = ~jnp.any(
+            self.is_crossing & has_guard_crossed(guard_values, guard_rates), axis=0
+        )
         lower_bound = jnp.where(is_before_event, step_length, search.lower_step_length_bound)
         upper_bound = jnp.where(is_before_event, search.upper_step_length_bound, step_length)
         proposed_step_length = step_length + time_to_event
         is_proposal_in_bracket = (
             proposed_step_length >= lower_bound - self.max_extrapolation_time
         ) & (proposed_step_length <= upper_bound + self.max_extrapolation_time)
-        next_step_length = jnp.where(
-            is_proposal_in_bracket, proposed_step_length, 0.5 * (lower_bound + upper_bound)
-        )
+        bisected_length = 0.5 * (lower_bound + upper_bound)
+        if self.phase.guards_rising_at_start is not None:
+            # A guard that rises at the start of the phase and falls soon after it has two roots
+            # there, to which Newton's method and bisections only halve the distance.
+            is_near_start = lower_bound < 0.1 * upper_bound
+            bisected_length = jnp.where(is_near_start, 0.125 * upper_bound, bisected_length)
+            is_halving = jnp.abs(proposed_step_length - 0.5 * step_length) < 0.1 * step_length
+            is_proposal_in_bracket = is_proposal_in_bracket & ~(is_near_start & is_halving)
+        next_step_length = jnp.where(is_proposal_in_bracket, proposed_step_length, bisected_length)
         if self.phase.has_exact_events:
             guard_index = jnp.where(jnp.isposinf(time_to_event), -1, guard_index)
             time_to_event = next_step_length - step_length
@@ -246,10 +245,22 @@ class _EventLocator(NamedTuple):
                 search, time_to_event, guard_index, guard_values
             )
         else:
+            linear_decrease = guard_rates * step_length
+            is_curved = self.is_crossing & (
+                jnp.abs(
+                    2.0
+                    * (self.step_start.guard_values - guard_values + linear_decrease)
+                    * guard_values
+                )
+                > 0.25 * linear_decrease * linear_decrease
+            )
+            # A guard that is too curved for Newton's method takes no short step.
             is_near = is_proposal_in_bracket & (
                 jnp.abs(time_to_event)
                 <= jnp.where(
-                    is_guard_straight, self.max_short_step_duration, self.max_extrapolation_time
+                    jnp.any(is_curved, axis=0),
+                    self.max_extrapolation_time,
+                    self.max_short_step_duration,
                 )
             )
         is_at_event = search.is_event_unresolved & is_near
@@ -272,7 +283,7 @@ class _EventLocator(NamedTuple):
         )
 
     def _confirm_exact_event(
-        self, search: EventSearch, time_to_event: Array, guard_index: Array, guard_values: Vector
+        self, search: EventSearch, time_to_event: Array, guard_index: Array, guard_values: Array
     ) -> tuple[Array, Array]:
         """Return whether an exact event is located, and the index of its guard.
 
@@ -285,20 +296,22 @@ class _EventLocator(NamedTuple):
         assert search.correction is not None
         correction = jnp.abs(time_to_event)
         event_time = self.step_start.elapsed_time + search.event_step_length + time_to_event
-        is_near = (correction <= self.max_extrapolation_time) & (
-            (correction <= EVENT_TIME_ACCURACY * event_time)
-            | (correction >= STALLED_CORRECTION_RATIO * search.correction)
-        )
+        is_near = correction <= self.max_extrapolation_time
+        if self.phase.max_event_correction is None:
+            is_near = is_near & (
+                (correction <= EVENT_TIME_ACCURACY * event_time)
+                | (correction >= STALLED_CORRECTION_RATIO * search.correction)
+            )
         scales = self.phase.guard_scales
-        values = jnp.stack(guard_values)
         scaled_values = jnp.where(
-            jnp.stack(self.is_crossing), values if scales is None else values / scales, jnp.inf
+            self.is_crossing, guard_values if scales is None else guard_values / scales, jnp.inf
         )
-        roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(values.dtype).eps
-        is_at_roundoff = (jnp.abs(jnp.min(scaled_values)) <= roundoff) & (scales is not None)
+        roundoff = GUARD_ROUNDOFF_IN_EPS * jnp.finfo(guard_values.dtype).eps
+        lowest = jnp.min(scaled_values, axis=0)
+        is_at_roundoff = (jnp.abs(lowest) <= roundoff) & (scales is not None)
         return is_near | is_at_roundoff, jnp.where(
             is_at_roundoff | (guard_index < 0),
-            jnp.argmin(scaled_values).astype(jnp.int32),
+            find_first_guard(scaled_values == lowest, 0),
             guard_index,
         )
 
@@ -365,66 +378,53 @@ class _EventLocator(NamedTuple):
         )
 
 
-def compute_event_time_tangent(
-    is_at_event: Array, event_guard_index: Array, guard_rates: Any, guard_tangents: Any
-) -> Array:
-    """Return the tangent of the event's time, s, from rates and tangents of all guards.
-
-    The tangent follows from the condition that the guard is zero at the event of the perturbed
-    motion. Without an event, or if the guard does not fall, the tangent is zero.
-
-    - `event_guard_index`: index of the guard that is zero at the event;
-    - `guard_rates`, `guard_tangents`: time derivatives and tangents, one array for each guard.
-    """
-    event_time_tangent = jnp.zeros_like(guard_tangents[0])
-    for guard_index in range(len(guard_tangents)):
-        guard_rate = guard_rates[guard_index]
-        is_event_guard = is_at_event & (event_guard_index == guard_index) & (guard_rate < 0.0)
-        event_time_tangent = jnp.where(
-            is_event_guard,
-            -guard_tangents[guard_index] / jnp.where(is_event_guard, guard_rate, -1.0),
-            event_time_tangent,
-        )
-    return event_time_tangent
-
-
 def propagate_to_event(
     tableau: ButcherTableau,
-    solver_step_function: SolverStepFunction,
-    phase_tangents: PhaseTangents,
+    solver_step_function: SolverStepFunction | None,
+    phase_tangents: Any,
     integrator_state: IntegratorState,
     last_step_length: Array,
     event_guard_index: Array,
-) -> tuple[Array, Array, Vector]:
+) -> tuple[Array, Array, Array]:
     """Return the tangents after the last solver step of a phase.
 
-    They are those at a fixed time, (directions, components, batch), that of the event's time, and
-    those of positions and rates at the event.
+    They are those at a fixed time, that of the event's time, and those of positions and rates at
+    the event. The axes are those of directions, components and the batch. Without an event, or if
+    its guard does not fall, the tangent of the time is zero.
 
+    - `solver_step_function`: None if the last solver step is already taken;
     - `last_step_length`: time from `integrator_state` to the event, s.
     """
-    stage_states, _ = solver_step_function(integrator_state.state, last_step_length)
-    assert integrator_state.state_tangents is not None
-    end_state_tangents = phase_tangents.propagate_to_step_end(
-        tableau, stage_states, integrator_state.state_tangents, last_step_length
+    end_state, end_tangents = integrator_state.state, integrator_state.state_tangents
+    assert end_tangents is not None
+    if solver_step_function is not None:
+        stage_states, _ = solver_step_function(end_state, last_step_length)
+        end_state = stage_states[-1]
+        end_tangents = phase_tangents.propagate_to_step_end(
+            tableau, stage_states, end_tangents, last_step_length
+        )
+    guard_rate, guard_tangent = phase_tangents.evaluate_rate_and_tangents(
+        lambda phase, state: select_entry_by_mask(event_guard_index, phase.evaluate_guards(state)),
+        end_state,
+        end_tangents,
     )
-    end_state, n = stage_states[-1], len(stage_states[-1].q)
-    tangents_by_component = tuple(jnp.moveaxis(end_state_tangents, 1, 0))
-    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
-    event_time_tangent = compute_event_time_tangent(
-        integrator_state.has_guard_crossed,
-        event_guard_index,
-        phase.evaluate_with_rates(phase.evaluate_guards, end_state)[1],
-        phase_tangents.evaluate_tangents(
-            lambda phase, state: phase.evaluate_guards(state), end_state, end_state_tangents
-        ),
+    # The guard is zero at the event of the perturbed motion too.
+    is_guard_falling = integrator_state.has_guard_crossed & (guard_rate < 0.0)
+    event_time_tangent = jnp.where(
+        is_guard_falling, -guard_tangent / jnp.where(is_guard_falling, guard_rate, -1.0), 0.0
     )
-    motion_rates = (*end_state.v, *end_state.acceleration.acceleration[:n])
-    state_tangents = tuple(
-        x + event_time_tangent * y
-        for x, y in zip(tangents_by_component[: 2 * n], motion_rates, strict=True)
+    motion_rates = evaluate_motion_rates(end_state)
+    motion_tangents = end_tangents[:, : len(motion_rates)]
+    return (
+        end_tangents,
+        event_time_tangent,
+        motion_tangents + event_time_tangent[:, None] * motion_rates,
     )
-    return end_state_tangents, event_time_tangent, state_tangents
+
+
+def evaluate_motion_rates(state: StageState) -> Array:
+    """Return the time derivatives of positions and rates, (components, batch)."""
+    return jnp.stack([*state.v[: len(state.q)], *state.acceleration.acceleration[: len(state.v)]])
 
 
 def has_guard_crossed(guard_value: Array, guard_rate: Array) -> Array:
@@ -432,31 +432,16 @@ def has_guard_crossed(guard_value: Array, guard_rate: Array) -> Array:
     return (guard_value < 0.0) | ((guard_value == 0.0) & (guard_rate <= 0.0))
 
 
-def find_first_guard(is_guard_met: Sequence[Array] | Array, index_if_none: int) -> Array:
+def find_first_guard(is_guard_met: Array, index_if_none: int) -> Array:
     """Return the index of the first guard whose flag is True, or `index_if_none`."""
-    first_guard = jnp.full(is_guard_met[0].shape, index_if_none, jnp.int32)
-    for guard_index in reversed(range(len(is_guard_met))):
-        first_guard = jnp.where(is_guard_met[guard_index], guard_index, first_guard)
-    return first_guard
-
-
-@jax.jit  # The function is traced once for all guards.
-def _classify_guard_crossing(
-    start_guard_value: Array, guard_value: Array, guard_rate: Array, step_length: Array
-) -> tuple[Array, Array]:
-    """Return whether a guard has crossed zero, and whether it is too curved for Newton's method.
-
-    - `start_guard_value`: value of the guard at the start of the solver step;
-    - `guard_value`, `guard_rate`: value and time derivative of the guard after `step_length`, s.
-    """
-    linear_decrease = guard_rate * step_length
-    return has_guard_crossed(guard_value, guard_rate), jnp.abs(
-        2.0 * (start_guard_value - guard_value + linear_decrease) * guard_value
-    ) > 0.25 * linear_decrease * linear_decrease
+    n_guards = len(is_guard_met)
+    indices = np.arange(n_guards, dtype=np.int32).reshape(-1, *(1,) * (is_guard_met.ndim - 1))
+    first_guard = jnp.min(jnp.where(is_guard_met, indices, n_guards), axis=0)
+    return jnp.where(first_guard < n_guards, first_guard, index_if_none)
 
 
 def _propose_earliest_event(
-    guard_values: Vector, guard_rates: Vector, is_crossing: list[Array]
+    guard_values: Array, guard_rates: Array, is_crossing: Array
 ) -> tuple[Array, Array]:
     """Return the time to the earliest event, s, by one Newton step, and the guard's index.
 
@@ -464,42 +449,25 @@ def _propose_earliest_event(
     guard that is negative and rises, because this guard crossed zero at an unknown earlier time.
     `is_crossing` states for each guard whether it crosses zero.
     """
-    time_to_event = jnp.full_like(guard_values[0], jnp.inf)
-    guard_index = jnp.zeros(time_to_event.shape, jnp.int32)
-    for candidate_guard_index, guard in enumerate(
-        zip(is_crossing, guard_values, guard_rates, strict=True)
-    ):
-        guard_zero_time = _compute_time_to_zero(*guard)
-        guard_index = jnp.where(guard_zero_time < time_to_event, candidate_guard_index, guard_index)
-        time_to_event = jnp.minimum(guard_zero_time, time_to_event)
-    return time_to_event, guard_index
-
-
-@jax.jit  # The function is traced once for all guards.
-def _compute_time_to_zero(is_crossing: Array, guard_value: Array, guard_rate: Array) -> Array:
-    """Return the time from the present state to the root of a guard's tangent line, s.
-
-    The time is infinite for a guard that does not cross zero. It is minus infinity for a crossing
-    guard that is negative and does not fall.
-    """
-    is_guard_falling = is_crossing & (guard_rate < 0.0)
-    time_to_zero_if_rising = jnp.where(is_crossing & (guard_value < 0.0), -jnp.inf, jnp.inf)
-    return jnp.where(
+    is_guard_falling = is_crossing & (guard_rates < 0.0)
+    times_to_zero = jnp.where(
         is_guard_falling,
-        -guard_value / jnp.where(is_guard_falling, guard_rate, -1.0),
-        time_to_zero_if_rising,
+        -guard_values / jnp.where(is_guard_falling, guard_rates, -1.0),
+        jnp.where(is_crossing & (guard_values < 0.0), -jnp.inf, jnp.inf),
     )
+    time_to_event = jnp.min(times_to_zero, axis=0)
+    return time_to_event, find_first_guard(times_to_zero == time_to_event, 0)
 
 
-@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
-def _find_parabola_zero(
+def _find_parabola_zeros(
     tableau: ButcherTableau,
+    may_rise_from_roundoff: bool,
     is_crossing: Array,
     start_guard_value: Array,
     middle_guard_value: Array,
     end_guard_value: Array,
 ) -> Array:
-    """Return the root of a guard's parabola, as a fraction of the solver step.
+    """Return the root of each guard's parabola, as a fraction of the solver step.
 
     The parabola passes through the guard's values at the start, at the middle stage and at the end.
     The secant method, followed by Newton's method, locates the root.
@@ -514,7 +482,9 @@ def _find_parabola_zero(
     )
     fraction_to_zero = jnp.clip(start_guard_value / guard_decrease, 0.0, 1.0)
     # A guard that rises from zero vanishes at the start of the step, so the other root is returned.
-    is_guard_rising = is_crossing & (start_guard_value == 0.0) & (linear_coefficient > 0.0)
+    is_guard_rising = is_crossing & (linear_coefficient > 0.0)
+    if not may_rise_from_roundoff:
+        is_guard_rising = is_guard_rising & (start_guard_value == 0.0)
     fraction_to_zero = jnp.where(
         is_guard_rising,
         jnp.clip(

@@ -16,7 +16,10 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import lanes
-from vrw_jax.base.elementwise import select_trees_by_condition
+from vrw_jax.base.elementwise import (
+    run_if_any_element_active,
+    select_trees_by_condition,
+)
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.event_location import (
@@ -53,6 +56,7 @@ from vrw_jax.flow.tangents import (
     apply_batched_jvp_rule,
     stack_directions,
 )
+from vrw_jax.lanes.batching import make_zeros_like_output
 
 
 class PhaseEnd(NamedTuple):
@@ -114,7 +118,7 @@ def integrate_batch_phase(
     """
 
     def integrate(
-        phase_tangents: PhaseTangents | None,
+        phase_tangents: Any,
         phase_constants: Any,
         held_constants: Vector,
         q: Vector,
@@ -136,13 +140,16 @@ def integrate_batch_phase(
                 make_phase, primals[0], primals[1], phase_constants_tangents, start_tangents
             )
             phase_end, search_end = integrate(phase_tangents, *primals)
-            return phase_end, _compute_phase_end_jvp(tableau, phase_tangents, phase_end, search_end)
+            return phase_end, compute_phase_end_jvp(tableau, phase_tangents, phase_end, search_end)
 
-        phase_end, (q, v, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
+        phase_end, (motion_tangent, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
             integrate_with_tangents, primals, state_tangents[:4]
         )
         zero_phase_end = lanes.make_zero_tangent(phase_end)
-        state_tangent = zero_phase_end.state._replace(q=q, v=v)
+        n = len(phase_end.state.q)
+        state_tangent = zero_phase_end.state._replace(
+            q=tuple(motion_tangent[:n]), v=tuple(motion_tangent[n:])
+        )
         return phase_end, zero_phase_end._replace(
             state=state_tangent, duration=event_time_tangent, margin_minima=minima_tangents
         )
@@ -155,41 +162,40 @@ def integrate_batch_phase(
 class SearchEnd(NamedTuple):
     """What derivatives of the end of a phase need of its integration."""
 
-    solver_step_function: SolverStepFunction
+    solver_step_function: Any  # None if the last solver step is already taken
     start_state: StageState
     integrator_state: IntegratorState  # after the loop, with the minima of the whole phase
-    margin_minima_result: MarginMinimaResult | None
-    # Only phases with kinks have the following data.
-    enter_sides: EnterSides | None = None
-    sides: Vector = ()  # at the end of the phase
-    located_guard_index: Any = None  # guard that is zero at the end
+    located_guard_index: Array  # guard that is zero at the end
+    enter_sides: EnterSides | None  # None for phases without kinks
+    sides: Vector  # sides of the kinks at the end
+    margin_minima_result: MarginMinimaResult | None = None
 
 
-def _compute_phase_end_jvp(
+def compute_phase_end_jvp(
     tableau: ButcherTableau,
-    phase_tangents: PhaseTangents,
+    phase_tangents: Any,
     phase_end: PhaseEnd,
     search_end: SearchEnd,
-) -> tuple[Vector, Vector, Array, Array | None]:
+) -> tuple[Array, Array, Array | None]:
     """Return the tangents at the end of a phase, for given tangents of its start and constants.
 
-    The result contains the tangents of positions, rates, duration and minima of the margins. The
-    first axis contains the directions.
+    The result contains the tangents of positions and rates, of the duration, and of minima of the
+    margins. The first axis contains the directions.
     """
-    solver_step_function, start_state, integrator_state, margin_minima_result = search_end[:4]
-    n, enter_sides = len(start_state.q), search_end.enter_sides
+    solver_step_function, start_state, integrator_state, located_guard_index = search_end[:4]
+    enter_sides, margin_minima_result = search_end.enter_sides, search_end.margin_minima_result
     last_step_length = jnp.where(
         integrator_state.has_guard_crossed, phase_end.duration - integrator_state.elapsed_time, 0.0
     )
-    end_state_tangents, event_time_tangent, state_tangents = propagate_to_event(
+    end_tangents, event_time_tangent, motion_tangents = propagate_to_event(
         tableau,
         solver_step_function,
         phase_tangents if enter_sides is None else phase_tangents.on_sides(search_end.sides),
         integrator_state,
         last_step_length,
-        phase_end.end_guard_index if enter_sides is None else search_end.located_guard_index,
+        located_guard_index,
     )
-    held_tangents = tuple(jnp.moveaxis(end_state_tangents, 1, 0))[2 * n :]
+    held_tangents = end_tangents[:, motion_tangents.shape[1] :]
     minima_tangents = None
     margin_minima_state = integrator_state.margin_minima_state
     if margin_minima_state is not None and margin_minima_result is not None:
@@ -201,27 +207,38 @@ def _compute_phase_end_jvp(
             margin_minima_result,
             start_state,
             phase_end.state,
-            jnp.stack([*state_tangents, *held_tangents], 1),
+            jnp.concatenate([motion_tangents, held_tangents], 1),
             enter_sides,
         )
-    return state_tangents[:n], state_tangents[n:], event_time_tangent, minima_tangents
+    return motion_tangents, event_time_tangent, minima_tangents
+
+
+class Interruption(NamedTuple):
+    """Interruption of a batch in which elements wait at their events, so that few are idle."""
+
+    max_iterations: int  # number of iterations after which no element waits
+    interrupted_state: IntegratorState  # elements that are running in this state continue
 
 
 def integrate_to_event(
     phase: BatchPhase,
-    phase_tangents: PhaseTangents | None,
+    phase_tangents: Any,
     tableau: ButcherTableau,
-    q: Vector,
-    v: Vector,
+    q: Any,
+    v: Any,
     is_active: Array,
     initial_dt: Array,
     options: StepOptions,
     straggler_count: Array | None = None,
+    interruption: Interruption | None = None,
     attach_derivatives: Callable | None = None,
 ) -> tuple[PhaseEnd, SearchEnd]:
     """Return the end of a phase for each batch element, and what its derivatives need.
 
     The arguments are those of `integrate_batch_phase` and of `integrate_over_kinks`.
+
+    - `phase_tangents`: a `PhaseTangents` or an object with the same methods, or None;
+    - `interruption`: when the integration is interrupted, and elements that continue after one.
     """
     phase = _wrap_each_phase_function(
         phase, lanes.mark_noinline if phase.is_compiled_separately else jax.jit
@@ -229,129 +246,204 @@ def integrate_to_event(
     n_guards: Any = None
     phase_with_kinks, enter_sides = phase, None
     if phase.evaluate_kinks is not None:
-        start_state = phase.make_state(q, v)
-        n_guards = len(phase.evaluate_guards(start_state))
-        phase = phase.on_sides(find_sides(phase, start_state))
-
-        def enter_sides(sides: Vector) -> tuple[BatchPhase, SolverStepFunction, Any]:
-            phase = _wrap_each_phase_function(phase_with_kinks.on_sides(sides), lanes.mark_noinline)
-            tangents = None if phase_tangents is None else phase_tangents.on_sides(sides)
-            return phase, _make_solver_step_function(phase, tableau, options), tangents
-
-    solver_step_function = _make_solver_step_function(phase, tableau, options)
+        phase, enter_sides, n_guards = _enter_first_sides(
+            phase, phase_tangents, phase.make_state(q, v), tableau, options
+        )
+    solver = _make_solver_step_function(phase, tableau, options)
     start_state = phase.make_state(q, v)
-    guard_values, guard_rates = lax.stop_gradient(
-        phase.evaluate_with_rates(phase.evaluate_guards, start_state)
-    )
-    is_guard_met_at_start = phase.guards_met_at_start or tuple(
-        map(has_guard_crossed, guard_values[:n_guards], guard_rates[:n_guards])
-    )
+    guard_values, is_guard_met_at_start = _evaluate_start_guards(phase, start_state, n_guards)
     # The index is that of the first guard whose event is the start itself.
     start_event_guard_index = find_first_guard(is_guard_met_at_start, -1)
     is_phase_started = is_active & (start_event_guard_index < 0)
-
-    integrator_state = _make_initial_state(
-        phase, start_state, guard_values, is_phase_started, initial_dt, phase_tangents
+    integrator_state = _init_integrator_state(
+        phase, start_state, guard_values, is_phase_started, initial_dt, phase_tangents, interruption
     )
-    integrate_until_crossing = functools.partial(
-        _integrate_until_crossing, tableau, options, straggler_count
-    )
-    locate = lambda phase, solver_step_function, integrator_state: locate_event(
-        phase, solver_step_function, tableau, lax.stop_gradient(integrator_state), options
+    needs_more_steps = functools.partial(
+        _needs_more_steps, is_phase_started, straggler_count, interruption
     )
 
+    def make_loop(phase: BatchPhase, solver: SolverStepFunction, tangents: Any) -> Callable:
+        try_step = _make_step_attempt(phase, solver, tableau, options, straggler_count, tangents)
+        return functools.partial(lax.while_loop, needs_more_steps, try_step)
+
+    locate = lambda phase, solver, state: locate_event(
+        phase, solver, tableau, lax.stop_gradient(state), options
+    )
+    sides, end_guard_index, has_last_step = phase.sides, None, False
     if enter_sides is None:
-        integrator_state = integrate_until_crossing(
-            phase, solver_step_function, phase_tangents, integrator_state
-        )
+        take_steps = make_loop(phase, solver, phase_tangents)
         if phase.margins_include_start or phase_tangents is not None:
+            has_last_step = phase_tangents is not None and phase.take_solver_step is not None
             # The functions are called, not inlined, because the program is already long.
-            phase = phase_with_kinks = _wrap_each_phase_function(phase, lanes.mark_noinline)
-            solver_step_function = _make_solver_step_function(phase, tableau, options)
-        event_search = locate(phase, solver_step_function, integrator_state)
-        sides, end_guard_index = (), event_search.guard_index
-    else:
-
-        def integrate_segment(
-            phase: BatchPhase, solver: SolverStepFunction, tangents: Any, state: IntegratorState
-        ) -> tuple[IntegratorState, EventSearch]:
-            state = integrate_until_crossing(phase, solver, tangents, state)
-            return state, locate(phase, solver, state)
-
-        sides, integrator_state, event_search, end_guard_index, _ = integrate_over_kinks(
-            integrate_segment,
-            enter_sides,
-            phase.sides,
-            n_guards,
-            tableau,
-            integrator_state,
-            options,
-            attach_derivatives,
+            if not has_last_step:
+                phase = phase_with_kinks = _wrap_each_phase_function(phase, lanes.mark_noinline)
+                solver = _make_solver_step_function(phase, tableau, options)
+        if phase.take_last_step is not None:
+            take_last_step = phase.take_last_step
+            solver = jax.jit(lambda state, h: (take_last_step(state, h), jnp.zeros_like(h)))
+        find_events = _arrive_at_events if has_last_step else _find_events
+        integrator_state, event_search = find_events(
+            take_steps, functools.partial(locate, phase, solver), integrator_state
         )
-        end_guard_index = jnp.where(end_guard_index < 0, event_search.guard_index, end_guard_index)
-        phase, solver_step_function, _ = enter_sides(sides)
+    else:
+        sides, integrator_state, event_search, end_guard_index, _ = integrate_over_kinks(
+            lambda phase, solver, tangents, state: _find_events(
+                make_loop(phase, solver, tangents), functools.partial(locate, phase, solver), state
+            ),
+            enter_sides, sides, n_guards, tableau, integrator_state, options, attach_derivatives,
+        )  # fmt: skip
+        phase, solver, _ = enter_sides(sides)
+    phase_end, located_guard_index = _make_phase_end(
+        integrator_state,
+        event_search,
+        jnp.where(is_active, start_event_guard_index, -1),
+        end_guard_index,
+        options,
+    )
+    last_solver = None if has_last_step else solver
+    search_end = SearchEnd(
+        last_solver, start_state, integrator_state, located_guard_index, enter_sides, sides
+    )
+    if integrator_state.margin_minima_state is None:
+        return phase_end, search_end
+    start_margins = jnp.stack(phase_with_kinks.evaluate_margins(start_state))
+    return _add_margin_minima(phase, start_margins, event_search, phase_end, search_end, options)
+
+
+def _enter_first_sides(
+    phase_with_kinks: BatchPhase,
+    phase_tangents: Any,
+    start_state: StageState,
+    tableau: ButcherTableau,
+    options: StepOptions,
+) -> tuple[BatchPhase, EnterSides, int]:
+    """Return the phase on its first sides, the function for the others, and the guards' number."""
+
+    def enter_sides(sides: Vector) -> tuple[BatchPhase, SolverStepFunction, Any]:
+        phase = _wrap_each_phase_function(phase_with_kinks.on_sides(sides), lanes.mark_noinline)
+        tangents = None if phase_tangents is None else phase_tangents.on_sides(sides)
+        return phase, _make_solver_step_function(phase, tableau, options), tangents
+
+    return (
+        phase_with_kinks.on_sides(find_sides(phase_with_kinks, start_state)),
+        enter_sides,
+        len(phase_with_kinks.evaluate_guards(start_state)),
+    )
+
+
+def _find_events(
+    take_steps: Callable[[IntegratorState], IntegratorState],
+    locate: Callable[[IntegratorState], EventSearch],
+    integrator_state: IntegratorState,
+) -> tuple[IntegratorState, EventSearch]:
+    """Return the state of the loop before the solver steps to the events, and the events."""
+    integrator_state = take_steps(integrator_state)
+    return integrator_state, locate(integrator_state)
+
+
+def _evaluate_start_guards(
+    phase: BatchPhase, start_state: StageState, n_guards: int | None
+) -> tuple[Array, Array]:
+    """Return the guards at the start of a phase, and whether each ends the phase there.
+
+    - `n_guards`: number of guards that end the phase; None for all.
+    """
+    if phase.guards_met_at_start is not None:
+        return lax.stop_gradient(phase.evaluate_guards(start_state)), phase.guards_met_at_start
+    guard_values, guard_rates = lax.stop_gradient(
+        phase.evaluate_with_rates(phase.evaluate_guards, start_state)
+    )
+    return guard_values, has_guard_crossed(guard_values[:n_guards], guard_rates[:n_guards])
+
+
+def _make_phase_end(
+    integrator_state: IntegratorState,
+    event_search: EventSearch,
+    start_event_guard_index: Array,
+    end_guard_index: Array | None,
+    options: StepOptions,
+) -> tuple[PhaseEnd, Array]:
+    """Return the end of a phase without minima, and the index of the guard that is zero there.
+
+    - `start_event_guard_index`: index of the guard whose event is the start itself, or -1;
+    - `end_guard_index`: see `kinks.KinkPassage`.
+    """
     is_crossing = integrator_state.has_guard_crossed
-    is_crossing_event_unresolved = is_crossing & event_search.is_event_unresolved
+    is_event_unresolved = is_crossing & event_search.is_event_unresolved
     duration = integrator_state.elapsed_time + jnp.where(
         is_crossing, event_search.event_step_length, 0.0
     )
     end_state = select_trees_by_condition(
         is_crossing, event_search.end_state, integrator_state.state
     )
-    margin_minima_state, margin_minima_result = integrator_state.margin_minima_state, None
-    if margin_minima_state is not None:
-        margin_minima_state = update_margin_minima_state(
-            phase,
-            margin_minima_state,
-            integrator_state.state,
-            end_state,
-            event_search.event_step_length,
-            is_crossing,
-            integrator_state.state_tangents,
-        )
-        margin_minima_result = refine_margin_minima(
-            phase,
-            solver_step_function,
-            margin_minima_state,
-            jnp.stack(phase_with_kinks.evaluate_margins(start_state)),
-            options,
-            min_iterations=3 if phase.has_exact_events else 1,
-            enter_sides=enter_sides,
-        )
     is_event_too_late = (
         is_crossing & ~event_search.is_event_unresolved & (duration > options.max_phase_time)
     )
-    event_guard_index = jnp.where(
-        is_active & (start_event_guard_index >= 0),
-        start_event_guard_index,
-        jnp.where(is_crossing, end_guard_index, -1),
+    has_no_event = is_event_unresolved | is_event_too_late
+    select_index = lambda guard_index: jnp.where(
+        has_no_event,
+        -1,
+        jnp.where(
+            start_event_guard_index >= 0,
+            start_event_guard_index,
+            jnp.where(is_crossing, guard_index, -1),
+        ),
     )
+    located_guard_index = select_index(event_search.guard_index)
+    if end_guard_index is not None:
+        end_guard_index = select_index(
+            jnp.where(end_guard_index < 0, event_search.guard_index, end_guard_index)
+        )
     phase_end = PhaseEnd(
         state=end_state,
         duration=duration,
-        end_guard_index=jnp.where(
-            is_crossing_event_unresolved | is_event_too_late, -1, event_guard_index
-        ),
+        end_guard_index=located_guard_index if end_guard_index is None else end_guard_index,
         is_timed_out=(integrator_state.integration_status == IntegrationStatus.TIMED_OUT)
         | is_event_too_late,
         is_unfinished=integrator_state.is_running,
         solver_steps=integrator_state.n_tried_steps
         + jnp.where(is_crossing, event_search.n_tried_steps, 0),
         next_solver_dt=integrator_state.next_step_length,
-        margin_minima=None
-        if margin_minima_result is None
-        else margin_minima_result.phase_margin_minima,
+        margin_minima=None,
     )
-    return phase_end, SearchEnd(
-        solver_step_function,
-        start_state,
-        integrator_state._replace(margin_minima_state=margin_minima_state),
-        margin_minima_result,
-        enter_sides,
-        sides,
-        None
-        if enter_sides is None
-        else jnp.where(phase_end.end_guard_index < 0, -1, event_search.guard_index),
+    return phase_end, located_guard_index
+
+
+def _add_margin_minima(
+    phase: BatchPhase,
+    start_margins: Array,
+    event_search: EventSearch,
+    phase_end: PhaseEnd,
+    search_end: SearchEnd,
+    options: StepOptions,
+) -> tuple[PhaseEnd, SearchEnd]:
+    """Return the end of a phase with the minima of its margins."""
+    integrator_state = search_end.integrator_state
+    assert integrator_state.margin_minima_state is not None
+    margin_minima_state = update_margin_minima_state(
+        phase,
+        integrator_state.margin_minima_state,
+        integrator_state.state,
+        phase_end.state,
+        event_search.event_step_length,
+        integrator_state.has_guard_crossed,
+        integrator_state.state_tangents,
+    )
+    margin_minima_result = refine_margin_minima(
+        phase,
+        search_end.solver_step_function,
+        margin_minima_state,
+        start_margins,
+        options,
+        min_iterations=3 if phase.has_exact_events else 1,
+        enter_sides=search_end.enter_sides,
+    )
+    return (
+        phase_end._replace(margin_minima=margin_minima_result.phase_margin_minima),
+        search_end._replace(
+            integrator_state=integrator_state._replace(margin_minima_state=margin_minima_state),
+            margin_minima_result=margin_minima_result,
+        ),
     )
 
 
@@ -382,51 +474,95 @@ def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> Bat
     )
 
 
-def _integrate_until_crossing(
+def _arrive_at_events(
+    take_steps: Callable[[IntegratorState], IntegratorState],
+    locate: Callable[[IntegratorState], EventSearch],
+    integrator_state: IntegratorState,
+) -> tuple[IntegratorState, EventSearch]:
+    """Return the state of the loop after a last solver step to each event, and the events.
+
+    A second pass through the same loop takes the last steps and propagates tangents over them, so
+    that the program contains both only once.
+    """
+
+    no_count: Any = None
+
+    def run_pass(carry: tuple) -> tuple:
+        n_passes, crossing_step_length, integrator_state, event_search = carry
+        integrator_state = take_steps(integrator_state)
+        is_arriving: Any = integrator_state.is_arriving
+        has_crossed = integrator_state.has_guard_crossed & ~is_arriving
+        located = locate(integrator_state)._replace(n_iterations=no_count)
+        event_search = select_trees_by_condition(has_crossed, located, event_search)
+        begins_last_step = has_crossed & ~event_search.is_event_unresolved
+        status = integrator_state.integration_status
+        status = jnp.where(integrator_state.is_running, IntegrationStatus.PAUSED, status)
+        status = jnp.where(begins_last_step, IntegrationStatus.RUNNING, status)
+        step_length = integrator_state.next_step_length
+        return (
+            n_passes + 1,
+            jnp.where(begins_last_step, step_length, crossing_step_length),
+            integrator_state._replace(
+                integration_status=status.astype(jnp.int32),
+                next_step_length=jnp.where(
+                    begins_last_step, event_search.event_step_length, step_length
+                ),
+                n_iterations=jnp.zeros((), jnp.int32),
+                is_arriving=is_arriving | begins_last_step,
+            ),
+            event_search,
+        )
+
+    no_search = make_zeros_like_output(
+        lambda: locate(integrator_state)._replace(n_iterations=no_count)
+    )
+    initial_state = integrator_state._replace(
+        is_arriving=jnp.zeros_like(integrator_state.is_running)
+    )
+    _, crossing_step_length, integrator_state, event_search = lax.while_loop(
+        lambda carry: carry[0] < 2,
+        run_pass,
+        (jnp.zeros((), jnp.int32), initial_state.next_step_length, initial_state, no_search),
+    )
+    status = integrator_state.integration_status
+    has_arrived: Any = integrator_state.is_arriving
+    status = jnp.where(status == IntegrationStatus.PAUSED, IntegrationStatus.RUNNING, status)
+    return (
+        # The search has counted the last step.
+        integrator_state._replace(
+            integration_status=status.astype(jnp.int32),
+            next_step_length=jnp.where(
+                has_arrived, crossing_step_length, integrator_state.next_step_length
+            ),
+            n_tried_steps=integrator_state.n_tried_steps - has_arrived,
+            is_arriving=None,
+        ),
+        event_search._replace(
+            event_step_length=jnp.where(has_arrived, 0.0, event_search.event_step_length)
+        ),
+    )
+
+
+def _make_step_attempt(
+    phase: BatchPhase,
+    solver_step_function: SolverStepFunction,
     tableau: ButcherTableau,
     options: StepOptions,
     straggler_count: Array | None,
-    phase: BatchPhase,
-    solver_step_function: SolverStepFunction,
-    phase_tangents: PhaseTangents | None,
-    initial_state: IntegratorState,
-) -> IntegratorState:
-    """Take adaptive solver steps in all batch elements, and return the state of the loop.
+    phase_tangents: Any,
+) -> Callable[[IntegratorState], IntegratorState]:
+    """Return a function that tries one adaptive solver step in all running batch elements.
 
     An element stops when a guard crosses zero, when it reaches the time limit, or when it fails.
-    The loop ends when no element is running, or earlier if the caller allows the slowest elements
-    to be left unfinished.
     """
 
     def take_one_solver_step(integrator_state: IntegratorState) -> IntegratorState:
         step_length = integrator_state.next_step_length
-        stage_states, mean_squared_error = solver_step_function(integrator_state.state, step_length)
-        *later_guard_values, end_guard_values = lax.stop_gradient(
-            [phase.evaluate_guards(stage_states[i]) for i in (*tableau.guard_stage_indices, -1)]
-        )
-        inner_guard_values = [integrator_state.guard_values, *later_guard_values]
-        finite_sum = functools.reduce(jnp.add, [0.0 * value for value in end_guard_values])
-        mean_squared_error = jnp.where(jnp.isfinite(finite_sum), mean_squared_error, jnp.inf)
-        guard_minimum_fraction = find_earliest_guard_minimum_fraction(
-            tableau, [*inner_guard_values, end_guard_values]
-        )
-        is_within_tolerance = mean_squared_error <= 1.0
-        # A step inside which a guard may be negative is repeated up to the guard's minimum.
-        elapsed_time = integrator_state.elapsed_time
-        may_cross_inside = (
-            is_within_tolerance
-            & (guard_minimum_fraction < 1.0)
-            & (elapsed_time + step_length * guard_minimum_fraction > elapsed_time)
-        )
-        controller_factor = compute_step_size_factor(
-            tableau, mean_squared_error, guard_minimum_fraction.dtype
+        stage_states, inner_guard_values, end_guard_values, step_length_factor, is_rejected = (
+            _try_solver_step(phase, solver_step_function, tableau, integrator_state)
         )
         next_state, is_accepted = _classify_solver_step(
-            options,
-            integrator_state,
-            jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor),
-            may_cross_inside | ~is_within_tolerance,
-            end_guard_values,
+            options, integrator_state, step_length_factor, is_rejected, end_guard_values
         )
         state, guard_values = select_trees_by_condition(
             is_accepted,
@@ -453,8 +589,11 @@ def _integrate_until_crossing(
                 state_tangents,
             )
         if phase_tangents is not None and state_tangents is not None:
-            state_tangents = phase_tangents.propagate_if_accepted(
-                tableau, stage_states, state_tangents, step_length, is_accepted
+            propagate = lambda tangents: phase_tangents.propagate_to_step_end(
+                tableau, stage_states, tangents, step_length, is_accepted
+            )
+            state_tangents = run_if_any_element_active(
+                jnp.any(is_accepted), propagate, state_tangents
             )
         if straggler_count is not None:
             n_running_elements = jnp.sum(next_state.is_running, dtype=jnp.int32)
@@ -475,52 +614,132 @@ def _integrate_until_crossing(
             state_tangents=state_tangents,
         )
 
-    def needs_more_steps(integrator_state: IntegratorState) -> Array:
-        """Return whether the loop continues, which depends on the number of running elements."""
-        if straggler_count is None:
-            return jnp.any(integrator_state.is_running)
-        n_running_elements = jnp.sum(integrator_state.is_running, dtype=jnp.int32)
-        max_iterations = (
-            STRAGGLER_ITERATION_FACTOR * integrator_state.n_iterations_until_half_ended + 8
-        )
-        is_iteration_limit_exceeded = integrator_state.n_iterations > max_iterations
-        return (n_running_elements > 0) & ~(
-            (n_running_elements <= straggler_count) & is_iteration_limit_exceeded
-        )
-
-    return lax.while_loop(needs_more_steps, take_one_solver_step, initial_state)
+    return take_one_solver_step
 
 
-def _make_initial_state(
+def _try_solver_step(
+    phase: BatchPhase,
+    solver_step_function: SolverStepFunction,
+    tableau: ButcherTableau,
+    integrator_state: IntegratorState,
+) -> tuple[list[StageState], list[Array], Array, Array, Array]:
+    """Return stages of a solver step, guards within and at its end, the next length, and rejection.
+
+    The next length is relative to this one.
+    """
+    step_length = integrator_state.next_step_length
+    stage_states, mean_squared_error = solver_step_function(integrator_state.state, step_length)
+    *later_guard_values, end_guard_values = lax.stop_gradient(
+        [phase.evaluate_guards(stage_states[i]) for i in (*tableau.guard_stage_indices, -1)]
+    )
+    inner_guard_values = [integrator_state.guard_values, *later_guard_values]
+    is_finite = jnp.all(jnp.isfinite(end_guard_values), axis=0)
+    mean_squared_error = jnp.where(is_finite, mean_squared_error, jnp.inf)
+    elapsed_time = integrator_state.elapsed_time
+    may_have_minimum: Any = True
+    if phase.guards_rising_at_start is not None:
+        may_have_minimum = (elapsed_time > 0.0) | ~phase.guards_rising_at_start
+    guard_minimum_fraction = find_earliest_guard_minimum_fraction(
+        tableau, [*inner_guard_values, end_guard_values], may_have_minimum
+    )
+    is_within_tolerance = mean_squared_error <= 1.0
+    # A step inside which a guard may be negative is repeated up to the guard's minimum.
+    may_cross_inside = (
+        is_within_tolerance
+        & (guard_minimum_fraction < 1.0)
+        & (elapsed_time + step_length * guard_minimum_fraction > elapsed_time)
+    )
+    controller_factor = compute_step_size_factor(
+        tableau, mean_squared_error, guard_minimum_fraction.dtype
+    )
+    return (
+        stage_states,
+        inner_guard_values,
+        end_guard_values,
+        jnp.where(may_cross_inside, guard_minimum_fraction, controller_factor),
+        may_cross_inside | ~is_within_tolerance,
+    )
+
+
+def _needs_more_steps(
+    is_phase_started: Array,
+    straggler_count: Array | None,
+    interruption: Interruption | None,
+    integrator_state: IntegratorState,
+) -> Array:
+    """Return whether the loop continues, which depends on the number of running elements.
+
+    The loop ends when no element is running, or earlier if the caller allows the slowest elements
+    to be left unfinished.
+    """
+    if interruption is not None:
+        is_waiting = jnp.any(is_phase_started & ~integrator_state.is_running)
+        is_patient = integrator_state.n_iterations < interruption.max_iterations
+        return jnp.any(integrator_state.is_running) & (is_patient | ~is_waiting)
+    if straggler_count is None:
+        return jnp.any(integrator_state.is_running)
+    n_running_elements = jnp.sum(integrator_state.is_running, dtype=jnp.int32)
+    max_iterations = STRAGGLER_ITERATION_FACTOR * integrator_state.n_iterations_until_half_ended + 8
+    is_iteration_limit_exceeded = integrator_state.n_iterations > max_iterations
+    return (n_running_elements > 0) & ~(
+        (n_running_elements <= straggler_count) & is_iteration_limit_exceeded
+    )
+
+
+def _init_integrator_state(
     phase: BatchPhase,
     start_state: StageState,
-    guard_values: Vector,
+    guard_values: Array,
     is_phase_started: Array,
     initial_dt: Array,
-    phase_tangents: PhaseTangents | None,
+    phase_tangents: Any,
+    interruption: Interruption | None,
 ) -> IntegratorState:
-    """Return the state of the loop before the first solver step."""
+    """Return the state before the first solver step, or the one that an interruption has left."""
     initial_minima = (
         init_margin_minima_state(phase, start_state, phase_tangents)
         if phase.margins_include_start
         else None
     )
-    initial_counts, initial_count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
+    initial_state = make_idle_state(start_state, guard_values, initial_dt)._replace(
+        integration_status=jnp.where(
+            is_phase_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
+        ).astype(jnp.int32),
+        margin_minima_state=initial_minima,
+        state_tangents=None if phase_tangents is None else phase_tangents.start_tangents,
+    )
+    if interruption is not None:
+        shared_fields = {
+            name: getattr(initial_state, name)
+            for name in ("n_iterations_until_half_ended", "n_iterations", "state_tangents")
+        }
+        without_shared = lambda state: state._replace(**dict.fromkeys(shared_fields))
+        initial_state = select_trees_by_condition(
+            interruption.interrupted_state.is_running,
+            without_shared(interruption.interrupted_state),
+            without_shared(initial_state),
+        )._replace(**shared_fields)
+    return initial_state
+
+
+def make_idle_state(
+    start_state: StageState, guard_values: Array, initial_dt: Array
+) -> IntegratorState:
+    """Return the state of the loop before the first solver step, in which no element runs."""
+    counts, count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
     return IntegratorState(
         state=start_state,
         guard_values=guard_values,
         next_step_length=initial_dt,
         elapsed_time=jnp.zeros_like(initial_dt),
-        integration_status=jnp.where(
-            is_phase_started, IntegrationStatus.RUNNING, IntegrationStatus.IDLE
-        ).astype(jnp.int32),
+        integration_status=counts + IntegrationStatus.IDLE,
         middle_guard_values=guard_values,
         end_guard_values=guard_values,
-        n_tried_steps=initial_counts,
-        n_iterations_until_half_ended=initial_count,
-        n_iterations=initial_count,
-        margin_minima_state=initial_minima,
-        state_tangents=None if phase_tangents is None else phase_tangents.start_tangents,
+        n_tried_steps=counts,
+        n_iterations_until_half_ended=count,
+        n_iterations=count,
+        margin_minima_state=None,
+        state_tangents=None,
     )
 
 
@@ -529,7 +748,7 @@ def _classify_solver_step(
     integrator_state: IntegratorState,
     step_length_factor: Array,
     is_step_rejected: Array,
-    end_guard_values: Vector,
+    end_guard_values: Array,
 ) -> tuple[IntegratorState, Array]:
     """Return the status of each batch element after a solver step, and whether it accepts the step.
 
@@ -541,9 +760,14 @@ def _classify_solver_step(
     """
     is_running = integrator_state.is_running
     is_valid_step = is_running & ~is_step_rejected
-    is_guard_met = functools.reduce(jnp.logical_or, [value <= 0.0 for value in end_guard_values])
-    is_crossing = is_valid_step & is_guard_met
+    is_crossing = is_valid_step & jnp.any(end_guard_values <= 0.0, axis=0)
     is_accepted = is_valid_step & ~is_crossing
+    is_arriving = integrator_state.is_arriving
+    if is_arriving is not None:
+        is_crossing, is_accepted = (
+            is_crossing & ~is_arriving,
+            is_accepted | (is_running & is_arriving),
+        )
     step_length = integrator_state.next_step_length
     elapsed_time = integrator_state.elapsed_time
     phase_time_limit = options.max_phase_time
@@ -566,6 +790,8 @@ def _classify_solver_step(
         IntegrationStatus.TIMED_OUT,
         jnp.where(is_crossing, IntegrationStatus.CROSSED, integration_status),
     )
+    if is_arriving is not None:
+        integration_status = jnp.where(is_arriving, IntegrationStatus.CROSSED, integration_status)
     integration_status = jnp.where(
         is_running, integration_status, integrator_state.integration_status
     )

@@ -7,7 +7,6 @@ identity if the accelerations do not jump.
 """
 
 import functools
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,13 +21,14 @@ from vrw_jax.flow.event_location import (
     EventSearch,
     IntegrationStatus,
     IntegratorState,
+    evaluate_motion_rates,
     find_first_guard,
     has_guard_crossed,
     propagate_to_event,
 )
 from vrw_jax.flow.minima import EnterSides, pass_kink_of_margins, update_margin_minima_state
 from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
-from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
+from vrw_jax.flow.tangents import BatchPhase
 
 
 def find_sides(phase: BatchPhase, state: StageState) -> Vector:
@@ -95,35 +95,10 @@ def integrate_over_kinks(
                 search.guard_index,
                 is_at_kink,
             )
-        kink_values = lax.stop_gradient(phase.evaluate_guards(phase.make_state(q, v))[n_guards:])
-        # Functions that are zero at the same point change their signs together.
-        is_crossed = [
-            is_at_kink & ((search.guard_index == n_guards + i) | (value <= 0.0))
-            for i, value in enumerate(kink_values)
-        ]
-        next_sides = tuple(
-            map(lambda x, side: jnp.where(x, -side, side), is_crossed, passage.sides)
+        next_sides, next_phase, kink_state, guard_values, end_guard_index = _cross_kinks(
+            phase, enter_sides, passage.sides, n_guards, q, v, search.guard_index, is_at_kink
         )
-        next_phase, *_ = enter_sides(next_sides)
-        kink_state = next_phase.make_state(q, v)
-        guard_values, guard_rates = lax.stop_gradient(
-            next_phase.evaluate_with_rates(next_phase.evaluate_guards, kink_state)
-        )
-        is_sliding = functools.reduce(
-            operator.or_, map(lambda x, rate: x & (rate <= 0.0), is_crossed, guard_rates[n_guards:])
-        )
-        end_guard_index = find_first_guard(
-            [*map(has_guard_crossed, guard_values[:n_guards], guard_rates[:n_guards])], -1
-        )
-        end_guard_index = jnp.where(
-            is_sliding & (end_guard_index < 0), search.guard_index, end_guard_index
-        )
-        end_guard_index = jnp.where(is_at_kink, end_guard_index, -1)
         is_passed = is_at_kink & (end_guard_index < 0)
-        # The function of a kink is zero there, up to round-off.
-        guard_values = guard_values[:n_guards] + tuple(
-            map(lambda x, value: jnp.where(x, 0.0, value), is_crossed, guard_values[n_guards:])
-        )
         next_state = state._replace(
             state=kink_state,
             guard_values=guard_values,
@@ -134,34 +109,17 @@ def integrate_over_kinks(
             integration_status=jnp.full_like(state.integration_status, IntegrationStatus.RUNNING),
             n_tried_steps=state.n_tried_steps + search.n_tried_steps,
         )
-        select_passed = functools.partial(select_trees_by_condition, is_passed)
-        unbatched: dict[str, Any] = {
-            name: getattr(state, name) for name in ("n_iterations_until_half_ended", "n_iterations")
-        }
-        kink_tangents = None
-        if phase_tangents is not None:
-            pass_kink = functools.partial(
-                _pass_tangents,
-                phase_tangents, tableau, solver_step_function, state, search, kink_state, is_passed,
-            )  # fmt: skip
-            unchanged_tangents = state.state_tangents, state.state_tangents
-            tangents, kink_tangents = run_if_any_element_active(
-                jnp.any(is_passed), pass_kink, unchanged_tangents
-            )
-            unbatched["state_tangents"] = tangents
-        if state.margin_minima_state is not None:
-            minima = update_margin_minima_state(
-                phase, state.margin_minima_state, state.state, search.end_state,
-                search.event_step_length, is_passed, state.state_tangents,
-            )  # fmt: skip
-            unbatched["margin_minima_state"] = pass_kink_of_margins(
-                phase, next_phase, minima, kink_state, is_passed, kink_tangents
-            )
-        drop: dict[str, Any] = dict.fromkeys(unbatched)
-        next_state = select_passed(next_state._replace(**drop), state._replace(**drop))
         return KinkPassage(
-            select_passed(next_sides, passage.sides),
-            next_state._replace(**unbatched),
+            select_trees_by_condition(is_passed, next_sides, passage.sides),
+            _select_passed_state(
+                tableau,
+                solver_step_function,
+                phase_tangents,
+                (phase, next_phase),
+                (state, next_state),
+                search,
+                is_passed,
+            ),
             search,
             end_guard_index,
             is_passed,
@@ -182,8 +140,94 @@ def integrate_over_kinks(
     return lax.while_loop(lambda passage: jnp.any(passage.is_passed), integrate_to_next_kink, start)
 
 
+def _cross_kinks(
+    phase: BatchPhase,
+    enter_sides: EnterSides,
+    sides: Vector,
+    n_guards: int,
+    q: Vector,
+    v: Vector,
+    located_guard_index: Array,
+    is_at_kink: Array,
+) -> tuple[Vector, BatchPhase, StageState, Array, Array]:
+    """Return sides, phase, state and guards after a kink, and the index of `KinkPassage`."""
+    kink_values = lax.stop_gradient(phase.evaluate_guards(phase.make_state(q, v))[n_guards:])
+    # Functions that are zero at the same point change their signs together.
+    is_located = jnp.stack([located_guard_index == n_guards + i for i in range(len(kink_values))])
+    is_crossed = is_at_kink & (is_located | (kink_values <= 0.0))
+    next_sides = tuple(map(lambda x, side: jnp.where(x, -side, side), is_crossed, sides))
+    next_phase, *_ = enter_sides(next_sides)
+    kink_state = next_phase.make_state(q, v)
+    guard_values, guard_rates = lax.stop_gradient(
+        next_phase.evaluate_with_rates(next_phase.evaluate_guards, kink_state)
+    )
+    is_sliding = jnp.any(is_crossed & (guard_rates[n_guards:] <= 0.0), axis=0)
+    end_guard_index = find_first_guard(
+        has_guard_crossed(guard_values[:n_guards], guard_rates[:n_guards]), -1
+    )
+    end_guard_index = jnp.where(
+        is_sliding & (end_guard_index < 0), located_guard_index, end_guard_index
+    )
+    end_guard_index = jnp.where(is_at_kink, end_guard_index, -1)
+    # The function of a kink is zero there, up to round-off.
+    guard_values = jnp.concatenate(
+        [guard_values[:n_guards], jnp.where(is_crossed, 0.0, guard_values[n_guards:])]
+    )
+    return next_sides, next_phase, kink_state, guard_values, end_guard_index
+
+
+def _select_passed_state(
+    tableau: ButcherTableau,
+    solver_step_function: SolverStepFunction,
+    phase_tangents: Any,
+    phases: tuple[BatchPhase, BatchPhase],
+    states: tuple[IntegratorState, IntegratorState],
+    search: EventSearch,
+    is_passed: Array,
+) -> IntegratorState:
+    """Return the state of the integration, with tangents and minima, in which kinks are passed.
+
+    - `phases`: phase before and after a kink;
+    - `states`: state before the solver step to the kink, and after the kink.
+    """
+    (phase, next_phase), (state, next_state) = phases, states
+    unbatched: dict[str, Any] = {
+        name: getattr(state, name) for name in ("n_iterations_until_half_ended", "n_iterations")
+    }
+    kink_tangents = None
+    if phase_tangents is not None:
+        pass_kink = functools.partial(
+            _pass_tangents,
+            phase_tangents,
+            tableau,
+            solver_step_function,
+            state,
+            search,
+            next_state.state,
+            is_passed,
+        )
+        unchanged_tangents = state.state_tangents, state.state_tangents
+        tangents, kink_tangents = run_if_any_element_active(
+            jnp.any(is_passed), pass_kink, unchanged_tangents
+        )
+        unbatched["state_tangents"] = tangents
+    if state.margin_minima_state is not None:
+        minima = update_margin_minima_state(
+            phase, state.margin_minima_state, state.state, search.end_state,
+            search.event_step_length, is_passed, state.state_tangents,
+        )  # fmt: skip
+        unbatched["margin_minima_state"] = pass_kink_of_margins(
+            phase, next_phase, minima, next_state.state, is_passed, kink_tangents
+        )
+    drop: dict[str, Any] = dict.fromkeys(unbatched)
+    selected_state = select_trees_by_condition(
+        is_passed, next_state._replace(**drop), state._replace(**drop)
+    )
+    return selected_state._replace(**unbatched)
+
+
 def _pass_tangents(
-    phase_tangents: PhaseTangents,
+    phase_tangents: Any,
     tableau: ButcherTableau,
     solver_step_function: SolverStepFunction,
     integrator_state: IntegratorState,
@@ -205,12 +249,9 @@ def _pass_tangents(
         jnp.where(is_passed, search.event_step_length, 0.0),
         search.guard_index,
     )
-    n = len(kink_state.q)
-    rates_after = *kink_state.v, *kink_state.acceleration.acceleration[:n]
-    tangents_after = [
-        x - time_tangent * rate for x, rate in zip(kink_tangents, rates_after, strict=True)
-    ]
+    tangents_after = kink_tangents - time_tangent[:, None] * evaluate_motion_rates(kink_state)
+    held_tangents = end_tangents[:, kink_tangents.shape[1] :]
     return tuple(
-        jnp.where(is_passed, jnp.concatenate([jnp.stack(x, 1), end_tangents[:, 2 * n :]], 1), y)
+        jnp.where(is_passed, jnp.concatenate([x, held_tangents], 1), y)
         for x, y in zip((tangents_after, kink_tangents), tangents, strict=True)
     )  # type: ignore[return-value]

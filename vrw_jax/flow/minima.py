@@ -18,7 +18,7 @@ from vrw_jax.base.elementwise import select_entry_by_mask, select_trees_by_condi
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
-from vrw_jax.flow.tangents import BatchPhase, PhaseTangents
+from vrw_jax.flow.tangents import BatchPhase
 
 MINIMUM_LOCATION_TOLERANCE = 1e-6
 """Accuracy of the location of a minimum, as a fraction of the solver step. The value is chosen
@@ -141,7 +141,7 @@ class MarginMinimaState(NamedTuple):
 
 
 def init_margin_minima_state(
-    phase: BatchPhase, start_state: StageState, phase_tangents: PhaseTangents | None
+    phase: BatchPhase, start_state: StageState, phase_tangents: Any
 ) -> MarginMinimaState:
     """Return the state of the search for minima before the first solver step.
 
@@ -318,70 +318,19 @@ def refine_margin_minima(
 
     phase_and_solver = phase, solver_step_function
 
-    def refine_one_margin_minimum(
-        _: None, margin_scan_inputs: tuple
-    ) -> tuple[None, tuple[Array, Array]]:
+    def refine_minimum(_: None, margin_scan_inputs: tuple) -> tuple[None, tuple[Array, Array]]:
         margin_index, margin_minimum_state = margin_scan_inputs
         phase, solver_step_function = phase_and_solver
         if enter_sides is not None:
             phase, solver_step_function, _ = enter_sides(margin_minimum_state.step_start_sides)
-        minimum_step_start_state = phase.make_state(
-            margin_minimum_state.step_start_q, margin_minimum_state.step_start_v
+        return None, _refine_one_margin_minimum(
+            phase,
+            solver_step_function,
+            margin_index,
+            margin_minimum_state,
+            options.max_margin_search_iterations,
+            min_iterations,
         )
-
-        evaluate_selected_margin = lambda state: (
-            select_entry_by_mask(margin_index, jnp.stack(phase.evaluate_margins(state))),
-        )
-
-        def improve_margin_minimum_search(
-            margin_minimum_search: _MarginMinimumSearch,
-        ) -> _MarginMinimumSearch:
-            step_length = margin_minimum_search.step_length
-            n_iterations = margin_minimum_search.n_iterations
-            step_end = solver_step_function(minimum_step_start_state, step_length)[0][-1]
-            (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
-                evaluate_selected_margin, step_end
-            )
-            step_length, best_step_length, best_margin_rate, has_secant_converged = (
-                _refine_minimum_location(
-                    step_length,
-                    margin_rate,
-                    margin_minimum_state.step_length,
-                    margin_minimum_search.best_step_length,
-                    margin_minimum_search.best_margin_rate,
-                )
-            )
-            return select_trees_by_condition(
-                margin_minimum_search.is_minimum_unresolved,
-                _MarginMinimumSearch(
-                    step_length,
-                    best_step_length,
-                    best_margin_rate,
-                    margin_value,
-                    margin_minimum_search.is_minimum_unresolved
-                    & (~has_secant_converged | (n_iterations + 1 < min_iterations)),
-                    n_iterations,
-                ),
-                margin_minimum_search,
-            )._replace(n_iterations=n_iterations + 1)
-
-        zero_step_length = jnp.zeros_like(margin_minimum_state.step_length)
-        margin_minimum_search = _MarginMinimumSearch(
-            margin_minimum_state.time_to_minimum,
-            zero_step_length,
-            margin_minimum_state.step_start_margin_rates,
-            zero_step_length + jnp.inf,
-            jnp.isfinite(margin_minimum_state.lowest_margin_values),
-            jnp.zeros((), jnp.int32),
-        )
-        needs_iteration = lambda margin_minimum_search: (
-            jnp.any(margin_minimum_search.is_minimum_unresolved)
-            & (margin_minimum_search.n_iterations < options.max_margin_search_iterations)
-        )
-        final_search = lax.while_loop(
-            needs_iteration, improve_margin_minimum_search, margin_minimum_search
-        )
-        return None, (final_search.margin_value, final_search.step_length)
 
     includes_phase_start = _spread_over_batch(phase.margins_include_start, start_margin_values)
     end_margin_minima = jnp.minimum(
@@ -390,7 +339,7 @@ def refine_margin_minima(
     )
     margin_indices = jnp.arange(len(start_margin_values), dtype=jnp.int32)
     interior_margin_minima, step_length_to_minimum = lax.scan(
-        refine_one_margin_minimum,
+        refine_minimum,
         None,
         (margin_indices, margin_minima_state._replace(step_start_tangents=None)),
     )[1]
@@ -401,6 +350,74 @@ def refine_margin_minima(
     )
 
 
+def _refine_one_margin_minimum(
+    phase: BatchPhase,
+    solver_step_function: SolverStepFunction,
+    margin_index: Array,
+    margin_minimum_state: MarginMinimaState,
+    max_iterations: Any,
+    min_iterations: int,
+) -> tuple[Array, Array]:
+    """Return the minimum of one margin, and the length of the solver step that ends there, s."""
+    minimum_step_start_state = phase.make_state(
+        margin_minimum_state.step_start_q, margin_minimum_state.step_start_v
+    )
+
+    evaluate_selected_margin = lambda state: (
+        select_entry_by_mask(margin_index, jnp.stack(phase.evaluate_margins(state))),
+    )
+
+    def improve_margin_minimum_search(
+        margin_minimum_search: _MarginMinimumSearch,
+    ) -> _MarginMinimumSearch:
+        step_length = margin_minimum_search.step_length
+        n_iterations = margin_minimum_search.n_iterations
+        step_end = solver_step_function(minimum_step_start_state, step_length)[0][-1]
+        (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
+            evaluate_selected_margin, step_end
+        )
+        step_length, best_step_length, best_margin_rate, has_secant_converged = (
+            _refine_minimum_location(
+                step_length,
+                margin_rate,
+                margin_minimum_state.step_length,
+                margin_minimum_search.best_step_length,
+                margin_minimum_search.best_margin_rate,
+            )
+        )
+        return select_trees_by_condition(
+            margin_minimum_search.is_minimum_unresolved,
+            _MarginMinimumSearch(
+                step_length,
+                best_step_length,
+                best_margin_rate,
+                margin_value,
+                margin_minimum_search.is_minimum_unresolved
+                & (~has_secant_converged | (n_iterations + 1 < min_iterations)),
+                n_iterations,
+            ),
+            margin_minimum_search,
+        )._replace(n_iterations=n_iterations + 1)
+
+    zero_step_length = jnp.zeros_like(margin_minimum_state.step_length)
+    margin_minimum_search = _MarginMinimumSearch(
+        margin_minimum_state.time_to_minimum,
+        zero_step_length,
+        margin_minimum_state.step_start_margin_rates,
+        zero_step_length + jnp.inf,
+        jnp.isfinite(margin_minimum_state.lowest_margin_values),
+        jnp.zeros((), jnp.int32),
+    )
+    needs_iteration = lambda margin_minimum_search: (
+        jnp.any(margin_minimum_search.is_minimum_unresolved)
+        & (margin_minimum_search.n_iterations < max_iterations)
+    )
+    final_search = lax.while_loop(
+        needs_iteration, improve_margin_minimum_search, margin_minimum_search
+    )
+    return final_search.margin_value, final_search.step_length
+
+
 def _spread_over_batch(flags_of_margins: Any, margins: Array) -> Array:
     """Return one flag for each margin in a shape that broadcasts with (margins, batch)."""
     return jnp.asarray(flags_of_margins).reshape(-1, *(1,) * (margins.ndim - 1))
@@ -409,7 +426,7 @@ def _spread_over_batch(flags_of_margins: Any, margins: Array) -> Array:
 def compute_margin_minima_jvp(
     solver_step_function: SolverStepFunction,
     tableau: ButcherTableau,
-    phase_tangents: PhaseTangents,
+    phase_tangents: Any,
     margin_minima_state: MarginMinimaState,
     margin_minima_result: MarginMinimaResult,
     start_state: StageState,

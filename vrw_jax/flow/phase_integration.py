@@ -134,11 +134,12 @@ def integrate_phase(
     is_guard_met, is_guard_falling = guards_and_margins.find_guards_met_at_start(
         *lax.stop_gradient((start_values[:n_guards], start_rates[:n_guards]))
     )
+    includes_start = guards_and_margins.includes_phase_start
     n_margins = len(start_values) - n_guards
-    if len(guards_and_margins.includes_phase_start) != n_margins:
+    if len(includes_start) != n_margins:
         raise ValueError(
-            f"includes_phase_start has {len(guards_and_margins.includes_phase_start)} flags, but "
-            f"there are {n_margins} margins: give one flag for each."
+            f"includes_phase_start has {len(includes_start)} flags, but there are {n_margins} "
+            "margins: give one flag for each."
         )
 
     def make_phase(
@@ -147,11 +148,11 @@ def integrate_phase(
         phase, tableau = _make_phase(field, options, state_units)
         n_all_guards = n_guards + len(sides)
         phase = phase._replace(
-            evaluate_guards=lambda state: tuple(evaluate(state.v[0])[:n_all_guards]),
+            evaluate_guards=lambda state: evaluate(state.v[0])[:n_all_guards],
             evaluate_margins=lambda state: tuple(evaluate(state.v[0])[n_all_guards:]),
-            margins_include_start=guards_and_margins.includes_phase_start,
+            margins_include_start=includes_start,
             guard_scales=guards_and_margins.guard_scales,
-            guards_met_at_start=tuple(is_guard_met),
+            guards_met_at_start=is_guard_met,
             sides=sides,
         )
         if kinks is not None:
@@ -162,7 +163,6 @@ def integrate_phase(
         return phase, tableau
 
     phase, tableau = make_phase(vector_field, evaluate)
-    first_step_length = jnp.minimum(options.dt0, options.max_phase_time)
     phase_end, search_end = integrate_to_event(
         phase,
         None,
@@ -170,31 +170,27 @@ def integrate_phase(
         (),
         (start_state,),
         is_active,
-        lax.stop_gradient(0.0 * start_state[0]) + first_step_length,
+        lax.stop_gradient(0.0 * start_state[0]) + jnp.minimum(options.dt0, options.max_phase_time),
         options,
         attach_derivatives=_attach_event_derivatives,
     )
     was_located = search_end.integrator_state.has_guard_crossed | jnp.any(
         is_guard_falling & (jnp.arange(n_guards) == phase_end.end_guard_index)
     )
-    end_phase, located_guard_index = phase, phase_end.end_guard_index
     if search_end.enter_sides is not None:
-        end_phase, *_ = search_end.enter_sides(search_end.sides)
-        located_guard_index = search_end.located_guard_index
+        phase, *_ = search_end.enter_sides(search_end.sides)
     end_time, (end_state,) = _attach_event_derivatives(
-        end_phase,
+        phase,
         search_end.solver_step_function,
         search_end.integrator_state,
         phase_end.duration,
         phase_end.state,
-        located_guard_index,
+        search_end.located_guard_index,
         was_located & (phase_end.end_guard_index >= 0),
     )
     margin_minima = start_values[n_guards:]
     if search_end.margin_minima_result is not None:
-        margin_minima = jnp.where(
-            jnp.asarray(guards_and_margins.includes_phase_start), margin_minima, jnp.inf
-        )
+        margin_minima = jnp.where(jnp.asarray(includes_start), margin_minima, jnp.inf)
         margin_minima = jnp.minimum(
             jnp.minimum(search_end.margin_minima_result.interior_margin_minima, margin_minima),
             evaluate(end_state)[n_guards:],
@@ -221,7 +217,7 @@ def _attach_event_derivatives(
     def evaluate_event_equations(event: tuple[Scalar, StateArray]) -> tuple[Scalar, StateArray]:
         end_time, state = event
         guard_values = phase.evaluate_guards(last_stage._replace(v=(state,)))
-        guard_value = select_entry_by_mask(guard_index, jnp.stack(guard_values))
+        guard_value = select_entry_by_mask(guard_index, guard_values)
         stage_states, _ = solver_step_function(step_start.state, end_time - step_start.elapsed_time)
         return (
             jnp.where(was_located, guard_value, last_time - end_time),
@@ -296,7 +292,7 @@ def _make_phase(
     return (
         BatchPhase(
             evaluate_rates,
-            lambda _: (),
+            lambda _: jnp.zeros((0,)),
             take_solver_step=take_solver_step,
             has_exact_events=True,
         ),

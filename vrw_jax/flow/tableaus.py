@@ -10,7 +10,6 @@ import functools
 import itertools
 import json
 import math
-import operator
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -150,10 +149,9 @@ def fit_guard_parabola(
 def _compute_bernstein_coefficients(
     tableau: ButcherTableau, guard_values: list[Array]
 ) -> list[Array]:
-    """Return the Bernstein coefficients, except the last, of the polynomial through guard values.
+    """Return the Bernstein coefficients, except the last, of the polynomials through guard values.
 
-    If all coefficients are positive, so is the polynomial. `guard_values` are the values of the
-    guard at the start, at the stages `guard_stage_indices`, and at the end.
+    If all coefficients are positive, so is the polynomial.
     """
     return [
         guard_values[0],
@@ -161,20 +159,11 @@ def _compute_bernstein_coefficients(
     ]
 
 
-@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
-def _may_cross_inside_step(tableau: ButcherTableau, guard_values: list[Array]) -> Array:
-    """Return whether a guard may be negative inside a solver step and positive at its end."""
-    bernstein_coefficients = _compute_bernstein_coefficients(tableau, guard_values)
-    return (functools.reduce(jnp.minimum, bernstein_coefficients) <= 0.0) & (guard_values[-1] > 0.0)
-
-
-@functools.partial(jax.jit, static_argnums=0)  # The function is traced once for all guards.
-def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tuple[Array, Array]:
-    """Return whether a guard may have a negative minimum inside a solver step, and where.
+def _find_guard_minima(tableau: ButcherTableau, guard_values: list[Array]) -> tuple[Array, Array]:
+    """Return whether each guard may have a negative minimum inside a solver step, and where.
 
     The location is the node of the lowest Bernstein coefficient, as a fraction of the step. A guard
-    that only decreases has no minimum. `guard_values` are the values of the guard at the start, at
-    the stages `guard_stage_indices`, and at the end.
+    that only decreases has no minimum.
     """
     min_bernstein_coefficient, *inner_bernstein_coefficients = _compute_bernstein_coefficients(
         tableau, guard_values
@@ -205,29 +194,25 @@ def find_guard_minimum(tableau: ButcherTableau, guard_values: list[Array]) -> tu
 
 
 def find_earliest_guard_minimum_fraction(
-    tableau: ButcherTableau, guard_values: list[Vector]
+    tableau: ButcherTableau, guard_values: list[Array], is_counted: Array | bool = True
 ) -> Array:
     """Return the location of the earliest minimum at which some guard may be negative.
 
     The location is a fraction of the solver step, or 1 if no guard has such a minimum.
-    `guard_values` are the guards at the start, at the stages `guard_stage_indices`, and at the end.
-    The computation is skipped if no batch element may have a minimum.
+    `guard_values` are the guards at the start, at the stages `guard_stage_indices`, and at the end,
+    each (guards, batch). `is_counted` tells which guards may have a minimum. The computation is
+    skipped if no batch element may have one.
     """
-    stage_values_by_guard = [list(stage_values) for stage_values in zip(*guard_values, strict=True)]
-    may_cross_inside = functools.reduce(
-        operator.or_,
-        (_may_cross_inside_step(tableau, stage_values) for stage_values in stage_values_by_guard),
+    lowest_coefficients = functools.reduce(
+        jnp.minimum, _compute_bernstein_coefficients(tableau, guard_values)
+    )
+    may_cross_inside = jnp.any(
+        is_counted & (lowest_coefficients <= 0.0) & (guard_values[-1] > 0.0), axis=0
     )
 
-    def find_first_minimum(earliest_minimum_fraction: Array) -> Array:
-        for stage_values in stage_values_by_guard:
-            has_guard_minimum, minimum_fraction = find_guard_minimum(tableau, stage_values)
-            earliest_minimum_fraction = jnp.where(
-                has_guard_minimum,
-                jnp.minimum(earliest_minimum_fraction, minimum_fraction),
-                earliest_minimum_fraction,
-            )
-        return earliest_minimum_fraction
+    def find_first_minimum(_: Array) -> Array:
+        has_guard_minimum, minimum_fraction = _find_guard_minima(tableau, guard_values)
+        return jnp.min(jnp.where(is_counted & has_guard_minimum, minimum_fraction, 1.0), axis=0)
 
     whole_step_fraction = jnp.ones_like(guard_values[0][0])
     return run_if_any_element_active(
@@ -277,7 +262,7 @@ class StageAccelerations(NamedTuple):
 
     sin: Any  # sine of theta
     cos: Any
-    acceleration: Vector  # accelerations of all three coordinates, those of the phase first
+    acceleration: Any  # accelerations of all three coordinates, those of the phase first
 
 
 @functools.cache
@@ -299,14 +284,17 @@ def compute_real_stability_limit(tableau: ButcherTableau) -> float:
 
 
 class StageState(NamedTuple):
-    """Positions, rates and accelerations at one stage; each is a tuple of arrays (batch,)."""
+    """Positions, rates and accelerations at one stage.
 
-    q: Vector
-    v: Vector
+    Each is a tuple of arrays (batch,), or one array (coordinates, batch).
+    """
+
+    q: Any
+    v: Any
     acceleration: StageAccelerations
 
 
-EvaluateAcceleration = Callable[[Vector, Vector], StageAccelerations]
+EvaluateAcceleration = Callable[[Any, Any], StageAccelerations]
 SolverStepFunction = Callable[[StageState, Array], tuple[list[StageState], Array]]
 """Function of a state and a step length that returns all stages of a solver step, and its error.
 

@@ -24,7 +24,6 @@ from jax.interpreters import batching
 from jaxtyping import Array
 
 from vrw_jax import lanes
-from vrw_jax.base.elementwise import run_if_any_element_active
 from vrw_jax.base.types import Vector
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
@@ -55,7 +54,8 @@ class BatchPhase(NamedTuple):
     """
 
     evaluate_acceleration: EvaluateAcceleration
-    evaluate_guards: Callable[[StageState], Vector]
+    evaluate_guards: Callable[[StageState], Array]
+    """Function that returns all guards as one array (guards, batch)."""
     evaluate_margins: Callable[[StageState], Vector] = lambda stage_state: ()
     """Function that returns the margins whose minima are computed."""
     margins_include_start: tuple[bool, ...] = ()
@@ -74,11 +74,26 @@ class BatchPhase(NamedTuple):
     """
     take_solver_step: SolverStepFunction | None = None
     """Solver step of the phase; by default, a step of the tableau."""
+    take_last_step: Callable[[StageState, Array], list[StageState]] | None = None
+    """Function that returns the stages of the same solver step by shorter and slower code, for the
+    search for events."""
     has_exact_events: bool = False
     """Whether an event is located to round-off, and not to the tolerances."""
+    max_event_correction: Array | None = None
+    """Largest last correction of an exact event's time, as a fraction of the solver step.
+
+    The state is extrapolated linearly over the correction, with an error of its square. By default,
+    that error is round-off.
+    """
+    guards_rising_at_start: Array | None = None
+    """Whether each guard rises from its round-off at the start of the phase.
+
+    Such a guard has no minimum in the first solver step. If it grows as the cube of the time, the
+    errors of inner stages are as large as its values. By default, such guards start at zero.
+    """
     guard_scales: Array | None = None
     """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
-    guards_met_at_start: Vector | None = None
+    guards_met_at_start: Array | None = None
     """Whether each guard ends the phase at its start; by default, its value and rate decide."""
     evaluate_kinks: Callable[[StageState], Vector] | None = None
     """Function that returns the values of functions at whose zeros the equations have kinks."""
@@ -89,13 +104,13 @@ class BatchPhase(NamedTuple):
     sides: Vector = ()
     """Signs for which the equations are smooth; empty without kinks."""
 
-    def make_state(self, q: Vector, v: Vector) -> StageState:
+    def make_state(self, q: Any, v: Any) -> StageState:
         """Return the state with positions `q`, rates `v` and the accelerations there."""
         return StageState(q, v, self.evaluate_acceleration(q, v))
 
     def evaluate_with_rates(
-        self, evaluate_functions: Callable[[StageState], Vector], state: StageState
-    ) -> tuple[Vector, Vector]:
+        self, evaluate_functions: Callable[[StageState], Any], state: StageState
+    ) -> tuple[Any, Any]:
         """Return the values of `evaluate_functions` at a state, and their time derivatives."""
         return jax.jvp(
             lambda q, v: evaluate_functions(self.make_state(q, v)),
@@ -417,10 +432,11 @@ class PhaseTangents(NamedTuple):
         stage_states: list[StageState],
         start_tangents: Array,
         h: Array,
+        is_accepted: Array | bool = True,
     ) -> Array:
         """Return the tangents at the end of a solver step, given the tangents at its start.
 
-        `h` is the length of the step, s.
+        `h` is the length of the step, s. Elements that do not accept the step keep their tangents.
         """
         stage_jacobians = _compute_stage_jacobians(
             self.make_phase,
@@ -429,29 +445,25 @@ class PhaseTangents(NamedTuple):
             self.held_constants,
             stage_states,
         )
-        return _propagate_tangents(tableau, *stage_jacobians, start_tangents, h)
+        end_tangents = _propagate_tangents(tableau, *stage_jacobians, start_tangents, h)
+        return (
+            end_tangents
+            if is_accepted is True
+            else jnp.where(is_accepted, end_tangents, start_tangents)
+        )
 
-    def propagate_if_accepted(
+    def evaluate_rate_and_tangents(
         self,
-        tableau: ButcherTableau,
-        stage_states: list[StageState],
-        start_tangents: Array,
-        h: Array,
-        is_accepted: Array,
-    ) -> Array:
-        """Return the tangents after a solver step in the batch elements that accept the step.
-
-        All other elements have their `start_tangents`. The computation is skipped if no element
-        accepts the step. `h` is the length of the step, s.
-        """
-        propagate_accepted_tangents = lambda start_tangents: jnp.where(
-            is_accepted,
-            self.propagate_to_step_end(tableau, stage_states, start_tangents, h),
-            start_tangents,
+        evaluate_function: Callable[[BatchPhase, StageState], Array],
+        state: StageState,
+        directions: Array,
+    ) -> tuple[Array, Array]:
+        """Return the time derivative of a function, and the result of `evaluate_tangents`."""
+        phase = self.make_phase(self.phase_constants, self.held_constants)
+        _, (rate,) = phase.evaluate_with_rates(
+            lambda state: (evaluate_function(phase, state),), state
         )
-        return run_if_any_element_active(
-            jnp.any(is_accepted), propagate_accepted_tangents, start_tangents
-        )
+        return rate, self.evaluate_tangents(evaluate_function, state, directions)
 
     def evaluate_tangents(
         self,

@@ -4,14 +4,13 @@ All laws of contact and impact are elementwise over the batch. A batch element i
 Each iteration resolves the events of all elements at an event, then integrates all elements
 further. The landing of the foremost foot is an event like any other.
 
-The batch kernel integrates many elements (`integrate_contact_interval`). On a CPU, its loop is one
+The batch kernel integrates many elements (`integrate_to_event`). On a CPU, its loop is one
 machine-code program in which few elements are idle. On other devices, XLA compiles the same source.
 diffrax integrates a single element (`integrate_by_diffrax`).
 """
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -20,25 +19,30 @@ from jaxtyping import Array
 from vrw_jax.base.elementwise import make_opaque_loop_condition, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.flow.event_location import IntegratorState
+from vrw_jax.flow.integrate import (
+    Interruption,
+    PhaseEnd,
+    SearchEnd,
+    integrate_to_event,
+    make_idle_state,
+)
 from vrw_jax.flow.tableaus import ButcherTableau
 from vrw_jax.lanes.batching import make_zeros_like_output
-from vrw_jax.models.contact_diffrax import init_diffrax_contact_interval, integrate_by_diffrax
-from vrw_jax.models.contact_impacts import ContactLaw
+from vrw_jax.models.contact_impacts import ContactEventResult, ContactLaw
 from vrw_jax.models.contact_integrator import (
-    N_ACCUMULATOR_ROWS,
-    ContactIntervalPoint,
-    ContactIntervalState,
-    LaneStatus,
-    init_contact_interval,
-    integrate_contact_interval,
-    pack_coordinates,
-    unpack_motion,
+    IntervalGuards,
+    begin_interval,
+    integrate_by_diffrax,
+    make_contact_phase,
 )
 from vrw_jax.models.contact_mechanics import (
     Friction,
     WheelMotion,
     compute_landing_position,
+    pack_motion,
     stop_gradients,
+    unpack_motion,
 )
 from vrw_jax.models.contact_record import (
     GaitStepCounters,
@@ -63,13 +67,18 @@ from vrw_jax.models.contact_section import (
     unpack_section_state,
 )
 from vrw_jax.models.contact_state import (
+    N_LOSSES,
     ContactModeDynamics,
     ContactState,
+    GuardLayout,
     NormalForceRates,
     choose_stopping_guard,
+    compute_contact_quantities,
     flag_zero_force_rates,
     is_wheel_at_rest,
     make_contact_mode_dynamics,
+    make_guard_layout,
+    unpack_state,
     update_force_rate_signs,
 )
 from vrw_jax.models.phase_sequence import find_stance_slope
@@ -80,6 +89,7 @@ from vrw_jax.wheel.params import (
     Symbols,
     add_laws,
     compute_symbols,
+    compute_wheel_units,
     make_wheel_from_parameters,
     stack_parameters,
 )
@@ -93,6 +103,8 @@ They are the friction coefficient of the feet that landed earlier, and the two r
 coefficient and the angle by which the next straight line is steeper, rad. If restitution is an
 input, its column is last.
 """
+MAX_ITERATIONS_WITH_WAITING_LANE = 4
+"""Number of solver steps after which an element at an event ends the loop for the batch."""
 STATUS_UNFINISHED = -1
 """Value that replaces the outcome code as long as a walk is unfinished."""
 
@@ -106,62 +118,44 @@ class BatchWalkResult(NamedTuple):
     n_solver_steps: Array
 
 
-class DifferentiableLaneState(NamedTuple):
-    """Differentiable arrays in the state of all batch elements, or tangents of these arrays."""
+class IntervalProgress(NamedTuple):
+    """Intervals of which an interruption has left some unfinished."""
 
-    q: Array
-    v: Array
-    interval_accumulators: Array | None
-    time_since_event: Array
-    step_accumulators: Array | None
-    durations: Array
-    step_details: Any  # floats of the details
+    interval_guards: IntervalGuards
+    integrator_state: IntegratorState
 
 
 class LaneState(NamedTuple):
-    """State of all batch elements between two iterations of the event loop."""
+    """State of all batch elements at their last events, or within an interval between two events.
 
-    contact_interval_state: ContactIntervalState
+    All floating-point arrays except those of `progress` have derivatives. The first three are those
+    of an interval.
+    """
+
+    q: Array  # hub x, hub z, theta and leg lengths, (3 + n, batch)
+    v: Array  # their rates and, if details are requested, the losses in the last interval
+    interval_duration: Array  # s
+    step_losses: Array | None  # losses and slip in this step, (N_LOSSES, batch), if requested
     step_counters: GaitStepCounters  # counters of this step; solver steps are counted over the walk
     step_details: UnilateralStepDetails | None  # details of this step, if requested
-    step_energy_loss_accumulators: (
-        Array | None
-    )  # integrals over this step, rows as in `ContactIntervalState`
+    contact_state: ContactState  # contact state in the last interval
+    guard_index: Array  # index of the guard of the event
+    is_resting: Array  # whether the wheel is at rest
+    n_solver_steps: Array  # number of solver steps in the last interval
+    interval_outcome: Array  # STEPPED if the last interval has ended, or shall end, at an event
     n_stepped: Array
     walk_outcome: Array
+    progress: IntervalProgress | None = None  # None if all elements are at events
 
-    def get_differentiable_state(self) -> DifferentiableLaneState:
-        """Return the differentiable arrays of the state."""
-        interval_state = self.contact_interval_state
-        return DifferentiableLaneState(
-            interval_state.contact_interval_point.q,
-            interval_state.contact_interval_point.v,
-            interval_state.interval_accumulators,
-            interval_state.time_since_event,
-            self.step_energy_loss_accumulators,
-            self.step_counters.durations,
-            eqx.filter(self.step_details, eqx.is_inexact_array),
-        )
+    @property
+    def motion(self) -> WheelMotion:
+        """Return the motion at the event."""
+        return unpack_motion(self.q, self.v)
 
-    def replace_differentiable_state(
-        self, differentiable_state: DifferentiableLaneState
-    ) -> "LaneState":
-        """Return the state with its differentiable arrays replaced."""
-        q, v, interval_accumulators, time_since_event, step_accumulators, durations, details = (
-            differentiable_state
-        )
-        nonfloat_details = eqx.filter(self.step_details, eqx.is_inexact_array, inverse=True)
-        interval_state = self.contact_interval_state
-        return self._replace(
-            contact_interval_state=interval_state._replace(
-                contact_interval_point=interval_state.contact_interval_point._replace(q=q, v=v),
-                interval_accumulators=interval_accumulators,
-                time_since_event=time_since_event,
-            ),
-            step_counters=self.step_counters._replace(durations=durations),
-            step_details=eqx.combine(details, nonfloat_details),
-            step_energy_loss_accumulators=step_accumulators,
-        )
+    @property
+    def is_unfinished(self) -> Array:
+        """Return whether the walk of each element continues."""
+        return self.walk_outcome == STATUS_UNFINISHED
 
 
 class BatchWalkSettings(NamedTuple):
@@ -181,6 +175,13 @@ class BatchWalkSettings(NamedTuple):
     # whether the extrema of normal forces are located; only if details are requested
     measures_force_peaks: bool = False
     law_structure: Any = NO_LAWS  # structure of the laws as a pytree
+
+    @property
+    def guard_layout(self) -> GuardLayout:
+        """Return the order of the guards."""
+        return make_guard_layout(
+            self.n_legs, self.has_one_sided_stoppers, self.measures_force_peaks
+        )
 
     @property
     def friction_index(self) -> int:
@@ -252,123 +253,147 @@ class BatchWalkSettings(NamedTuple):
         if self.measures_force_peaks:
             unit_signs = jnp.stack([jnp.ones_like(motion.x)] * len(NormalForceRates._fields))
             contact_state = contact_state._replace(force_rate_signs=unit_signs)
-        contact_mode_dynamics = self.make_lane_contact_dynamics(input_columns, contact_state)
-        interval_state = make_zeros_like_output(
-            lambda: self.begin_contact_interval(contact_mode_dynamics, motion)
-        )
-        q, v = pack_coordinates(motion)
-        infinite_rows = jnp.full_like(interval_state.contact_interval_point.dynamics_rows, jnp.inf)
-        interval_state = interval_state._replace(
-            contact_interval_point=ContactIntervalPoint(q, v, infinite_rows),
-            contact_state=contact_state,
-            lane_status=interval_state.lane_status + LaneStatus.EVENT,
-        )
-        int_zero_lanes = jnp.zeros_like(interval_state.triggered_guard_index)
+        zeros = jnp.zeros(motion.x.shape, jnp.int32)
+        q, v = self._pack_start(motion)
+        losses, counters, details = self._init_step_records(motion.x)
         return LaneState(
-            interval_state,
-            *self._init_step_records(section_state[0]),
-            int_zero_lanes,
-            int_zero_lanes + STATUS_UNFINISHED,
+            q,
+            v,
+            jnp.zeros_like(motion.x),
+            losses,
+            counters,
+            details,
+            contact_state,
+            guard_index=zeros,
+            is_resting=zeros > 0,
+            n_solver_steps=zeros,
+            interval_outcome=zeros + Outcome.STEPPED,
+            n_stepped=zeros,
+            walk_outcome=zeros + STATUS_UNFINISHED,
         )
 
-    def begin_contact_interval(
-        self, contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
-    ) -> ContactIntervalState:
-        """Return the state at the start of an interval between events, without derivatives."""
-        contact_mode_dynamics, motion, dt0 = stop_gradients(
-            (contact_mode_dynamics, motion, self.step_options.dt0)
-        )
-        if self.tableau is None:
-            return init_diffrax_contact_interval(contact_mode_dynamics, motion)
-        return init_contact_interval(contact_mode_dynamics, motion, dt0)
+    def _pack_start(self, motion: WheelMotion) -> tuple[Array, Array]:
+        """Return coordinates and rates at the start of an interval, before any loss."""
+        q, v = pack_motion(motion)
+        return q, jnp.concatenate([v, jnp.zeros_like(q[: N_LOSSES * self.is_detailed])])
 
     def _init_step_records(
         self, lane_template: Array
-    ) -> tuple[GaitStepCounters, UnilateralStepDetails | None, Array | None]:
-        """Return step counters, step details and loss accumulators at the start of a step.
-
-        Details and accumulators are None if no details are requested.
-        """
+    ) -> tuple[Array | None, GaitStepCounters, UnilateralStepDetails | None]:
+        """Return losses, counters and details at the start of a step."""
+        counters = init_step_counters(lane_template)
         if not self.is_detailed:
-            return init_step_counters(lane_template), None, None
-        return (
-            init_step_counters(lane_template),
-            init_step_details(lane_template, self.measures_force_peaks),
-            jnp.zeros((N_ACCUMULATOR_ROWS, *lane_template.shape), lane_template.dtype),
-        )
+            return None, counters, None
+        losses = jnp.zeros((N_LOSSES, *lane_template.shape), lane_template.dtype)
+        return losses, counters, init_step_details(lane_template, self.measures_force_peaks)
 
     def process_events(self, input_columns: Array, lane_state: LaneState) -> LaneState:
         """Return the state of all batch elements after their events are resolved.
 
-        If a walk ends, its outcome is set. Running elements are unchanged.
+        If a walk ends, its outcome is set. A landing of the foremost foot opens the next step.
         """
-        interval_state = lane_state.contact_interval_state
-        contact_state = interval_state.contact_state
-        motion = unpack_motion(interval_state.contact_interval_point)
-        s, friction = self.unpack_input_columns(input_columns)
-        dynamics_before = self.make_lane_contact_dynamics(input_columns, contact_state)
-        guard_layout = dynamics_before.guard_layout
-        _, rates, dynamics_rows = lax.stop_gradient(interval_state.contact_interval_point)
-        is_resting = is_wheel_at_rest(s, rates, dynamics_rows[: len(rates)], self.step_options.atol)
-        guard_index = choose_stopping_guard(
-            dynamics_before, rates, interval_state.triggered_guard_index, self.step_options.atol
+        progress, lane_state = lane_state.progress, lane_state._replace(progress=None)
+        ended = self._end_interval(input_columns, lane_state)
+        begun = self._begin_step(input_columns, ended)
+        continued = self._resolve_event(input_columns, begun)
+        after_event = select_trees_by_condition(ended.is_unfinished, continued, ended)
+        is_at_event = lane_state.is_unfinished
+        if progress is not None:
+            is_at_event = is_at_event & ~progress.integrator_state.is_running
+        lane_state = select_trees_by_condition(is_at_event, after_event, lane_state)
+        return lane_state._replace(progress=progress)
+
+    def begin_progress(self, input_columns: Array, lane_state: LaneState) -> IntervalProgress:
+        """Return the progress before the first interval."""
+        dynamics = self.make_lane_contact_dynamics(input_columns, lane_state.contact_state)
+        assert self.tableau is not None
+        phase = make_contact_phase(dynamics, self.tableau, self.step_options)
+        start = lane_state.q, lane_state.v
+        interval_guards, state = make_zeros_like_output(
+            lambda: (
+                begin_interval(dynamics, phase, *start, self.step_options),
+                phase.make_state(*start),
+            )
         )
-        interval_state = interval_state._replace(triggered_guard_index=guard_index)
+        guard_values = jnp.zeros(interval_guards.is_met_at_start.shape, lane_state.q.dtype)
+        return IntervalProgress(
+            interval_guards, make_idle_state(state, guard_values, lane_state.interval_duration)
+        )
+
+    def _has_landed(self, lane_state: LaneState) -> Array:
+        """Return whether the foremost foot lands at the event."""
+        return (lane_state.interval_outcome == Outcome.STEPPED) & (
+            lane_state.guard_index == self.guard_layout.foremost_landing_guard
+        )
+
+    def _end_interval(self, input_columns: Array, lane_state: LaneState) -> LaneState:
+        """Return the state with the last interval recorded, and the outcomes of ended walks."""
         step_counters = count_contact_interval(
             lane_state.step_counters,
-            contact_state,
-            interval_state.time_since_event,
-            interval_state.n_solver_steps,
+            lane_state.contact_state,
+            lane_state.interval_duration,
+            lane_state.n_solver_steps,
         )
         step_details: Any = lane_state.step_details
-        step_accumulators: Any = lane_state.step_energy_loss_accumulators
+        step_losses: Any = lane_state.step_losses
         n_events = step_counters.n_events
         if self.is_detailed:
+            dynamics = self.make_lane_contact_dynamics(input_columns, lane_state.contact_state)
             step_details = record_contact_interval(
-                step_details, dynamics_before, motion, interval_state.time_since_event
+                step_details, dynamics, lane_state.motion, lane_state.interval_duration
             )
-            step_accumulators = step_accumulators + interval_state.interval_accumulators
+            step_losses = step_losses + lane_state.v[len(lane_state.q) :]
         if self.measures_force_peaks:
             n_events = n_events + step_details.force_peaks.n_force_extrema
-        is_at_event = interval_state.lane_status == LaneStatus.EVENT
-        has_landed = is_at_event & (guard_index == guard_layout.foremost_landing_guard)
+        has_landed = self._has_landed(lane_state)
         outcome = determine_interval_outcome(
             n_events,
-            guard_layout,
-            is_at_event,
-            guard_index,
+            self.guard_layout,
+            lane_state.guard_index,
             has_landed,
-            interval_state.lane_status,
-            is_resting,
+            lane_state.interval_outcome,
+            lane_state.is_resting,
             self.max_events,
         ).astype(jnp.int32)
         n_stepped = lane_state.n_stepped + has_landed
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
-        ended_lane_state = LaneState(
-            interval_state, step_counters, step_details, step_accumulators, n_stepped, outcome
+        return lane_state._replace(
+            step_counters=step_counters,
+            step_details=step_details,
+            step_losses=step_losses,
+            n_stepped=n_stepped,
+            walk_outcome=jnp.where(has_ended, outcome, lane_state.walk_outcome),
         )
 
-        # A landing of the foremost foot opens the next step. Then every event is processed.
-        begins_step = has_landed & ~has_ended
-        motion_at_step_start, contact_state_at_step_start = unpack_section_state(
-            s, pack_section_state(s, motion, contact_state)
+    def _begin_step(self, input_columns: Array, lane_state: LaneState) -> LaneState:
+        """Return the state with a new step, at a landing of the foremost foot."""
+        s, contact_state = self.unpack_input_columns(input_columns)[0], lane_state.contact_state
+        motion, start_contact_state = unpack_section_state(
+            s, pack_section_state(s, lane_state.motion, contact_state)
         )
-        contact_state_at_step_start = contact_state_at_step_start._replace(
-            force_rate_signs=contact_state.force_rate_signs
+        q, v = self._pack_start(motion)
+        losses, counters, details = self._init_step_records(motion.x)
+        begun = lane_state._replace(
+            q=q,
+            v=v,
+            step_losses=losses,
+            step_counters=counters._replace(n_solver_steps=lane_state.step_counters.n_solver_steps),
+            step_details=details,
+            contact_state=start_contact_state._replace(
+                force_rate_signs=contact_state.force_rate_signs
+            ),
+            guard_index=jnp.full_like(
+                lane_state.guard_index, self.guard_layout.first_landing_guard
+            ),
         )
-        motion, contact_state = select_trees_by_condition(
-            begins_step,
-            (motion_at_step_start, contact_state_at_step_start),
-            (motion, contact_state),
-        )
-        initial_counters, *initial_records = self._init_step_records(motion.x)
-        initial_counters = initial_counters._replace(n_solver_steps=step_counters.n_solver_steps)
-        step_counters, step_details, step_accumulators = select_trees_by_condition(
-            begins_step,
-            (initial_counters, *initial_records),
-            (step_counters, step_details, step_accumulators),
-        )
-        guard_index = jnp.where(begins_step, guard_layout.first_landing_guard, guard_index)
+        return select_trees_by_condition(self._has_landed(lane_state), begun, lane_state)
+
+    def _resolve_event(self, input_columns: Array, lane_state: LaneState) -> LaneState:
+        """Return the state at the start of the next interval."""
+        s, friction = self.unpack_input_columns(input_columns)
+        motion, contact_state = lane_state.motion, lane_state.contact_state
+        guard_index, step_counters = lane_state.guard_index, lane_state.step_counters
+        step_details: Any = lane_state.step_details
         contact_law = ContactLaw(
             s,
             friction,
@@ -380,81 +405,161 @@ class BatchWalkSettings(NamedTuple):
         )
         event_result, contact_event, event_outcome = process_event(
             contact_law,
-            guard_layout,
+            self.guard_layout,
             motion,
             contact_state,
             guard_index,
             step_counters.n_events,
             self.max_events,
         )
-        # At the extremum of a force, motion and contacts continue without change.
         n_contact_events: Any = 1
         if self.measures_force_peaks:
-            is_contact_event = guard_index < guard_layout.first_force_rate_guard
+            is_contact_event = guard_index < self.guard_layout.first_force_rate_guard
             n_contact_events = is_contact_event.astype(jnp.int32)
-            is_rate_zero = flag_zero_force_rates(guard_layout, guard_index)
-            step_details = step_details._replace(
-                force_peaks=record_force_extremum(
-                    step_details.force_peaks, is_rate_zero, dynamics_before, motion
-                )
-            )
             event_outcome = jnp.where(is_contact_event, event_outcome, Outcome.STEPPED)
-            motion_after, contact_state_after = select_trees_by_condition(
-                is_contact_event,
-                (event_result.motion, event_result.contact_state),
-                (motion, ContactState.without_recent_changes(*contact_state[:2])),
+            step_details, event_result = self._record_force_extrema(
+                input_columns, lane_state, event_result, is_contact_event
             )
-            dynamics_after = self.make_lane_contact_dynamics(input_columns, contact_state_after)
-            force_rate_signs = update_force_rate_signs(
-                dynamics_after, motion_after, contact_state.force_rate_signs, is_rate_zero
-            )
-            event_result = event_result._replace(
-                motion=motion_after,
-                contact_state=contact_state_after._replace(force_rate_signs=force_rate_signs),
-            )
-        contact_mode_dynamics = self.make_lane_contact_dynamics(
-            input_columns, event_result.contact_state
-        )
-        next_interval = self.begin_contact_interval(contact_mode_dynamics, event_result.motion)
-        q, v = pack_coordinates(event_result.motion)
-        next_interval = next_interval._replace(
-            contact_interval_point=next_interval.contact_interval_point._replace(q=q, v=v),
-            lane_status=jnp.where(
-                event_outcome != Outcome.STEPPED, event_outcome, next_interval.lane_status
-            ),
-        )
         if self.is_detailed:
             step_details = record_event(
                 step_details, step_counters.n_events == 0, event_result, contact_event
             )
             step_details = record_contact_interval(
-                step_details, contact_mode_dynamics, event_result.motion, jnp.zeros_like(motion.x)
+                step_details,
+                self.make_lane_contact_dynamics(input_columns, event_result.contact_state),
+                event_result.motion,
+                jnp.zeros_like(motion.x),
             )
-        continued_lane_state = LaneState(
-            next_interval,
-            step_counters._replace(n_events=step_counters.n_events + n_contact_events),
-            step_details,
-            step_accumulators,
-            n_stepped,
-            lane_state.walk_outcome,
+        q, v = self._pack_start(event_result.motion)
+        return lane_state._replace(
+            q=q,
+            v=v,
+            interval_duration=jnp.zeros_like(motion.x),
+            step_counters=step_counters._replace(
+                n_events=step_counters.n_events + n_contact_events
+            ),
+            step_details=step_details,
+            contact_state=event_result.contact_state,
+            n_solver_steps=jnp.zeros_like(guard_index),
+            interval_outcome=event_outcome,
         )
-        has_interval_ended = (interval_state.lane_status != LaneStatus.RUNNING) & (
-            lane_state.walk_outcome == STATUS_UNFINISHED
+
+    def _record_force_extrema(
+        self,
+        input_columns: Array,
+        lane_state: LaneState,
+        event_result: ContactEventResult,
+        is_contact_event: Array,
+    ) -> tuple[UnilateralStepDetails, ContactEventResult]:
+        """Return details with the extrema of forces, and an event that continues through them.
+
+        At the extremum of a force, motion and contacts continue without change.
+        """
+        step_details: Any = lane_state.step_details
+        motion, contact_state = lane_state.motion, lane_state.contact_state
+        assert contact_state.force_rate_signs is not None
+        is_rate_zero = flag_zero_force_rates(self.guard_layout, lane_state.guard_index)
+        force_peaks = record_force_extremum(
+            step_details.force_peaks,
+            is_rate_zero,
+            self.make_lane_contact_dynamics(input_columns, contact_state),
+            motion,
         )
-        return select_trees_by_condition(
-            has_interval_ended,
-            select_trees_by_condition(has_ended, ended_lane_state, continued_lane_state),
-            lane_state,
+        motion, next_contact_state = select_trees_by_condition(
+            is_contact_event,
+            (event_result.motion, event_result.contact_state),
+            (motion, ContactState.without_recent_changes(*contact_state[:2])),
         )
+        force_rate_signs = update_force_rate_signs(
+            self.make_lane_contact_dynamics(input_columns, next_contact_state),
+            motion,
+            contact_state.force_rate_signs,
+            is_rate_zero,
+        )
+        return step_details._replace(force_peaks=force_peaks), event_result._replace(
+            motion=motion,
+            contact_state=next_contact_state._replace(force_rate_signs=force_rate_signs),
+        )
+
+    def integrate(
+        self, input_columns: Array, lane_state: LaneState, phase_tangents: Any = None
+    ) -> tuple[LaneState, PhaseEnd, SearchEnd | None]:
+        """Return the state of all batch elements at their next events, and how the phase ended.
+
+        - `phase_tangents`: tangents that are integrated together with the motion, or None.
+        """
+        dynamics = self.make_lane_contact_dynamics(input_columns, lane_state.contact_state)
+        options = compute_wheel_units(dynamics.s).scale_times_to_seconds(self.step_options)
+        phase = make_contact_phase(
+            dynamics, self.tableau, options, limits_tangents=phase_tangents is not None
+        )
+        interval_guards = begin_interval(dynamics, phase, lane_state.q, lane_state.v, options)
+        is_active = lane_state.is_unfinished & (lane_state.interval_outcome == Outcome.STEPPED)
+        progress, interruption, search_end = lane_state.progress, None, None
+        if self.tableau is None:
+            phase = interval_guards.limit_phase(phase, dynamics, options)
+            phase_end = integrate_by_diffrax(dynamics, phase, lane_state.motion, is_active, options)
+            motion, (_, *losses) = unpack_state(phase_end.state)
+            q, v = pack_motion(motion)
+            v = jnp.concatenate([v, jnp.stack(losses)[: N_LOSSES * self.is_detailed]])
+            accelerations = compute_contact_quantities(
+                *stop_gradients((dynamics, motion))
+            ).accelerations
+        else:
+            if progress is not None:
+                interruption = Interruption(
+                    MAX_ITERATIONS_WITH_WAITING_LANE, progress.integrator_state
+                )
+                interval_guards = select_trees_by_condition(
+                    progress.integrator_state.is_running, progress.interval_guards, interval_guards
+                )
+            phase_end, search_end = integrate_to_event(
+                interval_guards.limit_phase(phase, dynamics, options),
+                phase_tangents,
+                self.tableau,
+                lane_state.q,
+                lane_state.v,
+                is_active,
+                options.dt0,
+                options,
+                interruption=interruption,
+            )
+            q, v, (_, _, rows) = phase_end.state
+            accelerations = rows[: len(q)]
+            if progress is not None:
+                integrator_state = search_end.integrator_state._replace(state_tangents=None)
+                progress = IntervalProgress(interval_guards, integrator_state)
+        guard_index, atol = phase_end.end_guard_index, self.step_options.atol
+        rates = lax.stop_gradient(v[: len(q)])
+        outcome = jnp.where(
+            phase_end.is_timed_out, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED
+        )
+        outcome = jnp.where((guard_index >= 0) | phase_end.is_unfinished, Outcome.STEPPED, outcome)
+        outcome = jnp.where(
+            guard_index == self.guard_layout.n_guards, Outcome.PAINLEVE_PARADOX, outcome
+        )
+        lane_state = lane_state._replace(
+            q=q,
+            v=v,
+            interval_duration=phase_end.duration,
+            guard_index=choose_stopping_guard(dynamics, rates, guard_index, atol),
+            is_resting=is_wheel_at_rest(dynamics.s, rates, accelerations, atol),
+            n_solver_steps=phase_end.solver_steps,
+            interval_outcome=jnp.where(is_active, outcome, lane_state.interval_outcome).astype(
+                jnp.int32
+            ),
+            progress=progress,
+        )
+        return lane_state, phase_end, search_end
 
     def compute_step_result(self, lane_state: LaneState, input_columns: Array) -> Any:
         """Return the results of the last step of all batch elements, whose walks have ended."""
         step_summary = self.summarize_step(lane_state, input_columns)
-        if lane_state.step_details is None or lane_state.step_energy_loss_accumulators is None:
+        if lane_state.step_details is None or lane_state.step_losses is None:
             return step_summary
         return make_unilateral_step(
             step_summary,
-            lane_state.step_energy_loss_accumulators,
+            lane_state.step_losses,
             lane_state.step_counters,
             lane_state.step_details,
             lane_state.walk_outcome,
@@ -466,12 +571,11 @@ class BatchWalkSettings(NamedTuple):
 
         If the step failed, the section state and the step length are zero.
         """
-        motion = unpack_motion(lane_state.contact_interval_state.contact_interval_point)
-        contact_state = lane_state.contact_interval_state.contact_state
+        motion = lane_state.motion
         section_state = pack_section_state(
             self.unpack_input_columns(input_columns)[0],
             motion,
-            contact_state,
+            lane_state.contact_state,
             self.extract_ground_ahead(input_columns),
         )
         zero_unless_stepped = lambda value: jnp.where(
@@ -527,37 +631,17 @@ def init_lane_states(
     )
 
 
-def process_and_integrate(
-    walk_settings: BatchWalkSettings,
-    input_columns: Array,
-    lane_state: LaneState,
-    waits_for_events: bool = False,
+def advance_to_events(
+    walk_settings: BatchWalkSettings, input_columns: Array, lane_state: LaneState
 ) -> tuple[LaneState, LaneState]:
-    """Return the state of the batch after its events, and the state after further integration.
-
-    - `waits_for_events`: whether every element is integrated to its next event.
-    """
-    state_after_events = walk_settings.process_events(input_columns, lane_state)
-    interval_state = state_after_events.contact_interval_state
-    if walk_settings.tableau is None:
-        interval_state = integrate_by_diffrax(
-            walk_settings.make_lane_contact_dynamics,
-            input_columns,
-            interval_state,
-            walk_settings.step_options,
-        )
-    else:
-        has_unfinished_walk = state_after_events.walk_outcome == STATUS_UNFINISHED
-        contact_state = interval_state.contact_state
-        interval_state = integrate_contact_interval(
-            lambda columns: walk_settings.make_lane_contact_dynamics(columns, contact_state),
-            input_columns,
-            interval_state,
-            has_unfinished_walk & (not waits_for_events),
-            walk_settings.step_options,
-            walk_settings.tableau,
-        )
-    return state_after_events, state_after_events._replace(contact_interval_state=interval_state)
+    """Return the state of the batch after its events, and the state at the next events."""
+    after_events = walk_settings.process_events(input_columns, lane_state)
+    if walk_settings.tableau is not None:
+        return after_events, walk_settings.integrate(input_columns, after_events)[0]
+    remove_axis = lambda tree: jax.tree.map(lambda x: x[..., 0], tree)
+    settings = walk_settings._replace(step_options=remove_axis(walk_settings.step_options))
+    single_state = settings.integrate(*remove_axis((input_columns, after_events)))[0]
+    return after_events, jax.tree.map(lambda x: x[..., None], single_state)
 
 
 def run_walks(
@@ -571,17 +655,25 @@ def run_walks(
         )
     input_columns = walk_settings.resolve_heights(input_columns, section_state)
     input_columns, lane_state = init_lane_states(walk_settings, input_columns, section_state)
-    run_iteration = lambda lane_state: process_and_integrate(
-        walk_settings, input_columns, lane_state
-    )[1]
+    if walk_settings.tableau is not None:
+        progress = walk_settings.begin_progress(input_columns, lane_state)
+        lane_state = lane_state._replace(progress=progress)
+    run_iteration = lambda lane_state: advance_to_events(walk_settings, input_columns, lane_state)[
+        1
+    ]
     should_continue = lambda lane_state: jnp.any(
-        make_opaque_loop_condition(
-            lane_state.walk_outcome == STATUS_UNFINISHED, lane_state.step_counters.n_events
-        )
+        make_opaque_loop_condition(lane_state.is_unfinished, lane_state.step_counters.n_events)
     )
     lane_state = lax.while_loop(should_continue, run_iteration, lane_state)
+    return make_walk_result(
+        walk_settings.compute_step_result(lane_state, input_columns), lane_state
+    )
+
+
+def make_walk_result(step_result: Any, lane_state: LaneState) -> BatchWalkResult:
+    """Return the results of walks that have ended."""
     return BatchWalkResult(
-        walk_settings.compute_step_result(lane_state, input_columns),
+        step_result,
         lane_state.walk_outcome,
         lane_state.n_stepped,
         lane_state.step_counters.n_solver_steps,

@@ -58,6 +58,22 @@ class WheelMotion(NamedTuple):
     dL: LegArray  # rates of the leg lengths, m/s
 
 
+def unpack_motion(q: Array, v: Array) -> WheelMotion:
+    """Return the motion with the coordinates `q` (hub x, hub z, theta, leg lengths) and rates `v`.
+
+    The first axis of `v` may have further entries.
+    """
+    (x, z, theta), (vx, vz, dtheta) = q[:3], v[:3]
+    return WheelMotion(x, z, theta, vx, vz, dtheta, q[3:], v[3 : len(q)])
+
+
+def pack_motion(motion: WheelMotion) -> tuple[Array, Array]:
+    """Return the coordinates of a motion and their rates, which inverts `unpack_motion`."""
+    return jnp.concatenate([jnp.stack(motion[:3]), motion.L]), jnp.concatenate(
+        [jnp.stack(motion[3:6]), motion.dL]
+    )
+
+
 class LegDirections(NamedTuple):
     """Directions of all legs: radial u = (sin, cos) and transverse e = (cos, -sin)."""
 

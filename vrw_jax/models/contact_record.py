@@ -165,10 +165,9 @@ def count_contact_interval(
 def determine_interval_outcome(
     n_events: Int[Array, "..."],
     guard_layout: GuardLayout,
-    has_reached_event: Array,
     guard_index: Array,
     has_landed: Array,
-    failure_outcome: Array,
+    interval_outcome: Array,
     is_resting: Array,
     max_events: int,
 ) -> Int[Array, "..."]:
@@ -176,15 +175,14 @@ def determine_interval_outcome(
 
     The result is STEPPED if the walk continues or the foremost foot has landed.
 
-    If the interval did not end at an event, the result is `failure_outcome`. If the wheel is at
+    If the interval did not end at an event, the result is `interval_outcome`. If the wheel is at
     rest, the result is CAME_TO_REST.
     """
     outcome = jnp.where(n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
     outcome = jnp.where(guard_index == guard_layout.rolling_rate_guard, Outcome.FELL_BACK, outcome)
     outcome = jnp.where(guard_index == guard_layout.collapse_guard, Outcome.COLLAPSED, outcome)
-    outcome = jnp.where(
-        has_reached_event, jnp.where(has_landed, Outcome.STEPPED, outcome), failure_outcome
-    )
+    outcome = jnp.where(has_landed, Outcome.STEPPED, outcome)
+    outcome = jnp.where(interval_outcome == Outcome.STEPPED, outcome, interval_outcome)
     return replace_rest_outcome(outcome, is_resting)
 
 

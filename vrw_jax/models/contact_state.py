@@ -4,6 +4,7 @@ A *contact state* consists of the contact modes of all feet and the stopper flag
 contact state is constant between two events.
 """
 
+import itertools
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
@@ -65,6 +66,10 @@ class EnergyLossAccumulators(NamedTuple):
     damping_loss: Scalar  # energy lost in the dampers, J
     friction_loss: Scalar  # energy lost by sliding, J
     slip_length: Scalar  # path length of all sliding feet, m
+
+
+N_LOSSES = len(EnergyLossAccumulators._fields) - 1
+"""Number of accumulators without the time."""
 
 
 def pack_state(motion: WheelMotion, accumulators: EnergyLossAccumulators) -> PackedState:
@@ -400,36 +405,69 @@ def update_force_rate_signs(
 
 
 class ContactQuantities(NamedTuple):
-    """Contact forces and slip speeds that the guards depend on in addition to the motion."""
+    """Accelerations, loss rates and contact forces; the first axis of each array contains rows."""
 
+    accelerations: Array  # of hub x, hub z, theta and the leg lengths
+    loss_rates: Array | None  # without the rate of the time; None unless a batch integrates them
+    painleve_determinant: Array  # one row
     normal_forces: SlotArray
     tangential_forces: SlotArray
     stopper_forces: SlotArray
     slip_speeds: SlotArray  # tangential speeds of the feet in the contact slots, m/s
-    airborne_stopper_forces: (
-        LegArray | None
-    )  # stopper force of legs in the air, if stoppers are one-sided
-    force_rates: Array | None = (
-        None  # `NormalForceRates` as one array (3, ...), if peaks are measured
-    )
+    # stopper force of legs in the air, if stoppers are one-sided
+    airborne_stopper_forces: LegArray | None
+    force_rates: Array | None  # `NormalForceRates`, if peaks are measured
+
+    def pack_rows(self) -> Array:
+        """Return all quantities as one array (rows, ...)."""
+        return jnp.concatenate(jax.tree.leaves(self))
+
+    @classmethod
+    def unpack_rows(
+        cls, contact_mode_dynamics: ContactModeDynamics, rows: Array
+    ) -> "ContactQuantities":
+        """Return the quantities in an array of `pack_rows`."""
+        n_legs = contact_mode_dynamics.s.n
+        row_counts = (
+            3 + n_legs,
+            N_LOSSES * contact_mode_dynamics.has_accumulators,
+            1,
+            *[2] * 4,
+            n_legs * contact_mode_dynamics.has_one_sided_stoppers,
+            len(NormalForceRates._fields) * contact_mode_dynamics.measures_force_peaks,
+        )
+        ends = itertools.accumulate(row_counts)
+        blocks: Any = (
+            rows[end - count : end] if count else None
+            for count, end in zip(row_counts, ends, strict=True)
+        )
+        return cls(*blocks)
 
 
-def collect_contact_quantities(
-    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion, contact_forces: ContactForces
+def compute_contact_quantities(
+    contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion
 ) -> ContactQuantities:
-    """Return contact forces and slip speeds from which `evaluate_guards` computes the guards."""
+    """Return the accelerations, and the quantities that losses and guards depend on."""
+    contact_forces = compute_forces(contact_mode_dynamics, motion)
     force_solution = contact_forces.force_solution
+    loss_rates = airborne_stopper_forces = force_rates = None
+    if contact_mode_dynamics.has_accumulators:
+        _, *rates = compute_accumulator_rates(contact_mode_dynamics, motion, contact_forces)
+        loss_rates = jnp.stack(prevent_fusion(rates, make_opaque_one(motion.theta)))
+    if contact_mode_dynamics.has_one_sided_stoppers:
+        airborne_stopper_forces = contact_forces.airborne_stopper_forces
+    if contact_mode_dynamics.measures_force_peaks:
+        force_rates = compute_force_rates(contact_mode_dynamics, motion)
     return ContactQuantities(
+        jnp.concatenate([jnp.stack(force_solution.hub_motion), force_solution.length_motion]),
+        loss_rates,
+        force_solution.painleve_determinant[None],
         force_solution.normal_forces,
         force_solution.tangential_forces,
         force_solution.stopper_forces,
         contact_forces.slot_foot_velocities.along_slope,
-        contact_forces.airborne_stopper_forces
-        if contact_mode_dynamics.has_one_sided_stoppers
-        else None,
-        compute_force_rates(contact_mode_dynamics, motion)
-        if contact_mode_dynamics.measures_force_peaks
-        else None,
+        airborne_stopper_forces,
+        force_rates,
     )
 
 
@@ -437,24 +475,13 @@ def evaluate_guards(
     contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     contact_quantities: ContactQuantities,
-    is_after_start: Array,
-) -> list[Array]:
-    """Return the values of the guards in the order of `GuardLayout`, as one array for each kind.
+) -> Array:
+    """Return the values of all guards in the order of `GuardLayout`, (guards, ...).
 
-    - `is_after_start`: whether the time is after the start of the contact state.
-
-    At the event that starts a contact state, a guard may be zero. It is the guard of a foot that
-    lifts off, of a leg that leaves its stopper, or of a foot that starts to slide. The value of
-    this guard at the start is replaced by 1.
+    A guard is positive inside the contact state and zero at its end. A guard that is not evaluated
+    has the value 1.
     """
     s, contact_state = contact_mode_dynamics.s, contact_mode_dynamics.contact_state
-    is_airborne = (contact_state.contact_modes == ContactMode.OFF) & (
-        is_after_start | ~contact_state.has_just_lifted
-    )
-    is_leg_free = ~contact_state.is_leg_locked & (is_after_start | ~contact_state.has_just_unlocked)
-    has_just_slid = contact_mode_dynamics.contact_slots.gather_flags_from_legs(
-        contact_state.has_just_slid
-    )
     friction = contact_mode_dynamics.friction
     friction_coefficients = replace_infinite_friction(friction)
     normal_forces = contact_quantities.normal_forces
@@ -469,18 +496,17 @@ def evaluate_guards(
     has_friction_cone = (contact_mode_dynamics.slot_modes == ContactMode.STICK) & jnp.isfinite(
         friction
     )
-    is_sliding = (slip_signs != 0.0) & (is_after_start | ~has_just_slid)
     replace_if_not_evaluated = lambda is_evaluated, guard_value: jnp.where(
         is_evaluated, guard_value, 1.0
     )
     guards = [
         replace_if_not_evaluated(
-            is_airborne,
+            contact_state.contact_modes == ContactMode.OFF,
             compute_foot_heights(
                 motion, compute_leg_directions(s, motion.theta), contact_mode_dynamics.ground_ahead
             ),
         ),
-        replace_if_not_evaluated(is_leg_free, s.L0 - motion.L),
+        replace_if_not_evaluated(~contact_state.is_leg_locked, s.L0 - motion.L),
         replace_if_not_evaluated(
             contact_mode_dynamics.slot_modes != ContactMode.OFF, supporting_force
         ),
@@ -490,7 +516,7 @@ def evaluate_guards(
         replace_if_not_evaluated(
             has_friction_cone, friction_coefficients * normal_forces + tangential_forces
         ),
-        replace_if_not_evaluated(is_sliding, slip_signs * contact_quantities.slip_speeds),
+        replace_if_not_evaluated(slip_signs != 0.0, slip_signs * contact_quantities.slip_speeds),
         replace_if_not_evaluated(
             contact_mode_dynamics.is_stopper_holding, contact_quantities.stopper_forces
         ),
@@ -515,7 +541,7 @@ def evaluate_guards(
                 contact_state.force_rate_signs * contact_quantities.force_rates,
             )
         )
-    return guards
+    return jnp.concatenate(guards)
 
 
 def compute_guard_scales(contact_mode_dynamics: ContactModeDynamics) -> Array:
@@ -607,21 +633,3 @@ def compute_packed_units(s: Symbols) -> PackedState:
     )
     motion_units = position_units[:3], rate_units[:3], position_units[3:], rate_units[3:]
     return lax.stop_gradient(jnp.concatenate([*motion_units, jnp.stack(accumulator_units)]))
-
-
-def compute_guard_values(
-    contact_mode_dynamics: ContactModeDynamics, packed_state: PackedState
-) -> Float[Array, " n_guards"]:
-    """Return the values of all guards for a packed state.
-
-    A guard is positive inside the contact state and zero at its end. A guard that is not evaluated
-    has the value 1.
-    """
-    motion, accumulators = unpack_state(packed_state)
-    contact_quantities = collect_contact_quantities(
-        contact_mode_dynamics, motion, compute_forces(contact_mode_dynamics, motion)
-    )
-    guard_groups = evaluate_guards(
-        contact_mode_dynamics, motion, contact_quantities, accumulators.time_since_event > 0.0
-    )
-    return jnp.concatenate(prevent_fusion(guard_groups, make_opaque_one(motion.theta)))

@@ -21,34 +21,37 @@ from vrw_jax import lanes
 from vrw_jax.base.elementwise import make_opaque_loop_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.integrate import sample_at_equal_times
-from vrw_jax.flow.tableaus import ButcherTableau, load_explicit_tableau
-from vrw_jax.models.contact_diffrax import sample_by_diffrax
-from vrw_jax.models.contact_integrator import (
-    ContactIntervalPoint,
-    attempt_solver_step,
-    init_contact_interval,
-    unpack_motion,
-)
+from vrw_jax.flow.phase_integration import sample_phase
+from vrw_jax.flow.tableaus import ButcherTableau, StageState, load_explicit_tableau
+from vrw_jax.models.contact_integrator import make_contact_phase
 from vrw_jax.models.contact_kernel import (
-    STATUS_UNFINISHED,
     BatchWalkResult,
     BatchWalkSettings,
+    advance_to_events,
     init_lane_states,
-    process_and_integrate,
     run_walks,
 )
-from vrw_jax.models.contact_mechanics import WheelMotion, find_contact_slots
+from vrw_jax.models.contact_mechanics import (
+    find_contact_slots,
+    pack_motion,
+    unpack_motion,
+)
 from vrw_jax.models.contact_record import GaitStepSummary
 from vrw_jax.models.contact_state import (
+    N_LOSSES,
     ContactModeDynamics,
+    ContactQuantities,
     ContactState,
     EnergyLossAccumulators,
+    compute_contact_quantities,
+    compute_packed_units,
+    evaluate_vector_field,
     pack_state,
     unpack_state,
 )
 from vrw_jax.models.contact_tangents import walk_with_tangents
 from vrw_jax.wheel.outcomes import ContactMode
-from vrw_jax.wheel.params import WheelParams, stack_parameters
+from vrw_jax.wheel.params import WheelParams, compute_wheel_units, stack_parameters
 
 
 def prepare_walk(
@@ -175,9 +178,10 @@ def make_column_function(
 
 
 class ContactIntervalLog(NamedTuple):
-    """Start state and duration of each interval of a step; an interval is between two events."""
+    """Start and duration of each interval of a step; an interval is between two events."""
 
-    start_states: Array  # start of each interval, see `contact_state.PackedState`, (intervals, dim)
+    q: Array  # coordinates at the start of each interval, (intervals, 3 + n)
+    v: Array  # rates and losses in the step so far, (intervals, 3 + n + N_LOSSES)
     contact_modes: Array  # contact mode of every foot, (intervals, legs)
     is_leg_locked: Array
     durations: Array  # s
@@ -185,8 +189,8 @@ class ContactIntervalLog(NamedTuple):
 
 def sample_contact_interval(
     contact_mode_dynamics: ContactModeDynamics,
-    motion: WheelMotion,
-    initial_accumulators: Array,
+    q: Array,
+    v: Array,
     duration: Array,
     n_samples: int,
     options: StepOptions,
@@ -195,43 +199,62 @@ def sample_contact_interval(
     """Return samples of one interval at equally spaced times, (samples, entries, batch).
 
     The first and the last sample are at the ends of the interval. The entries are coordinates,
-    rates, loss accumulators, normal forces and tangential forces in the contact slots. At the
-    start, the accumulators are `initial_accumulators`.
+    rates, losses, normal forces and tangential forces in the contact slots.
 
+    - `q`, `v`: coordinates, and rates followed by losses at the start;
     - `duration`: length of the interval, s.
     """
-    initial_interval = init_contact_interval(contact_mode_dynamics, motion, options.dt0)
+    phase = make_contact_phase(contact_mode_dynamics, tableau, options)
+    take_solver_step: Any = phase.take_solver_step
 
-    def take_sample_step(
-        sample_state: tuple[ContactIntervalPoint, Array], step_size: Array
-    ) -> tuple[tuple[ContactIntervalPoint, Array], Array]:
-        start_point, accumulators = sample_state
-        attempted_step = attempt_solver_step(
-            contact_mode_dynamics,
-            tableau,
-            options,
-            initial_interval._replace(contact_interval_point=start_point, h=step_size),
+    def take_sample_step(state: StageState, h: Array) -> tuple[StageState, Array]:
+        stage_states, squared_error = take_solver_step(state, h)
+        return stage_states[-1], squared_error
+
+    def pack_sample(state: StageState) -> Array:
+        contact_quantities = ContactQuantities.unpack_rows(
+            contact_mode_dynamics, state.acceleration.acceleration
         )
-        assert attempted_step.accumulator_increments is not None
-        return (
-            attempted_step.end_point,
-            accumulators + attempted_step.accumulator_increments,
-        ), attempted_step.mean_squared_error
-
-    def pack_sample(sample_state: tuple[ContactIntervalPoint, Array]) -> Array:
-        (q, v, dynamics_rows), accumulators = sample_state
-        slot_forces = dynamics_rows[len(q) + 1 : len(q) + 5]
-        return jnp.concatenate([q, v, accumulators, slot_forces])
+        slot_forces = contact_quantities.normal_forces, contact_quantities.tangential_forces
+        return jnp.concatenate([state.q, state.v, *slot_forces])
 
     return sample_at_equal_times(
         take_sample_step,
         pack_sample,
-        (initial_interval.contact_interval_point, initial_accumulators),
+        phase.make_state(q, v),
         tableau,
         duration,
         n_samples,
         options,
     )
+
+
+def sample_by_diffrax(
+    contact_mode_dynamics: ContactModeDynamics,
+    q: Array,
+    v: Array,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+) -> Array:
+    """Return the samples of `sample_contact_interval` for a single wheel, (samples, entries)."""
+    losses = EnergyLossAccumulators(jnp.zeros_like(duration), *v[len(q) :])
+
+    def pack_sample(packed_state: Array) -> Array:
+        motion, (_, *losses) = unpack_state(packed_state)
+        contact_quantities = compute_contact_quantities(contact_mode_dynamics, motion)
+        slot_forces = contact_quantities.normal_forces, contact_quantities.tangential_forces
+        return jnp.concatenate([*pack_motion(motion), jnp.stack(losses), *slot_forces])
+
+    packed_states = sample_phase(
+        functools.partial(evaluate_vector_field, contact_mode_dynamics),
+        pack_state(unpack_motion(q, v), losses),
+        duration,
+        n_samples,
+        compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options),
+        compute_packed_units(contact_mode_dynamics.s),
+    )
+    return jax.vmap(pack_sample)(packed_states)
 
 
 @functools.cache
@@ -254,50 +277,30 @@ def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[.
 
     def advance_to_event(arguments: tuple, lane_state: Any) -> tuple[Any, ContactIntervalLog]:
         walk_settings, input_columns, x = prepare_resolved(arguments)
-        state_after_event, lane_state = process_and_integrate(
-            walk_settings,
-            walk_settings.replace_invalid_lanes(input_columns, x)[0],
-            lane_state,
-            waits_for_events=True,
+        start, lane_state = advance_to_events(
+            walk_settings, walk_settings.replace_invalid_lanes(input_columns, x)[0], lane_state
         )
-        assert state_after_event.step_energy_loss_accumulators is not None
-        start_interval = state_after_event.contact_interval_state
-        duration = lane_state.contact_interval_state.time_since_event
-        start_state = pack_state(
-            unpack_motion(start_interval.contact_interval_point),
-            EnergyLossAccumulators(
-                jnp.zeros_like(duration), *state_after_event.step_energy_loss_accumulators
-            ),
-        )
+        n = len(start.q)
+        assert start.step_losses is not None
         return lane_state, ContactIntervalLog(
-            start_state,
-            start_interval.contact_state.contact_modes,
-            start_interval.contact_state.is_leg_locked,
-            duration,
+            start.q,
+            jnp.concatenate([start.v[:n], start.step_losses]),
+            start.contact_state.contact_modes,
+            start.contact_state.is_leg_locked,
+            lane_state.interval_duration,
         )
 
-    def sample_logged_interval(arguments: tuple, contact_interval_log: ContactIntervalLog) -> Any:
+    def sample_logged_interval(arguments: tuple, interval_log: ContactIntervalLog) -> Array:
         walk_settings, input_columns, x = prepare_resolved(arguments)
-        start_states, contact_modes, is_leg_locked, durations = contact_interval_log
-        contact_mode_dynamics = walk_settings.make_lane_contact_dynamics(
+        q, v, contact_modes, is_leg_locked, durations = interval_log
+        dynamics = walk_settings.make_lane_contact_dynamics(
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
             ContactState.without_recent_changes(contact_modes, is_leg_locked),
         )
-        options, tableau = walk_settings.step_options, walk_settings.tableau
-        if tableau is None:
-            return sample_by_diffrax(
-                contact_mode_dynamics, start_states, durations, n_samples, options
-            )
-        motion, (_, *loss_accumulators) = unpack_state(start_states)
-        return sample_contact_interval(
-            contact_mode_dynamics,
-            motion,
-            jnp.stack(loss_accumulators),
-            durations,
-            n_samples,
-            options,
-            tableau,
-        )
+        arguments = dynamics, q, v, durations, n_samples, walk_settings.step_options
+        if walk_settings.tableau is None:
+            return sample_by_diffrax(*arguments)
+        return sample_contact_interval(*arguments, walk_settings.tableau)
 
     def sample_whole_step(*arguments: Any) -> tuple:
         walk_settings, input_columns, _ = prepare_resolved(arguments)
@@ -319,7 +322,7 @@ def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[.
             return lane_state, jax.tree.map(write_log_entry, contact_interval_log, interval_entry)
 
         should_continue = lambda state: make_opaque_loop_condition(
-            state[0].walk_outcome == STATUS_UNFINISHED, state[0].step_counters.n_events
+            state[0].is_unfinished, state[0].step_counters.n_events
         )
         lane_state, contact_interval_log = lax.while_loop(
             should_continue,
@@ -327,23 +330,21 @@ def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[.
             (initial_state, jax.tree.map(allocate_log_array, log_template)),
         )
         step_summary = walk_settings.summarize_step(lane_state, input_columns)
-        if uses_diffrax:
-            interval_samples = lax.map(
-                functools.partial(sample_logged_interval, arguments), contact_interval_log
-            )
-        else:
-            sample_rows = jax.vmap(functools.partial(sample_compiled_intervals, arguments))(
-                contact_interval_log
-            )
-            interval_samples = _unpack_sample_rows(
-                walk_settings.n_legs, contact_interval_log, sample_rows
-            )
+        map_intervals = lax.map if uses_diffrax else lambda f, log: jax.vmap(f)(log)
+        sample_rows = map_intervals(
+            functools.partial(sample_compiled_intervals, arguments), contact_interval_log
+        )
+        interval_samples = _unpack_sample_rows(
+            walk_settings.n_legs, contact_interval_log, sample_rows
+        )
         return contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
 
     compile_lanes = call_with_one_lane if uses_diffrax else lanes.jit_batch
     begin_compiled_walk = compile_lanes(init_lane_state)
     advance_compiled_walk = compile_lanes(advance_to_event)
-    sample_compiled_intervals = lanes.jit_batch(sample_logged_interval)
+    sample_compiled_intervals = (
+        sample_logged_interval if uses_diffrax else lanes.jit_batch(sample_logged_interval)
+    )
     return jax.jit(sample_whole_step)
 
 
@@ -357,8 +358,8 @@ def _unpack_sample_rows(
     """
     n_samples, n_coordinates = sample_rows.shape[1], 3 + n_legs
     time_since_event = jnp.linspace(0.0, 1.0, n_samples) * contact_interval_log.durations[:, None]
-    q, v, accumulators, slot_forces = jnp.split(
-        sample_rows, (n_coordinates, 2 * n_coordinates, 2 * n_coordinates + 3), -1
+    q, v, losses, slot_forces = jnp.split(
+        sample_rows, (n_coordinates, 2 * n_coordinates, 2 * n_coordinates + N_LOSSES), -1
     )
     contact_interval_quantities = [
         q[..., :3],
@@ -366,7 +367,7 @@ def _unpack_sample_rows(
         q[..., 3:],
         v[..., 3:],
         time_since_event[..., None],
-        accumulators,
+        losses,
     ]
     contact_slots = jax.vmap(
         lambda contact_modes: find_contact_slots(contact_modes != ContactMode.OFF)

@@ -16,8 +16,8 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.tableaus import load_explicit_tableau
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
 from vrw_jax.models.contact_impacts import project_motion
-from vrw_jax.models.contact_integrator import pack_coordinates
 from vrw_jax.models.contact_kernel import BatchWalkSettings, run_walks
+from vrw_jax.models.contact_mechanics import pack_motion
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.contact_section import (
     LOCKED_CODE_OFFSET,
@@ -104,7 +104,7 @@ def step_batch_with_jacobian(
         compute_wheel_units_of_rows(input_columns.T, n_legs), n_legs
     )
     rate_units = np.stack(section_units, -1)[:, rate_indices - len(input_columns)]
-    projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n_legs)]]  # as in `pack_coordinates`
+    projected_units = rate_units[:, [1, 2, 0, *range(3, 3 + n_legs)]]  # as in `pack_motion`
     rate_projection = _project_start_rates(input_columns, section_states, n_legs) * (
         rate_units[:, None] / projected_units[:, :, None]
     )
@@ -271,7 +271,7 @@ def _project_start_rates(
 
 def _compute_projected_rates(s: Symbols, section_state: Array) -> Array:
     motion, contact_state = unpack_section_state(s, section_state)
-    return pack_coordinates(project_motion(s, motion, *contact_state[:2]))[1]
+    return pack_motion(project_motion(s, motion, *contact_state[:2]))[1]
 
 
 @functools.cache

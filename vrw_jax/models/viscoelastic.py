@@ -432,7 +432,7 @@ def make_batch_phase(
     )
     return BatchPhase(
         evaluate_acceleration,
-        lambda stage: phase.compute_guards(make_phase_instant(stage)),
+        lambda stage: jnp.stack(phase.compute_guards(make_phase_instant(stage))),
         lambda stage: phase.compute_margins(make_phase_instant(stage)),
         phase.are_margins_counted_at_start if records_margins else (),
         implicit_dynamics,
