@@ -242,6 +242,14 @@ MODEL_NAMES = (
 """Names of the models, in the order of `ModelIndex`."""
 
 
+def multiply_rows(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the product of a matrix and a vector in each row of a batch.
+
+    Its bits do not depend on the batch, which `numpy.einsum` does not promise.
+    """
+    return np.matmul(matrices, vectors[..., None])[..., 0]
+
+
 class LowerFidelityGaits(NamedTuple):
     """Gait of each wheel, computed with a model whose section state is (theta-, dtheta-, dL1-).
 
@@ -280,7 +288,7 @@ class LowerFidelityGaits(NamedTuple):
         """
         with np.errstate(all="ignore"):
             inverse = np.linalg.inv(np.eye(3) - jacobian[:, -3:])
-        error = np.einsum("ijk,ik->ij", inverse, quantities[:, -3:] - section_states)
+        error = multiply_rows(inverse, quantities[:, -3:] - section_states)
         models = np.full(len(section_states), model)
         return cls(models, section_states, quantities, inverse, jacobian, error)
 

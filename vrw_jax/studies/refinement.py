@@ -31,6 +31,7 @@ from vrw_jax.studies.fidelity import (
     StepQuantities,
     compute_measure_derivatives,
     evaluate_measures,
+    multiply_rows,
 )
 
 
@@ -246,9 +247,9 @@ def estimate_measures(
     )
     defect = state_change[:, section_coordinates] * has_same_leg_codes[:, None]
     with np.errstate(all="ignore"):
-        correction = np.einsum("ijk,ik->ij", inverse_newton_matrix, defect)
-        quantities = contact_step.step_quantities + np.einsum(
-            "ijk,ik->ij", step_quantity_jacobian, correction
+        correction = multiply_rows(inverse_newton_matrix, defect)
+        quantities = contact_step.step_quantities + multiply_rows(
+            step_quantity_jacobian, correction
         )
         measure_jacobian = compute_measure_derivatives(measure_names, quantities)
         state_sensitivity = np.abs(measure_jacobian @ step_quantity_jacobian)
@@ -265,7 +266,7 @@ def estimate_measures(
             has_same_leg_codes,
             correction,
             evaluate_measures(measure_names, quantities),
-            np.einsum("ijk,ik->ij", state_sensitivity, np.abs(correction)),
+            multiply_rows(state_sensitivity, np.abs(correction)),
             measure_jacobian,
             step_error_bound * quantity_sensitivity,
             missed_duration[:, None] * duration_sensitivity,

@@ -60,6 +60,7 @@ from vrw_jax.studies.fidelity import (
     evaluate_measures,
     find_paper_gaits,
     find_rigid_gaits,
+    multiply_rows,
 )
 from vrw_jax.studies.refinement import (
     RefinedGaits,
@@ -504,7 +505,7 @@ class _MeasureRequest:
             model_error = values - estimates.measure_values
             sensitivity = np.abs(estimates.measure_jacobian @ gaits.step_quantity_jacobian)
             numerical_error = (
-                np.einsum("ijk,ik->ij", sensitivity, np.abs(gaits.section_state_error))
+                multiply_rows(sensitivity, np.abs(gaits.section_state_error))
                 + estimates.numerical_error_bound
                 + estimates.missed_contact_error_bound
             )
