@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from support.walkers import BALL_PARAMS, BALL_SYSTEM, GRAVITY, SIMPLEST_WALKER, JuggledBall
+from support.walkers import (
+    BALL_PARAMS,
+    BALL_SYSTEM,
+    GRAVITY,
+    SIMPLEST_WALKER,
+    JuggledBall,
+    SlowReturn,
+)
 
 import vrw_jax as vrw
 
@@ -296,6 +303,14 @@ def test_measures_of_gaits_of_any_walker_are_fitted(walker):
     kicks, loss = np.array([1.0, 1.5]), 1.0 - result["ball.restitution"]
     slopes = [2.0 * kicks / loss**2 / GRAVITY, kicks**2 / loss**3 / GRAVITY]
     np.testing.assert_allclose(result.jacobian[..., 0].T, slopes, rtol=1e-8)  # error of a gait
+
+
+def test_gaits_far_from_the_starts_of_a_walker_are_fitted():
+    """Newton's method does not reach them, so that the search begins at gaits found by walks."""
+    data = {"offset": [3.0, 3.2], "offset_error": [0.1, 0.1]}
+    result = vrw.fit(data, {"c": 1.0}, ["c"], model=SlowReturn(), n_starts=1)
+    # The search ends where chi2 hardly decreases: 7e-5 is 1e-3 of the standard error.
+    assert result["c"] == pytest.approx(3.1, abs=7e-5)
 
 
 def test_uneven_ground_of_any_walker_and_an_unknown_start():

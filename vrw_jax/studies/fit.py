@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -28,7 +29,7 @@ from vrw_jax.base.parameters import list_parameters
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.finder_selection import resolve_finder
-from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
+from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_model
 from vrw_jax.studies import fit_data, fit_problem
 from vrw_jax.studies.fit_laws import make_leg_laws
 from vrw_jax.studies.fit_problem import FitProblem, FitTarget, solve_fits
@@ -153,7 +154,9 @@ def fit(
     labels = table.labels.get("walk", np.zeros(table.values.shape[1]))
     walks, row_walks = np.unique(labels, return_inverse=True)
     starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
-    first_states: Any = _find_first_states(table.kind, params, finder, start, len(walks))
+    first_states: Any = _find_first_states(
+        table.kind, params, finder, start, len(walks), table.conditions
+    )
     has_unknown_starts = start is None and table.kind != "gaits"
     if has_unknown_starts and model.is_wheel and first_states.shape[1] > 3:
         # Of a full section state, Leg 1 stands on the ground, and the others on their stoppers.
@@ -266,19 +269,33 @@ def fit(
         "s" if name == "time" else domains[name].unit if name in domains else units.get(name, "1")
         for name in quantities
     )
-    arguments = table, unknown_units, params, problem.unpack(problem.base_values)[0]
-    if not table.is_batch:
-        return make_result(problem, targets, starts, *arguments, is_batch=False)
+    walker = problem.unpack(problem.base_values)[0]
+    arguments = table, unknown_units, params, walker
     mean_targets = targets._replace(values=targets.values.mean(0, keepdims=True))
-    mean_fit = make_result(problem, mean_targets, starts, *arguments, is_batch=False)
+    fit_mean = lambda problem, starts: make_result(
+        problem, mean_targets, starts, *arguments, is_batch=False
+    )
+    mean_fit = fit_mean(problem, starts)
+    if is_own_walker(walker) and table.kind == "gaits" and start is None:
+        mean_fit = _improve_with_new_guesses(mean_fit, fit_mean)
+    if not table.is_batch:
+        return mean_fit
     starts = np.tile(mean_fit.values, (len(table.values), 1))
-    return make_result(problem, targets, starts, *arguments, is_batch=True)
+    return make_result(mean_fit.problem, targets, starts, *arguments, is_batch=True)
 
 
 def _find_first_states(
-    kind: str, params: Any, finder: Any, start: Any, n_walks: int
+    kind: str,
+    params: Any,
+    finder: Any,
+    start: Any,
+    n_walks: int,
+    conditions: Mapping[str, np.ndarray],
 ) -> np.ndarray | None:
-    """Return the section state at the start of each walk, or a guess of it or of the gait."""
+    """Return the section state at the start of each walk, or a guess of it or of each gait.
+
+    - `conditions`: known parameters of each row of gaits.
+    """
     if start is not None and not isinstance(start, str):
         states = np.atleast_2d(check_numpy_reals("start", start))
         if states.shape[0] not in (1, n_walks):
@@ -293,12 +310,61 @@ def _find_first_states(
         default_start = finder.model.compute_default_start(params)
         states = np.asarray(cycle.section_state if bool(cycle.found) else default_start)[None]
     else:
+        walker, model = finder.model.walker, finder.model
         if kind == "gaits":
-            return None
-        gait: Any = finder.find_cycle(params)
-        states = np.atleast_2d(finder.model.walker.starts(params))[:1]
-        states = np.asarray(gait.section_state)[None] if bool(gait.found) else np.asarray(states)
+            get_value = lambda name: conditions.get(name, model.get_parameter(params, name))
+            gaits = _find_row_gaits(finder, list(map(get_value, model.parameter_names)))
+            missing = np.flatnonzero(~np.asarray(gaits.found))
+            if len(missing):
+                raise ValueError(
+                    f"the search begins at the given parameters, but gait {missing[0]} of the data "
+                    "was not found there: give parameters that have the gaits, or start=, section "
+                    "coordinates near them."
+                )
+            return np.asarray(gaits.section_state)
+        gait: Any = limit_cycle(params, model=walker, options=finder.step_options)
+        states = np.asarray(gait.section_state)[None]
+        if not bool(gait.found):
+            states = np.atleast_2d(walker.starts(params))[:1]
     return np.broadcast_to(states, (n_walks, states.shape[1])).astype(float)
+
+
+def _find_row_gaits(finder: Any, row_values: Sequence[Any]) -> Any:
+    """Return the gait of a walker for each row of data, from the values of its parameters."""
+    _, params = finder.model.from_parameter_values(
+        np.broadcast_arrays(*map(np.atleast_1d, row_values)), 0
+    )
+    return limit_cycles(params, model=finder.model.walker, options=finder.step_options)
+
+
+# Largest number of times that the guesses of gaits are replaced by the gaits of the last fit.
+MAX_GUESS_UPDATES = 20
+# Smallest relative decrease of chi2 after which the guesses are replaced again.
+MIN_CHI2_DECREASE = 1e-6
+
+
+def _improve_with_new_guesses(
+    fit: FitResult, repeat: Callable[[FitProblem, Any], FitResult]
+) -> FitResult:
+    """Return a fit to gaits of a walker whose guesses are the gaits of the fit itself.
+
+    A gait that is far from its guess may not be found, which would hold the search back.
+
+    - `repeat`: function of a problem and starts that returns their fit.
+    """
+    for _ in range(MAX_GUESS_UPDATES):
+        problem = fit.problem
+        values, others = problem.place_unknowns(jnp.asarray(fit.values))
+        gaits = _find_row_gaits(
+            problem.finder, problem.set_conditions(values, problem.conditions, others)
+        )
+        if not np.all(gaits.found):
+            break
+        problem = eqx.tree_at(lambda p: p.starts, problem, jnp.asarray(gaits.section_state))
+        previous, fit = fit, repeat(problem, fit.values[None])
+        if not fit.chi2 < previous.chi2 * (1.0 - MIN_CHI2_DECREASE):
+            break
+    return fit
 
 
 def _count_steps(

@@ -190,11 +190,14 @@ class FitProblem(eqx.Module):
         select = lambda columns: self._select_columns(columns, extra)
         if self.kind == "gaits":
 
-            def predict_row(conditions: dict[str, Array]) -> tuple[Array, Array]:
-                gait = self._find_gait(self._set_conditions(values, conditions, others), 0)
+            def predict_row(conditions: dict[str, Array], row: Array) -> tuple[Array, Array]:
+                gait = self._find_gait(self.set_conditions(values, conditions, others), row)
                 return select(gait), gait.cycle.found
 
-            numbers, is_found = jax.vmap(predict_row, axis_size=len(self.whitener))(self.conditions)
+            rows = jnp.arange(len(self.whitener))
+            if self.starts is not None:
+                rows = jnp.minimum(rows, len(self.starts) - 1)  # one guess for all, or one for each
+            numbers, is_found = jax.vmap(predict_row)(self.conditions, rows)
             return Prediction(numbers, jnp.all(is_found))
         starts, n_entries = self.starts, self.n_start_entries
         if n_entries:
@@ -216,7 +219,7 @@ class FitProblem(eqx.Module):
                 require_known_name(name, tuple(columns), f"measure of {self.kind}")
         return jnp.stack([columns[name] for name in self.names], -1)
 
-    def _set_conditions(
+    def set_conditions(
         self, values: ParameterValues, conditions: Mapping[str, Array], others: Mapping[str, Array]
     ) -> ParameterValues:
         return [
@@ -253,7 +256,7 @@ class FitProblem(eqx.Module):
         walk: Array,
     ) -> tuple[dict[str, Array], Array]:
         """Return what is known of one walk at each step, or at the times of all rows."""
-        values = self._set_conditions(values, conditions, others)
+        values = self.set_conditions(values, conditions, others)
         walker, params, ground = self._put_on_ground(values, conditions)
         is_valid, is_series = jnp.array(True), self.kind == "series"
         if self.starts_from_gait:
