@@ -227,7 +227,7 @@ def test_the_curve_on_which_an_oscillator_touches_its_stop_is_that_of_the_linear
         follow(parameters=("A", "w"), bounds={"A": (0.1, 1.0)})
     with pytest.raises(ValueError, match="two different ones"):
         follow(parameters=("A", "A"), bounds={"A": (0.1, 1.0)})
-    with pytest.raises(ValueError, match=r"no special point 'distance to the stop'.*none"):
+    with pytest.raises(ValueError, match=r"no special point 'distance to the stop'.*found: none"):
         follow(parameters=("A", "w"), bounds={"A": (0.25, 0.35), "w": (0.69, 0.71)})
 
 

@@ -8,12 +8,21 @@ import dataclasses
 import re
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from support.walkers import BALL_PARAMS, BALL_SYSTEM, GRAVITY, SIMPLEST_WALKER, Henon, JuggledBall
+from support.walkers import (
+    BALL_PARAMS,
+    BALL_SYSTEM,
+    GRAVITY,
+    SIMPLEST_WALKER,
+    Henon,
+    JuggledBall,
+    SlowReturn,
+)
 
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode
@@ -58,18 +67,6 @@ def test_the_first_start_that_leads_to_a_gait_is_taken():
     starts = lambda p: jnp.array([[-3.0], [1.0]])  # the ball that moves down never flies
     walker = dataclasses.replace(BALL_SYSTEM, starts=starts)
     assert vrw.limit_cycle(BALL_PARAMS, model=walker).converged
-
-
-class SlowReturn(vrw.AbstractWalker):
-    """Walker that returns to c at a bounded rate, so that Newton's method diverges from afar."""
-
-    coordinates = {"offset": "m"}  # noqa: RUF012
-
-    def advance(self, params, x, options):
-        return vrw.AdvanceResult(x - 0.9 * jnp.arctan(x - params["c"]), jnp.ones(1))
-
-    def starts(self, params):
-        return jnp.array([20.0])
 
 
 def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
@@ -142,6 +139,21 @@ def test_panels_show_the_coordinates_of_a_walk_with_gaps_at_its_events():
     assert velocity[4] == pytest.approx(-2.0, rel=1e-9)
     bounces = [line.get_xdata()[0] for line in panels[0].lines[:-1]]
     np.testing.assert_allclose(bounces, 4.0 / GRAVITY * np.array([1.0, 2.0]), rtol=1e-9)
+
+
+class Mass(eqx.Module):
+    kick: float = vrw.parameter(1.0, unit="m/s", domain=(0.0, np.inf))
+    ball: dict = eqx.field(default_factory=lambda: BALL_PARAMS["ball"])
+
+    def __getitem__(self, name):
+        return getattr(self, name)
+
+
+def test_parameters_outside_their_domain_have_a_code():
+    assert vrw.limit_cycle(Mass(), model=BALL_SYSTEM).converged
+    gait = vrw.limit_cycle(Mass(kick=-1.0), model=BALL_SYSTEM)
+    assert gait.outcome == vrw.Outcome.BAD_INPUT
+    assert "outside its domain" in gait.why
 
 
 def test_figures_show_the_results_of_any_walker():
@@ -335,6 +347,15 @@ def test_each_function_of_the_table_takes_a_walker():
             "have no derivatives",
         ),
         (lambda: vrw.limit_cycle({"kick": 1.0}, model=BALL_SYSTEM), "of the walker reads 'ball'"),
+        (
+            lambda: vrw.fit(
+                {"period": [1.0], "period_error": [0.1]},
+                BALL_PARAMS | {"kick": -1.0},
+                ["kick"],
+                model=JuggledBall(),
+            ),
+            "gait 0 of the data was not found",
+        ),
         (lambda: vrw.walk({"kick": 1.0}, [2.0], 2, model=JuggledBall()), "contains kick: add it"),
         (lambda: vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM).measure("x"), "height"),
     ],

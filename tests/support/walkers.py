@@ -118,3 +118,15 @@ class Henon(vrw.AbstractWalker):
         x, y = x
         end = jnp.stack([1.0 - params["a"] * x**2 + y, params["b"] * x])
         return vrw.AdvanceResult(end, jnp.ones(1))
+
+
+class SlowReturn(vrw.AbstractWalker):
+    """Walker that returns to c at a bounded rate, so that Newton's method diverges from afar."""
+
+    coordinates = {"offset": "m"}  # noqa: RUF012
+
+    def advance(self, params, x, options):
+        return vrw.AdvanceResult(x - 0.9 * jnp.arctan(x - params["c"]), jnp.ones(1))
+
+    def starts(self, params):
+        return jnp.array([20.0])

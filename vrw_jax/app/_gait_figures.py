@@ -596,8 +596,10 @@ def tornado_figure(
                 label=f"parameter {direction} {parameter_change_text}",
             )
         axes.axvline(0.0, color="black", linewidth=0.6)
-        parameter_symbols = [f"${MEASURES[str(name)].mathtext}$" for name in bars.parameter.values]
-        axes.set_yticks(range(bars.size), parameter_symbols)
+        labels = list(map(str, bars.parameter.values))
+        if table.attrs.get("rung") != "own_walker":  # The library's symbols are those of wheels.
+            labels = [f"${MEASURES[name].mathtext}$" for name in labels]
+        axes.set_yticks(range(bars.size), labels)
         axes.set_ylim(bars.size - 0.5, -0.5)
         change_label = format_axis_label(measure_name, "change of {symbol}")
         axes.set_xlabel("change [%]" if spreads is None else change_label)

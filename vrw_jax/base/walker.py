@@ -115,7 +115,7 @@ class AbstractWalker(abc.ABC):
         if "height" not in self.ground:
             raise ValueError(
                 "heights are given, but the walker does not declare what they change: give it "
-                'ground={"height": "rise"}, with the name of its parameter.'
+                'ground={"height": name}, with the name of its parameter.'
             )
         heights = check_reals("heights", heights, "give one height for each foothold, in m")
         if heights.ndim == 0 or heights.shape[-1] != n_steps + 1:

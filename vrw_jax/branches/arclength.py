@@ -134,7 +134,7 @@ class ContinuationStatus(StatusCode):
     RANGE_END_REACHED = 1, "The parameter's range ended."
     POINT_NOT_ADMISSIBLE = 2, "The next points do not satisfy the conditions of the branch."
     STEP_SIZE_UNDERFLOW = 3, "Newton's method found no next point, however short the step."
-    MAX_POINTS_REACHED = 4, "The branch has the largest allowed number of points: raise max_points."
+    MAX_POINTS_REACHED = 4, "The branch is at its limit: raise max_points of ArclengthOptions."
     START_NOT_FOUND = 5, "No starting point was found."
     CURVE_CLOSED = 6, "The curve returned to its start."
     BRANCH_SWITCHED = 7, "It begins on another branch."

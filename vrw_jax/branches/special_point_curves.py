@@ -212,8 +212,8 @@ def continue_special_points(
     if missing_special_point_names:
         raise ValueError(
             f"no special point {missing_special_point_names[0]!r} on branches along "
-            f"{first_parameter_name} and {second_parameter_name} within their bounds, but "
-            f"{', '.join(sorted(seeds_by_name)) or 'none'}: give a gait nearer to it, or wider "
+            f"{first_parameter_name} and {second_parameter_name} within their bounds (found: "
+            f"{', '.join(sorted(seeds_by_name)) or 'none'}): give a gait nearer to it, or wider "
             "bounds."
         )
     curves_by_name = {

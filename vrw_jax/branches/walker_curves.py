@@ -276,6 +276,6 @@ def _find_start(
         found_names += [point.name for point in branch.special_points]
     raise ValueError(
         f"no special point {name!r} on branches along {names[0]} and {names[1]} within their "
-        f"bounds, but {', '.join(sorted(set(found_names))) or 'none'}: give a gait nearer to it, "
-        "or wider bounds."
+        f"bounds (found: {', '.join(sorted(set(found_names))) or 'none'}): give a gait nearer to "
+        "it, or wider bounds."
     )

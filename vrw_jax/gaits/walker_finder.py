@@ -136,7 +136,8 @@ class HybridGait(NamedTuple):
         describe = lambda code, newton: (
             newton
             if code in (Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
-            else f"A step of the search failed: {Outcome(int(code)).name}."
+            else f"A step of the search failed: {Outcome(int(code)).name}. "
+            f"{Outcome(int(code)).meaning}"
         )
         return format_each_batch_element(describe, self.outcome, self.fixed_point.ending)
 
@@ -324,7 +325,10 @@ def _search_from_guess(
     )
     x, period, values = fixed_point.x, jnp.zeros((), fixed_point.x.dtype), []
     numbers = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((params, guess))])
-    outcome = jnp.where(jnp.all(jnp.isfinite(numbers)), Outcome.STEPPED, Outcome.BAD_INPUT)
+    is_valid = jnp.all(jnp.isfinite(numbers))
+    for parameter in list_tree_parameters(params):
+        is_valid &= jnp.all(parameter.domain.contains_parameter_value(parameter.value))
+    outcome = jnp.where(is_valid, Outcome.STEPPED, Outcome.BAD_INPUT)
     for _ in range(period_n):
         step = compile_step(walker)(params, x, options)
         values.append(walker.measure_step(params, x, step, options))
@@ -438,7 +442,7 @@ class WalkerFinder(AbstractGaitFinder):
         if ground_parameter is None:
             raise ValueError(
                 "the walker does not declare where the ground enters: give it "
-                'ground={"slope": "slope"} or {"height": "rise"}, with the name of its parameter.'
+                'ground={"slope": name} or {"height": name}, with the name of its parameter.'
             )
 
         if walker.invariants:

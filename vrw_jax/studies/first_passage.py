@@ -496,7 +496,7 @@ def _check_walker_on_random_ground(
     if property_name not in walker.ground:
         raise ValueError(
             f"{sd_name} is given, but the walker does not declare what it changes: give it "
-            f'ground={{"{property_name}": "{property_name}"}}, with the name of its parameter.'
+            f'ground={{"{property_name}": name}}, with the name of its parameter.'
         )
 
 

@@ -102,8 +102,9 @@ class GaitSensitivity(AbstractPrintable):
         for measure_index, measure_definition in enumerate(self.described_measures):
             unit = measure_definition.display_unit
             sensitivity_unit = f"{unit} per {self.disturbance_unit}".strip()
+            place = "foothold" if self.disturbance_unit == "m" else "line"
             norm_parts_text = (
-                "step that ends on the disturbed line: "
+                f"step that ends on the disturbed {place}: "
                 f"{float(self.ending_step[measure_index]):.6g}, "
                 f"step that begins on it: {float(self.beginning_step[measure_index]):.6g}, "
                 f"later steps: {float(self.later_steps[measure_index]):.6g}"
