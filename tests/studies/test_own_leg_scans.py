@@ -144,3 +144,17 @@ def test_samples_of_a_law_with_kinks_are_the_gaits_of_walks():
     assert float(rate) == pytest.approx(float(period[2] - period[0]) / 2.0, rel=1e-5)
     assert scan.friction_rear.sel(damping=150.0).notnull().all()
     assert scan.period.sel(damping=900.0).isnull().all()
+
+
+@pytest.mark.slow
+def test_measures_of_legs_in_turn_with_kinks_are_those_of_both_steps():
+    """In sensitivities as in scans, with derivatives equal to central differences of the scan."""
+    model = make_wheel(vrw.AlternatingLegs(BumpStop(100.0), BumpStop(80.0)))
+    names = ["energy_lost_damping", "fore_foot_force"]
+    scan = vrw.scan(vrw.samples(damping=[149.5, 150.0, 150.5]), names, model=model)
+    table = vrw.sensitivities(PARAMS, measures=names, model=model).sel(parameter="damping")
+    for name in names:
+        before, value, after = scan[name].values
+        row = table.sel(measure=name)
+        assert row.value == pytest.approx(value, rel=1e-9)
+        assert row.derivative == pytest.approx(after - before, rel=1e-4)
