@@ -237,7 +237,7 @@ def _check_definition(
     walker.check_definition(params, jax.ShapeDtypeStruct(x_shape, x_dtype), name)
 
 
-def find_batch_axes(params: Any, x: Any) -> tuple:
+def find_batch_axes(params: Any, x: Array) -> tuple:
     """Return the axes of parameters, section coordinates and options in a batch."""
     axes = jax.tree.map(lambda leaf: 0 if jnp.ndim(leaf) else None, params)
     return axes, 0 if x.ndim == 2 else None, None

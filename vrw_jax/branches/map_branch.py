@@ -74,7 +74,7 @@ from vrw_jax.gaits.fixed_points import (
     has_unit_multiplier,
 )
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
-from vrw_jax.lanes.batching import map_in_numpy_batches
+from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 from vrw_jax.models.measures import make_labeled_variables
 
 
@@ -371,7 +371,7 @@ def trace_map_branch(
     continuation = make_continuation(
         MapProblem(iterate_map(function, n_iterates), tuple(state_units.tolist())),
         options,
-        jax.tree.map(lambda leaf: np.asarray(leaf)[None], constants),
+        select_tree_rows(constants, None),
         np.array([lower_bound, upper_bound]),
         state_units,
         tangent,

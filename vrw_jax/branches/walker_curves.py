@@ -43,6 +43,7 @@ from vrw_jax.branches.map_branch import (
 from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
 from vrw_jax.gaits.fixed_points import estimate_state_units
 from vrw_jax.gaits.walker_finder import HybridGait
+from vrw_jax.lanes.batching import select_tree_rows
 
 RANGE_EDGE = "edge of the box"
 """Name of the distance of the second parameter from its nearer bound, as a fraction of its range.
@@ -176,7 +177,7 @@ def continue_walker_special_point(
     x = np.asarray(start.point.section_state)
     units = estimate_state_units(map_by_first, jnp.asarray(values), x, values[0], limits[0])
     problem = MapProblem(map_section_state, tuple(units.tolist()))
-    params_batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], params)
+    params_batch = select_tree_rows(params, None)
     first_bounds = np.array(limits[0])
     gaits = HybridContinuation(
         problem, options, params_batch, first_bounds, units, walker=walker, name=names[0],

@@ -180,15 +180,8 @@ def find_walker_gaits(
         gait = find_gaits(params, guesses)
         if has_traced_leaf(params, guesses, gait):
             return gait
-        add_batch_axis = lambda tree: jax.tree.map(lambda x: np.asarray(x)[None], tree)
-        rows, starts = collect_walk_ends(
-            walker,
-            add_batch_axis(params),
-            add_batch_axis(guesses),
-            add_batch_axis(gait.outcome),
-            options,
-            period_n,
-        )
+        one_params, one_guess, outcome = select_tree_rows((params, guesses, gait.outcome), None)
+        rows, starts = collect_walk_ends(walker, one_params, one_guess, outcome, options, period_n)
         found = find_gaits(params, starts[0]) if len(rows) else gait
         return found if found.converged else gait
     lengths = {len(leaf) for leaf in jax.tree.leaves(params) if leaf.ndim}

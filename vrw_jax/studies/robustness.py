@@ -79,9 +79,13 @@ class GaitSensitivity(AbstractPrintable):
     later_steps: Float[Array, " n_measures"]
     spectral_radius: Scalar
     outcome: Int[Array, ""]
-    measures: tuple[str, ...] = eqx.field(static=True)
     described_measures: tuple[Measure, ...] = eqx.field(static=True)
     disturbance_unit: str = eqx.field(static=True)
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """Return the names of the measures."""
+        return tuple(measure.name for measure in self.described_measures)
 
     @property
     def ending(self) -> str:
@@ -218,7 +222,6 @@ def compute_gait_sensitivity(
         later_steps=later_steps,
         spectral_radius=zero_without_gait(limit_cycle_result.spectral_radius_value),
         outcome=limit_cycle_result.outcome,
-        measures=measure_names,
         described_measures=tuple(map(cycle_finder.get_measure, measure_names)),
         disturbance_unit=cycle_finder.disturbance_unit,
     )
