@@ -252,7 +252,7 @@ def test_a_step_that_never_reaches_the_section_has_a_code_and_finite_numbers():
         Termination.SECTION_REACHED,
         Termination.MAX_TIME_REACHED,
     ]
-    assert all(np.isfinite(x).all() for x in rising)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(rising))
 
 
 to_sky = Guard(lambda y, p: y[0], target_mode="sky")

@@ -43,11 +43,17 @@ def test_integrals_over_a_mode_have_their_closed_forms_and_derivatives():
         vrw.measure("mean_square", phase="flight", reduction="mean")(square),
         vrw.measure("action", phase="flight", reduction="integral")(square),
     )
-    walker = dataclasses.replace(BALL_SYSTEM, measures=measures)
-    table = vrw.sensitivities(BALL_PARAMS, measures=["mean_square", "action"], model=walker)
+    extrema = (
+        vrw.measure("apex", phase="flight", reduction="max")(lambda y, p: y[0]),
+        vrw.measure("lowest_velocity", phase="flight", reduction="min")(lambda y, p: y[1]),
+    )
+    walker = dataclasses.replace(BALL_SYSTEM, measures=(*measures, *extrema))
+    names = ["mean_square", "action", "apex", "lowest_velocity"]
+    table = vrw.sensitivities(BALL_PARAMS, measures=names, model=walker)
     v, dv = 2.0, np.array([4.0, 2.0])
-    np.testing.assert_allclose(table.value, [v**2 / 3, 2 * v**3 / 3 / GRAVITY], rtol=1e-9)
-    expected = [2 * v / 3 * dv, 2 * v**2 / GRAVITY * dv]
+    values = [v**2 / 3, 2 * v**3 / 3 / GRAVITY, v**2 / 2 / GRAVITY, -v]
+    np.testing.assert_allclose(table.value, values, rtol=1e-9)
+    expected = [2 * v / 3 * dv, 2 * v**2 / GRAVITY * dv, v / GRAVITY * dv, -dv]
     np.testing.assert_allclose(table.derivative, expected, rtol=1e-8)
 
 
@@ -80,6 +86,38 @@ def test_the_mean_force_on_the_rear_foot_is_that_of_samples(cycle):
     assert float(cycle.measure(MEAN_FORCE)) == pytest.approx(21.07, abs=5e-3)
     impulse = cycle.measure(IMPULSE)
     np.testing.assert_allclose(impulse, cycle.measure(MEAN_FORCE) * cycle.durations[0], rtol=1e-13)
+
+
+def fore_force(instant, params):
+    return instant.fore_force.normal
+
+
+ALL_PHASES = ("DLS", "SLS-I", "SLS-II")
+LARGEST_FORCE = vrw.measure("largest", unit="N", phase=ALL_PHASES, reduction="max")(fore_force)
+
+
+def test_extrema_and_means_over_several_phases_are_those_of_samples(cycle):
+    """The largest force is also a measure of the library; the trapezoidal error is 1e-5."""
+    np.testing.assert_allclose(
+        cycle.measure(LARGEST_FORCE), cycle.measure("peak_force"), rtol=1e-13
+    )
+    walk = vrw.simulate(WHEEL, cycle.section_state, 1, n_samples=1001)
+    force = walk.lambda_2.values
+    declare = lambda reduction: vrw.measure("force", phase=ALL_PHASES, reduction=reduction)
+    smallest, mean = (cycle.measure(declare(name)(fore_force)) for name in ("min", "mean"))
+    np.testing.assert_allclose(smallest, force.min(), rtol=1e-8)
+    expected = np.trapezoid(force, walk.time.values) / np.ptp(walk.time.values)
+    np.testing.assert_allclose(mean, expected, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_derivative_of_the_largest_force_is_that_of_the_library():
+    find = lambda damping: vrw.limit_cycle(vrw.WheelParams(damping=damping))
+    by_own, by_library = (
+        jax.grad(lambda damping, name=name: find(damping).measure(name))(200.0)
+        for name in (LARGEST_FORCE, "peak_force")
+    )
+    np.testing.assert_allclose(by_own, by_library, rtol=1e-10)
 
 
 def test_a_measure_of_a_step_loses_what_gravity_supplies(cycle):
@@ -149,6 +187,17 @@ def test_a_branch_of_a_wheel_has_the_measure_of_each_gait():
     [
         (lambda: vrw.measure("force", phase="DLS"), "reduction"),
         (lambda: vrw.measure("force", reduction="mean"), "there is no phase"),
+        (
+            lambda: vrw.continue_branch(
+                BALL_PARAMS,
+                "kick",
+                (0.5, 2.0),
+                model=BALL_SYSTEM,
+                cycle=vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM),
+                margins={"mean": vrw.measure("mean", phase="flight", reduction="mean")(rear_force)},
+            ),
+            "a margin is a minimum",
+        ),
         (
             lambda: vrw.limit_cycle(WHEEL).measure(
                 vrw.measure("force", phase="flight", reduction="mean")(rear_force)

@@ -123,6 +123,14 @@ def test_a_walk_that_enters_a_mode_beyond_a_guard_says_so():
     assert "guards" in walk.ending
     batch = vrw.step_batch(BALL_PARAMS, np.array([[1.0], [2.0]]), model=buried)
     assert batch.outcome.tolist() == [vrw.Outcome.GUARD_VIOLATED, vrw.Outcome.STEPPED]
+    place = "guard 'bounce' of mode 'flight'"
+    endings = buried.step_batch(BALL_PARAMS, np.array([[1.0], [2.0]])).ending
+    assert place in endings[0]
+    assert "mode" not in endings[1]
+    assert place in str(buried.step(BALL_PARAMS, [1.0]))
+    gait = vrw.limit_cycle(BALL_PARAMS, model=buried, guess=[1.0])
+    assert gait.outcome == vrw.Outcome.GUARD_VIOLATED
+    assert place in gait.why
 
 
 def test_section_coordinates_of_another_length_are_refused():
@@ -162,7 +170,9 @@ def test_figures_show_the_results_of_any_walker():
     scan = vrw.scan(design, ["period", "height"], base=BALL_PARAMS, model=walker)
     (figure,) = vrw.plot.scan_figures(scan).values()
     assert figure.axes[-1].get_ylabel() or len(figure.axes) > 3
-    assert vrw.plot.map_figure(scan, "height", []).axes[0].get_xlabel()
+    map_axes = vrw.plot.map_figure(scan, "height", []).axes
+    assert map_axes[0].get_xlabel()
+    assert map_axes[-1].get_ylabel() == "height [m]"
     tornado = vrw.plot.tornado_figure(vrw.sensitivities(BALL_PARAMS, model=walker))
     assert [axes.get_title() for axes in tornado.axes][1:] == ["velocity", "height"]
     tuned = vrw.tune(BALL_PARAMS, {"height": 1.0}, ["kick"], {"kick": (0.5, 1.5)}, model=walker)

@@ -2,9 +2,11 @@
 
 import functools
 import operator
+import re
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,18 +14,44 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.machine_code import CodeRegistrySpy, use_cache_folder
+from support.walkers import BALL_SYSTEM
 
 import vrw_jax as vrw
 from vrw_jax import lanes
+from vrw_jax.base.walker import compile_step
 from vrw_jax.branches.continuation_problems import make_trial_linearizer
+from vrw_jax.flow.hybrid_simulation import _estimate_time_errors, simulate_modes
+from vrw_jax.flow.hybrid_system import (
+    _compile_mode_measures,
+    _compile_sampling,
+    _compile_simulation,
+    compile_finish,
+)
+from vrw_jax.flow.saltation import _multiply_event_determinants
+from vrw_jax.flow.segments import _integrate_flow_segments
 from vrw_jax.gaits.collocation_search import CollocationSystem, run_search_attempts
+from vrw_jax.gaits.derivatives import _compute_collocation_tangents
+from vrw_jax.gaits.fixed_points import _find_fixed_point_of_iterate
+from vrw_jax.gaits.force_peaks import _compute_peak_derivatives, _locate_force_peaks
 from vrw_jax.gaits.limit_cycle_result import solve_limit_cycle
+from vrw_jax.gaits.walker_finder import _find_gaits
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.models.contact_kernel import run_walks
+from vrw_jax.models.contact_section import embed_section_state
 from vrw_jax.models.contact_step import prepare_walk, sample_contact_interval
-from vrw_jax.models.contact_walks import _make_static_walk_settings
+from vrw_jax.models.contact_walks import (
+    _compile_section_function,
+    _make_static_walk_settings,
+    _run_lane_walks,
+)
 from vrw_jax.models.phase_sequence import make_step_result
-from vrw_jax.models.viscoelastic import take_steps_of_lanes
+from vrw_jax.models.step_batch import _compile_lane_step
+from vrw_jax.models.viscoelastic import (
+    _finish_lane_steps,
+    _sample_lane_steps,
+    take_steps_of_lanes,
+)
+from vrw_jax.wheel.params import NO_LAWS
 
 GRAVITY = 9.81
 moon = types.ModuleType("moon")
@@ -276,7 +304,9 @@ def test_keys_are_the_same_in_every_process():
 
 
 def change_settings(value):
-    """Yield copies of settings in which one number, flag or text is another one, at any depth."""
+    """Yield copies of settings in which one number, flag, text or function is another one, at any
+    depth.
+    """
     if isinstance(value, bool):
         yield not value
     elif isinstance(value, int | float):
@@ -290,10 +320,21 @@ def change_settings(value):
         for i, entry in enumerate(value):
             for changed in change_settings(entry):
                 yield make([*value[:i], changed, *value[i + 1 :]])
+    elif isinstance(value, dict):
+        for name, entry in value.items():
+            for changed in change_settings(entry):
+                yield value | {name: changed}
+            yield {f"{other}x" if other == name else other: x for other, x in value.items()}
     elif isinstance(value, np.ndarray | jax.Array):
         yield value + 1
     elif isinstance(value, jax.tree_util.PyTreeDef):
         yield jax.tree.structure([0.0] * (value.num_leaves + 1))
+    elif isinstance(value, functools.partial):
+        for changed in change_settings(value.args):
+            yield functools.partial(value.func, *changed)
+        yield functools.partial(lambda *_: 5.0, *value.args)
+    elif isinstance(value, types.FunctionType):
+        yield lambda *_: 5.0
     else:
         for name in vars(value):
             for changed in change_settings(vars(value)[name]):
@@ -302,21 +343,40 @@ def change_settings(value):
                 yield copied
 
 
+SYSTEM = CollocationSystem(8, 1, vrw.CycleOptions())
+ACTION = vrw.measure("action", phase="flight", reduction="integral")(lambda y, p: y[1] ** 2)
+MODES = (
+    vrw.hybrid.Mode(
+        lambda y: -y, (vrw.hybrid.Guard(lambda y: y[0] - 1.0, lambda y: 2.0 * y, None, None),)
+    ),
+)
+WALK_SETTINGS = _make_static_walk_settings(vrw.UnilateralWheel(), vrw.StepOptions(), 8, True, 12)
+
+
 @pytest.mark.parametrize(
     ("compiled", "settings"),
     [
-        (run_search_attempts, CollocationSystem(8, 1, vrw.CycleOptions())),
-        (make_trial_linearizer, (CollocationSystem(8, 1, vrw.CycleOptions()), (0, 1))),
+        (run_search_attempts, SYSTEM),
+        (_compute_collocation_tangents, SYSTEM),
+        (_locate_force_peaks, SYSTEM),
+        (_compute_peak_derivatives, SYSTEM),
+        (make_trial_linearizer, (SYSTEM, (0, 1))),
         (lanes.make_leaf_function, (jax.tree.structure(vrw.StepOptions()), True, 0.7)),
         (take_steps_of_lanes, (True, 0.7)),
-        (
-            run_walks,
-            _make_static_walk_settings(vrw.UnilateralWheel(), vrw.StepOptions(), 8, True, 12),
-        ),
+        (_finish_lane_steps, (True, 1)),
+        (_sample_lane_steps, (True, 40)),
+        (run_walks, WALK_SETTINGS),
+        (_run_lane_walks, WALK_SETTINGS),
         (prepare_walk, (True, "lanes", False, False)),
         (sample_contact_interval, (vrw.UnilateralWheel(restitution=0.5), 40)),
         (make_step_result, (vrw.ViscoelasticWheel(friction=0.4), 40)),
         (solve_limit_cycle, (vrw.LadderWheel(), vrw.RigidWheel(), "cycle")),
+        (_find_gaits, (BALL_SYSTEM, 1)),
+        (simulate_modes, (MODES, 3)),
+        (_estimate_time_errors, MODES),
+        (_multiply_event_determinants, MODES),
+        (_integrate_flow_segments, (MODES[0].field, 4, 2)),
+        (_find_fixed_point_of_iterate, (MODES[0].field, 1, (MODES[0].field,), 30, False)),
     ],
 )
 def test_each_setting_of_a_compiled_function_is_part_of_its_key(compiled, settings):
@@ -329,3 +389,68 @@ def test_each_setting_of_a_compiled_function_is_part_of_its_key(compiled, settin
         changed = list(change_settings(settings))
     keys += [make_key(functools.partial(compiled, x)) for x in changed]
     assert len(set(keys)) == len(keys) > 2
+
+
+@pytest.mark.parametrize(
+    ("compile_function", "settings"),
+    [
+        (compile_step, (BALL_SYSTEM,)),
+        (compile_finish, (BALL_SYSTEM,)),
+        (_compile_sampling, (BALL_SYSTEM, 9)),
+        (_compile_simulation, (BALL_SYSTEM, 3, 0)),
+        (_compile_mode_measures, (BALL_SYSTEM, (ACTION,))),
+        (_compile_lane_step, (True, jax.tree.structure(NO_LAWS), 8, (0, 1), 0)),
+        (_compile_section_function, (embed_section_state, 8)),
+    ],
+)
+def test_each_setting_of_a_function_that_is_compiled_from_it_is_part_of_its_key(
+    compile_function, settings
+):
+    compile_anew = compile_function.__wrapped__
+    settings_and_changes = [settings]
+    for i, setting in enumerate(settings):
+        for changed in change_settings(setting):
+            settings_and_changes.append((*settings[:i], changed, *settings[i + 1 :]))
+    keys = []
+    for arguments in settings_and_changes:
+        try:
+            compiled = compile_anew(*arguments)
+        except (TypeError, ValueError, KeyError, AttributeError, IndexError):
+            continue  # settings without meaning, which compile nothing
+        # Programs are also kept by the largest array that is unrolled.
+        unrolled = getattr(compiled, "_max_unrolled_entries", 0)
+        keys.append((make_key(compiled._function), unrolled))
+    assert len(set(keys)) == len(keys) > 2
+
+
+COMPILERS = re.compile(
+    r"(?<!def )\b(?:lanes\.jit|jit_batch|compile_batch_function|call_compiled_program"
+    r"|get_compiled_program)\("
+)
+
+
+def test_no_other_function_is_compiled():
+    """A new place that compiles a function belongs into the two tests above."""
+    package = Path(vrw.__file__).parent
+    counts = {
+        str(file.relative_to(package)): len(COMPILERS.findall(file.read_text()))
+        for file in package.rglob("*.py")
+        if "lanes" not in file.parts
+    }
+    assert {name: count for name, count in counts.items() if count} == {
+        "base/walker.py": 1,
+        "branches/continuation_problems.py": 1,
+        "flow/hybrid_simulation.py": 2,
+        "flow/hybrid_system.py": 4,
+        "flow/saltation.py": 1,
+        "flow/segments.py": 1,
+        "gaits/derivatives.py": 2,
+        "gaits/fixed_points.py": 1,
+        "gaits/force_peaks.py": 1,
+        "gaits/walker_finder.py": 1,
+        "models/contact_step.py": 2,
+        "models/contact_walks.py": 2,
+        "models/step_batch.py": 1,
+        "models/unilateral_wheel.py": 1,
+        "models/viscoelastic.py": 5,
+    }

@@ -45,7 +45,7 @@ from vrw_jax.app.figure_style import (
 from vrw_jax.base.checks import check_names, check_positive, check_type, require_known_name
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import Branch, SpecialPoint
-from vrw_jax.models.measures import MEASURES, PRE_TOUCHDOWN_COMPONENT_NAMES, describe_violation
+from vrw_jax.models.measures import MEASURES, describe_violation
 from vrw_jax.studies.tune_maximization import ACTIVE_BOUND_TOLERANCE, TrialKind
 from vrw_jax.studies.tune_result import TuneResult
 from vrw_jax.wheel.params import check_parameter_name
@@ -135,7 +135,14 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
         )
         component_colors = dict(zip(components, itertools.cycle(COMPONENT_COLORS), strict=False))
         drawn_panels = (
-            ("section coordinates" if has_names else "fixed point", component_colors),
+            (
+                next(iter(components))
+                if len(components) == 1
+                else "section coordinates"
+                if has_names
+                else "fixed point",
+                component_colors,
+            ),
             MULTIPLIER_PANEL,
         )
     legend_height = 0.32 + 0.16 * -(-len(special_points) // 2)
@@ -197,7 +204,7 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
         panel_axes[0].legend()
     for axes in panel_axes:
         if axes.get_subplotspec().is_last_row():
-            axes.set_xlabel(format_axis_label(branch.parameter))
+            axes.set_xlabel(format_axis_label(branch.parameter, dataset=branch_dataset))
     _add_branch_legend(figure, special_points, branch.parameter)
     return figure
 
@@ -329,20 +336,19 @@ def basin_figure(
         )
         if failure_outcome_codes:
             draw_outcome_cells(axes, x, y, basin_dataset.outcome.values, failure_outcome_codes)
-        if {horizontal_axis_name, vertical_axis_name} <= set(PRE_TOUCHDOWN_COMPONENT_NAMES):
-            component_indices = list(
-                map(PRE_TOUCHDOWN_COMPONENT_NAMES.index, (horizontal_axis_name, vertical_axis_name))
-            )
+        axis_names = [horizontal_axis_name, vertical_axis_name]
+        if "component" in basin_dataset and {*axis_names} <= {*basin_dataset.component.values}:
             axes.plot(
-                *basin_dataset.orbit_state.values[..., component_indices].reshape(-1, 2).T,
+                *basin_dataset.orbit_state.sel(component=axis_names).values.reshape(-1, 2).T,
                 "+",
                 color=OKABE_ITO_YELLOW,
                 markersize=7.0,
                 markeredgewidth=1.6,
             )
-        axes.set(title=panel_title, xlabel=format_axis_label(horizontal_axis_name, "{symbol}"))
+        xlabel, ylabel = (format_axis_label(x, "{symbol}", basin_dataset) for x in axis_names)
+        axes.set(title=panel_title, xlabel=xlabel)
         if axes.get_subplotspec().is_first_col():
-            axes.set_ylabel(format_axis_label(vertical_axis_name, "{symbol}"))
+            axes.set_ylabel(ylabel)
     color_bar = figure.colorbar(step_count_image, ax=list(panel_axes), aspect=25, pad=0.01)
     color_bar.set_label("steps until the gait is reached")
     color_bar.ax.set_ylim(0.0, max_n_steps_to_gait)

@@ -213,7 +213,7 @@ def draw_scan_slices(
             axes_of_row.tolist(),
             cell_mesh,
             measure_values,
-            textwrap.fill(format_axis_label(measure_name, "{name}"), 24),
+            textwrap.fill(format_axis_label(measure_name, "{name}", scan), 24),
             aspect=12,
             pad=0.01,
         )
@@ -229,11 +229,11 @@ def draw_scan_slices(
             axes_of_column[0].set_title(format_value_label(panel_column_parameter, panel_value))
         axes_of_column[-1].set_xlabel(
             format_axis_label(
-                x, "{name} {symbol}" if width_inches > 2.5 * n_panel_columns else "{symbol}"
+                x, "{name} {symbol}" if width_inches > 2.5 * n_panel_columns else "{symbol}", scan
             )
         )
     for axes in panel_axes[:, 0]:
-        axes.set_ylabel(format_axis_label(y, "{symbol}"))
+        axes.set_ylabel(format_axis_label(y, "{symbol}", scan))
     _add_scan_legend(figure, outcome_codes, legend_lines, n_panel_columns)
     if slice_indices:
         fixed_values_text = ", ".join(
@@ -262,7 +262,7 @@ def draw_scan_samples(
             axes,
             point_collection,
             scan[measure_name].values,
-            format_axis_label(measure_name),
+            format_axis_label(measure_name, dataset=scan),
             location="top",
             aspect=25,
         )
@@ -271,8 +271,8 @@ def draw_scan_samples(
         panel_axes[-1], scan[x].values, scan[y].values, outcome_codes, marker_size
     )
     for axes in panel_axes:
-        axes.set_xlabel(format_axis_label(x, "{symbol}"))
-    panel_axes[0].set_ylabel("sample" if y == "sample" else format_axis_label(y, "{symbol}"))
+        axes.set_xlabel(format_axis_label(x, "{symbol}", scan))
+    panel_axes[0].set_ylabel("sample" if y == "sample" else format_axis_label(y, "{symbol}", scan))
     _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
     return figure
 
@@ -318,9 +318,9 @@ def draw_parameter_pairs(
                 axes, drawn_samples, x, y, measure_name, marker_size
             )
         if i == n_parameters - 1:
-            axes.set_xlabel(format_axis_label(x, "{symbol}"))
+            axes.set_xlabel(format_axis_label(x, "{symbol}", scan))
         if j == 0 and i > 0:
-            axes.set_ylabel(format_axis_label(y, "{symbol}"))
+            axes.set_ylabel(format_axis_label(y, "{symbol}", scan))
         elif i != j:
             axes.tick_params(labelleft=False)
     panel_axes[0, 0].set_ylabel("share that walks")
@@ -335,7 +335,7 @@ def draw_parameter_pairs(
             panel_axes.ravel().tolist(),
             point_collection,
             drawn_samples[measure_name].values,
-            format_axis_label(measure_name, "{name}"),
+            format_axis_label(measure_name, "{name}", scan),
             aspect=40,
             pad=0.01,
         )
@@ -445,11 +445,11 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         axes.plot(scan[x].values, scan[measure_name].values, marker=".", color=OKABE_ITO_BLUE)
         axes.set_yscale("log" if measure_name in LOGARITHMIC_MEASURE_NAMES else "linear")
-        axes.set_ylabel(textwrap.fill(format_axis_label(measure_name, "{name}"), 24))
+        axes.set_ylabel(textwrap.fill(format_axis_label(measure_name, "{name}", scan), 24))
         for sample_index in missing_gait_indices:
             cell_ends = cell_edges[sample_index : sample_index + 2]
             axes.axvspan(*cell_ends, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
-    panel_axes[-1].set_xlabel(format_axis_label(x))
+    panel_axes[-1].set_xlabel(format_axis_label(x, dataset=scan))
     return figure
 
 
@@ -616,7 +616,7 @@ def map_figure(
         rasterized=True,
     )
     figure.colorbar(measure_image, ax=axes, aspect=30, pad=0.01).set_label(
-        format_axis_label(measure)
+        format_axis_label(measure, dataset=scan)
     )
     labeled_special_points = set()
     for special_point_curve in curves:
@@ -655,8 +655,8 @@ def map_figure(
         label="two special points at once",
     )
     axes.set(
-        xlabel=format_axis_label(x),
-        ylabel=format_axis_label(y),
+        xlabel=format_axis_label(x, dataset=scan),
+        ylabel=format_axis_label(y, dataset=scan),
         xlim=scan[x].values[[0, -1]],
         ylim=scan[y].values[[0, -1]],
     )

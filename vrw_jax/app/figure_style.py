@@ -323,13 +323,16 @@ def _format_figure_unit(quantity_name: str) -> str:
     return MEASURES[quantity_name].display_unit.replace(" ", "·").replace("^2", "²")
 
 
-def format_axis_label(quantity_name: str, label_format: str = "{name} {symbol}") -> str:
+def format_axis_label(
+    quantity_name: str, label_format: str = "{name} {symbol}", dataset: xr.Dataset | None = None
+) -> str:
     """Return an axis label for a quantity, with its unit, formatted with `label_format`.
 
-    An unknown name is returned unchanged.
+    The unit of a quantity of the user is that of its variable in `dataset`.
     """
     if quantity_name not in MEASURES:
-        return quantity_name
+        unit = "1" if dataset is None else dataset[quantity_name].attrs.get("units", "1")
+        return typeset_greek_symbols(quantity_name) + f" [{unit}]" * (unit not in ("", "1"))
     measure_description = MEASURES[quantity_name]
     label_text = label_format.format(
         name=typeset_greek_symbols(measure_description.long_name),

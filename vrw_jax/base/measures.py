@@ -23,7 +23,7 @@ class Measure:
     - `is_integer_code`: whether the measure is an integer code or count without derivatives;
     - `is_averaged_over_steps`, `is_largest_over_steps`: whether the measure of several steps is
       their mean or their maximum instead of their sum;
-    - `function`, `phase`, `reduction`: function of a measure of your own, see `vrw.measure`.
+    - `function`, `phases`, `reduction`: function of a measure of your own, see `vrw.measure`.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Measure:
     is_averaged_over_steps: bool = False
     is_largest_over_steps: bool = False
     function: Callable[..., Any] | None = None
-    phase: str = ""
+    phases: tuple[str, ...] = ()
     reduction: str = ""
 
     def __call__(self, *arguments: Any) -> Any:
@@ -129,16 +129,17 @@ def measure(
     unit: str = "1",
     meaning: str = "",
     symbol: str = "",
-    phase: str = "",
+    phase: str | Sequence[str] = (),
     reduction: str = "",
 ) -> Callable[[Callable[..., Any]], Measure]:
     """Declare a function as a measure of gaits, of the paper's wheel or of your own walker.
 
     A measure without a phase is a function of a step and of the parameters. A measure of a phase is
-    a function of the motion at one instant and of the parameters, whose integral or mean over the
-    phase is as accurate as the motion and has derivatives. For the wheel, the instant has `motion`,
-    `acceleration`, `fore_force` and `rear_force`, and the phases are "DLS", "SLS-I" and "SLS-II".
-    For a `HybridSystem`, the instant is the state, and the phases are the modes.
+    a function of the motion at one instant and of the parameters, whose integral, mean, minimum or
+    maximum over the phase is as accurate as the motion and has derivatives. For the wheel, the
+    instant has `motion`, `acceleration`, `fore_force` and `rear_force`, and the phases are "DLS",
+    "SLS-I" and "SLS-II". For a `HybridSystem`, the instant is the state, and the phases are the
+    modes. A phase that does not occur has the value zero.
 
     Give the measure to `vrw.scan`, `vrw.tune`, `vrw.sensitivities`, `vrw.continue_branch` or
     `cycle.measure`, or to your own walker as `measures=(cost,)`, whose gaits have it in `values`.
@@ -149,8 +150,8 @@ def measure(
         unit: SI unit, "1" for a pure number.
         meaning: what is measured, for printed results and datasets.
         symbol: symbol in figures; by default the name.
-        phase: name of the phase or mode over which the function is integrated.
-        reduction: "integral" or "mean" over the phase.
+        phase: name of the phase or mode in which the function is measured, or several names.
+        reduction: "integral", "mean", "min" or "max" over the phases.
 
     Returns:
         A decorator, which returns a `Measure` that is called like the function.
@@ -167,8 +168,9 @@ def measure(
         '1/s'
     """
     _require_unused_name(name, USED_NAMES)
-    if phase:
-        check_choice("reduction", reduction, ("integral", "mean"))
+    phases = (phase,) * bool(phase) if isinstance(phase, str) else tuple(phase)
+    if phases:
+        check_choice("reduction", reduction, ("integral", "mean", "min", "max"))
     elif reduction:
         raise ValueError(
             f"reduction is {reduction!r}, but there is no phase: name the phase over which the "
@@ -185,7 +187,7 @@ def measure(
             meaning,
             is_averaged_over_steps=True,
             function=function,
-            phase=phase,
+            phases=phases,
             reduction=reduction,
         )
 

@@ -4,6 +4,7 @@ bifurcations.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.base.checks import (
@@ -24,15 +24,18 @@ from vrw_jax.base.checks import (
     check_real,
     check_reals,
     check_type,
-    require_known_name,
     require_no_masked_entries,
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure, select_measures
+from vrw_jax.base.measures import Measure, measure, select_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
+from vrw_jax.base.parameters import (
+    find_tree_parameter,
+    list_tree_parameters,
+    replace_tree_parameter,
+)
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     AbstractWalker,
@@ -65,7 +68,6 @@ from vrw_jax.branches.test_functions import (
     compute_multipliers,
 )
 from vrw_jax.flow.hybrid_system import HybridSystem
-from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 from vrw_jax.gaits.fixed_points import (
     UNIT_MULTIPLIER_ADVICE,
     check_state_units,
@@ -142,6 +144,7 @@ class AbstractMapContinuation(AbstractContinuation):
     """Attributes of the quantities that the dataset of the branch contains, by name."""
     component_units: ClassVar[tuple[tuple[str, str], ...]] = ()
     """Names and units of the components of the state, if they have names."""
+    unit_of_parameter: ClassVar[str] = "1"  # SI unit of the continued parameter
 
     @property
     def parameter_unit(self) -> float:
@@ -403,7 +406,8 @@ def trace_map_branch(
             },
         }
         | make_stability_variables(branch_data.points.return_map_jacobian),
-        {name: ("point", branch_data.points.p)} | (components if units else {}),
+        {name: ("point", branch_data.points.p, {"units": continuation.unit_of_parameter})}
+        | (components if units else {}),
         {"title": f"Branch of fixed points along {name}"},
     )
     return Branch(
@@ -420,11 +424,11 @@ class HybridContinuation(AbstractMapContinuation):
     """Continuation of the gaits of a walker, with margins and, if known, the order of events."""
 
     _: KW_ONLY
-    walker: AbstractWalker
+    walker: Any  # an AbstractWalker
     name: str  # of the continued parameter
     period_n: int
     step_options: StepOptions
-    margins: tuple[tuple[str, Callable[[Array, Any], Array]], ...]
+    margins: tuple[Measure, ...]
     measures: tuple[Measure, ...]
     component_units: tuple[tuple[str, str], ...]  # type: ignore[misc]
 
@@ -436,8 +440,8 @@ class HybridContinuation(AbstractMapContinuation):
                 "order_of_events_changes", "Events change their order.", is_stepwise=True
             ),
             **{
-                name: TestFunction(BORDER_COLLISION, "A margin vanishes.")
-                for name, _ in self.margins
+                margin.name: TestFunction(BORDER_COLLISION, "A margin vanishes.")
+                for margin in self.margins
             },
         }
 
@@ -445,9 +449,13 @@ class HybridContinuation(AbstractMapContinuation):
     def measure_attributes(self) -> dict[str, Mapping[str, str]]:  # type: ignore[override]
         return {
             "period": {"units": "s"},
-            **{name: {} for name, _ in self.margins},
-            **{measure.name: measure.variable_attributes for measure in self.measures},
+            **{own.name: own.variable_attributes for own in (*self.margins, *self.measures)},
         }
+
+    @property
+    def unit_of_parameter(self) -> str:  # type: ignore[override]
+        parameters = {x.name: x for x in list_tree_parameters(self.wheels)}
+        return parameters[self.name].domain.unit
 
     def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable:
         params = replace_tree_parameter(
@@ -467,26 +475,25 @@ class HybridContinuation(AbstractMapContinuation):
         states, walker, options = self.state_units * points.z, self.walker, self.step_options
         params = replace_tree_parameter(wheels, self.name, points.p)
         quantities = {"x": states, "period": np.zeros(len(states))}
-        quantities |= {measure.name: np.zeros(len(states)) for measure in self.measures}
+        quantities |= {own.name: np.zeros(len(states)) for own in self.measures}
+        quantities |= {margin.name: np.full(len(states), np.inf) for margin in self.margins}
+        own_measures = (*self.margins, *self.measures)
         codes, outcome = [], np.full(len(states), int(Outcome.STEPPED))
-        minima = np.full((len(states), len(self.margins)), np.inf)
         for _ in range(self.period_n):
             step = step_batch_of_walker(walker, params, states, options)
-            if self.margins:
-                functions = tuple(function for _, function in self.margins)
-                step_minima = map_in_numpy_batches(
-                    functools.partial(_measure_margins, walker, functions, options),
-                    POINT_BATCH_SIZES, params, states, step.n_events,
-                )  # fmt: skip
-                minima = np.minimum(minima, step_minima)
             quantities["period"] = quantities["period"] + step.duration
-            if self.measures:
+            values = {}
+            if own_measures:
                 values = map_in_numpy_batches(
-                    functools.partial(_measure_steps, walker, self.measures, options),
+                    functools.partial(_measure_steps, walker, own_measures, options),
                     POINT_BATCH_SIZES, params, states, step,
                 )  # fmt: skip
-                for measure, value in values.items():
-                    quantities[measure] = quantities[measure] + value / self.period_n
+            for own in self.measures:
+                quantities[own.name] += values[own.name] / self.period_n
+            for margin in self.margins:
+                has_mode = step.mode_durations[:, walker.find_modes(margin)].sum(1) > 0.0
+                minimum = np.where(has_mode, values[margin.name], np.inf)
+                quantities[margin.name] = np.minimum(quantities[margin.name], minimum)
             if isinstance(walker, HybridSystem):
                 codes.append(np.column_stack([step.n_events, step.events]))
             outcome = np.where(outcome == Outcome.STEPPED, step.outcome, outcome)
@@ -494,7 +501,6 @@ class HybridContinuation(AbstractMapContinuation):
         return quantities | {
             EVENT_ORDER: number_rows(np.concatenate([np.zeros((len(states), 1)), *codes], 1)),
             "outcome": outcome,
-            **{name: minima[:, i] for i, (name, _) in enumerate(self.margins)},
         }
 
     def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
@@ -514,44 +520,26 @@ def _measure_steps(
     return jax.vmap(evaluate)(params, x, steps)
 
 
-@eqx.filter_jit
-@eqx.filter_vmap(in_axes=(None, None, None, 0, 0, 0))
-def _measure_margins(
-    system: HybridSystem,
-    margins: tuple[Callable, ...],
-    options: StepOptions,
-    params: Any,
-    x: Array,
-    n_events: Array,
-) -> Array:
-    """Return the minimum of each margin over one step of `n_events` events."""
-    start = system.embed(x, params)
-    simulation = system.simulate(params, start, events=system.max_events, options=options)
-    starts, durations = simulation.find_phases(start)
-
-    def measure_mode(field: Callable, start: Array, duration: Array, is_active: Array) -> Array:
-        evaluate = lambda y: jnp.stack(
-            [duration - y[-1], *(margin(y[:-1], params) for margin in margins)]
+def declare_margins(walker: Any, margins: MarginFunctions | None) -> tuple[Measure, ...]:
+    """Return margins of a walker as measures, whose minima are taken, or raise an error."""
+    check_type("margins", margins, (Mapping, type(None)), "give a dictionary of functions by name")
+    if margins and not isinstance(walker, HybridSystem):
+        raise ValueError(
+            f"margins are minima over the motion, which a {type(walker).__name__} does not define: "
+            "give a vrw.HybridSystem, or leave them out."
         )
-        return integrate_phase(
-            lambda y: jnp.append(field(y[:-1], params), 1.0),
-            GuardsAndMargins(evaluate, 1, (True,) * len(margins)),
-            jnp.append(start, 0.0),
-            is_active,
-            options,
-        ).margin_minima
-
-    fields = [mode.field for mode in system.modes.values()]
-    measure_by_mode = [functools.partial(measure_mode, field) for field in fields]
-
-    def measure_phase(phase: tuple) -> Array:
-        index, mode, start, duration = phase
-        is_active = (index < n_events) & (duration > 0.0)
-        minima = lax.switch(mode, measure_by_mode, start, duration, is_active)
-        return jnp.where(is_active, minima, jnp.inf)
-
-    phases = jnp.arange(system.max_events), simulation.modes, starts, durations
-    return jnp.min(lax.map(measure_phase, phases), 0)
+    declared = []
+    for name, margin in (margins or {}).items():
+        check_callable(f"margin {name!r}", margin, "of state and parameters")
+        if not isinstance(margin, Measure):
+            margin = measure(name, phase=tuple(walker.modes), reduction="min")(margin)
+        elif margin.reduction != "min":
+            raise ValueError(
+                f"margin {name!r} is a measure with reduction={margin.reduction!r}, but a margin "
+                'is a minimum: declare it with reduction="min".'
+            )
+        declared.append(dataclasses.replace(margin, name=name))
+    return tuple(declared)
 
 
 def continue_hybrid_branch(
@@ -569,24 +557,16 @@ def continue_hybrid_branch(
 ) -> Branch:
     """Return the branch of `continue_branch` for a walker of the user."""
     measures = select_measures(measures, walker.measures)
-    for measure in measures:
-        if measure.phase and isinstance(walker, HybridSystem):
-            require_known_name(measure.phase, tuple(walker.modes), "mode")
+    own_margins = declare_margins(walker, margins)
+    if isinstance(walker, HybridSystem):
+        for own in (*measures, *own_margins):
+            walker.find_modes(own)
     coordinates = (
         name_coordinates(walker, np.shape(gait.section_state)[-1]) if walker.coordinates else {}
     )
     check_int("period_n", period_n)
     step_options = StepOptions() if step_options is None else step_options
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
-    check_type("margins", margins, (Mapping, type(None)), "give a dictionary of functions by name")
-    margins = dict(margins or {})
-    if margins and not isinstance(walker, HybridSystem):
-        raise ValueError(
-            f"margins are minima over the motion, which a {type(walker).__name__} does not define: "
-            "give a vrw.HybridSystem, or leave them out."
-        )
-    for margin_name, margin in margins.items():
-        check_callable(f"margin {margin_name!r}", margin, "of state and parameters")
     n_periods = SWITCHED_KINDS.get(switch_at.kind, 1) if isinstance(switch_at, SpecialPoint) else 1
     start_value = float(jax.tree.leaves(params)[find_tree_parameter(params, name)])
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
@@ -601,7 +581,7 @@ def continue_hybrid_branch(
     return trace_map_branch(
         functools.partial(
             HybridContinuation, walker=walker, name=name, period_n=n_periods * period_n,
-            step_options=step_options, margins=tuple(margins.items()), measures=measures,
+            step_options=step_options, margins=own_margins, measures=measures,
             component_units=tuple(coordinates.items()),
         ),
         map_section_state, gait.section_state, start_value, bounds, params, name, None, options,

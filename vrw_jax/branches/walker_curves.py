@@ -38,6 +38,7 @@ from vrw_jax.branches.map_branch import (
     MarginFunctions,
     check_arclength_options,
     continue_hybrid_branch,
+    declare_margins,
     make_stability_variables,
 )
 from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
@@ -152,7 +153,7 @@ def continue_walker_special_point(
     require_untraced_arguments(
         "vrw.continue_special_point", "differentiate vrw.limit_cycle", params, gait
     )
-    check_type("margins", margins, (Mapping, type(None)), "give a dictionary of functions by name")
+    own_margins = declare_margins(walker, margins)
     require_known_name(name, (*BIFURCATIONS, *(margins or {})), "special point or margin")
     if np.any(np.asarray(gait.outcome) != Outcome.STEPPED) or walker.invariants:
         raise ValueError(
@@ -181,7 +182,7 @@ def continue_walker_special_point(
     first_bounds = np.array(limits[0])
     gaits = HybridContinuation(
         problem, options, params_batch, first_bounds, units, walker=walker, name=names[0],
-        period_n=1, step_options=step_options, margins=tuple((margins or {}).items()), measures=(),
+        period_n=1, step_options=step_options, margins=own_margins, measures=(),
         component_units=(),
     )  # fmt: skip
     curve_problem = WalkerCurveProblem(

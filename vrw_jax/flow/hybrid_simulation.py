@@ -319,13 +319,14 @@ def _simulate_one_event(
     modes: tuple[Mode, ...],
     mode_index: int,
     options: StepOptions,
+    evaluate_margins: Callable[[StateArray], Array],
     state: Array,
     time: Array,
 ) -> tuple[PhaseEnd, Array, Array, Array]:
     """Integrate one phase in a mode, and apply the reset at its end.
 
-    Return the end of the phase, whether a guard is violated at its start, the next state and the
-    next mode.
+    Return the end of the phase, the index of the guard that is violated at its start, or -1, the
+    next state and the next mode.
     """
     mode = modes[mode_index]
     compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
@@ -337,7 +338,8 @@ def _simulate_one_event(
     time_after_first_step = lax.stop_gradient(time + options.dt0)
     time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
     is_guard_near_zero = -guard_values <= jnp.abs(guard_rates) * time_resolution
-    is_guard_violated = jnp.any((guard_values < 0.0) & ~is_guard_near_zero)
+    are_violated = (guard_values < 0.0) & ~is_guard_near_zero
+    violated_guard = jnp.where(jnp.any(are_violated), jnp.argmax(are_violated), -1)
     guard_offset = jnp.where(
         (guard_values < 0.0) & is_guard_near_zero & (guard_rates > 0.0), -guard_values, 0.0
     )
@@ -345,17 +347,19 @@ def _simulate_one_event(
     # rise.
     will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
     guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
+    n_margins = jax.eval_shape(evaluate_margins, state).size
     guards_and_margins = GuardsAndMargins(
-        lambda y: mode.guard_values(y) + guard_offset,
+        lambda y: jnp.append(mode.guard_values(y) + guard_offset, evaluate_margins(y)),
         len(mode.guards),
+        (True,) * n_margins,
         is_zero_at_start=(guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise,
     )
-    phase_end = integrate_phase(mode.field, guards_and_margins, state, ~is_guard_violated, options)
+    phase_end = integrate_phase(mode.field, guards_and_margins, state, violated_guard < 0, options)
     guard_index = jnp.maximum(phase_end.end_guard_index, 0)
     next_state = lax.switch(guard_index, [g.reset for g in mode.guards], phase_end.state)
     next_modes = [mode_index if g.target_mode is None else g.target_mode for g in mode.guards]
     next_mode = select_entry_by_mask(guard_index, jnp.asarray(next_modes, jnp.int32))
-    return phase_end, is_guard_violated, next_state, next_mode.astype(jnp.int32)
+    return phase_end, violated_guard.astype(jnp.int32), next_state, next_mode.astype(jnp.int32)
 
 
 class EventRun(NamedTuple):
@@ -368,6 +372,7 @@ class EventRun(NamedTuple):
     n_events: Int[Array, ""]
     n_events_without_progress: Int[Array, ""]
     solver_steps: Int[Array, ""]
+    violated_guard: Int[Array, ""]  # index of the guard below zero when the mode began, or -1
     termination: Int[Array, ""]  # a Termination
     log: Any
 
@@ -381,6 +386,10 @@ class Event(NamedTuple):
     state_after: StateArray
     mode: Int[Array, ""]
     guard: Int[Array, ""]
+    margin_minima: Float[Array, " margins"]  # since the event before
+
+
+no_margins = lambda y: y[:0]
 
 
 def run_events(
@@ -392,24 +401,27 @@ def run_events(
     log: Any,
     update_log: Callable[[Any, Array, Array, Event], Any],
     is_last_event: Callable[[Event], Array] = lambda event: jnp.asarray(False),
+    evaluate_margins: Callable[[StateArray], Array] = no_margins,
 ) -> EventRun:
     """Simulate until an event is the last, until `max_events` events, or until a failure.
 
     - `log`, `update_log`: what is recorded; `update_log(log, n_events, has_event, event)` returns
       the log after a phase, for the number of events before its end. If the phase ends without an
-      event, `has_event` is False, and the log must not change.
+      event, `has_event` is False, and the log must not change;
+    - `evaluate_margins`: function that returns the margins at a state, whose minima events have.
     """
     mode_branches = [
-        functools.partial(_simulate_one_event, modes, mode_index, options)
+        functools.partial(_simulate_one_event, modes, mode_index, options, evaluate_margins)
         for mode_index in range(len(modes))
     ]
     # The n - 1 guards between n bodies that meet in one point have up to n (n - 1) / 2 events.
     max_simultaneous_events = sum(len(mode.guards) ** 2 for mode in modes)
 
     def simulate_next_event(run: EventRun) -> EventRun:
-        phase_end, is_guard_violated, next_state, next_mode = lax.switch(
+        phase_end, violated_guard, next_state, next_mode = lax.switch(
             run.mode, mode_branches, run.state, run.time
         )
+        is_guard_violated = violated_guard >= 0
         has_event = ~is_guard_violated & (phase_end.end_guard_index >= 0)
         # D. E. Knuth's two-sum returns the rounded sum of two times and its rounding error.
         duration = phase_end.duration + run.time_remainder
@@ -419,7 +431,7 @@ def run_events(
         n_without_progress = jnp.where(time > run.time, 0, run.n_events_without_progress + 1)
         event = Event(
             time, phase_end.duration, phase_end.state, next_state, run.mode,
-            phase_end.end_guard_index,
+            phase_end.end_guard_index, phase_end.margin_minima,
         )  # fmt: skip
         # The first condition that holds determines the termination.
         termination = jnp.select(
@@ -452,14 +464,16 @@ def run_events(
             n_events=run.n_events + has_event,
             n_events_without_progress=n_without_progress.astype(jnp.int32),
             solver_steps=run.solver_steps + phase_end.solver_steps,
+            violated_guard=violated_guard,
             termination=termination.astype(jnp.int32),
             log=update_log(run.log, run.n_events, has_event, event),
         )
 
     count, zero = jnp.zeros((), jnp.int32), 0.0 * start[0]
     first_run = EventRun(
-        zero, zero, start, count + first_mode, count, count, count, count + STATUS_RUNNING_CODE, log
-    )
+        zero, zero, start, count + first_mode, count, count, count, count - 1,
+        count + STATUS_RUNNING_CODE, log,
+    )  # fmt: skip
     is_running = lambda run: make_opaque_loop_condition(
         run.termination == STATUS_RUNNING_CODE, run.n_events
     )
@@ -503,7 +517,7 @@ def simulate_modes(
         entries = (
             event.time,
             *(select_entry_by_mask(event.guard, x) for x in lax.stop_gradient(time_errors)),
-            *event[2:],
+            *event[2:6],
         )
 
         is_entry = has_event & (jnp.arange(events) == n_events)

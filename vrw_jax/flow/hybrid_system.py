@@ -10,8 +10,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +29,13 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import describe_step_ending
+from vrw_jax.base.printing import (
+    format_each_batch_element,
+    format_heading_and_rows,
+    format_numbers,
+    format_outcome_counts,
+    format_quantity,
+)
 from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import (
     AbstractWalker,
@@ -46,6 +53,7 @@ from vrw_jax.flow.hybrid_simulation import (
     HybridSolution,
     Mode,
     Termination,
+    no_margins,
     run_events,
     simulate_modes,
 )
@@ -70,7 +78,7 @@ OUTCOME_BY_TERMINATION = np.array(
 """Outcome of a step by the `Termination` of its simulation."""
 
 
-class HybridStep(NamedTuple):
+class HybridStep(eqx.Module):
     """One step of a hybrid system, from section to section.
 
     - `section_state`: section coordinates at the end of the step; where the simulation ended early,
@@ -80,7 +88,10 @@ class HybridStep(NamedTuple):
     - `events`: number of the guard of each event, counted over the guards of all modes; -1 after
       the last event;
     - `n_events`, `solver_steps`: numbers of events and of solver steps;
-    - `termination`: a `Termination`; a complete step has `Termination.SECTION_REACHED`.
+    - `termination`: a `Termination`; a complete step has `Termination.SECTION_REACHED`;
+    - `last_mode`, `violated_guard`: numbers of the mode in which the simulation ended, and of its
+      guard that was negative when the mode began, or -1;
+    - `guard_names`: names of the guards by the name of each mode.
     """
 
     section_state: Float[Array, " n"]
@@ -90,6 +101,9 @@ class HybridStep(NamedTuple):
     n_events: Int[Array, ""]
     solver_steps: Int[Array, ""]
     termination: Int[Array, ""]
+    last_mode: Int[Array, ""]
+    violated_guard: Int[Array, ""]
+    guard_names: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True)
 
     @property
     def durations(self) -> Any:
@@ -109,8 +123,34 @@ class HybridStep(NamedTuple):
 
     @property
     def ending(self) -> Any:
-        """Return a sentence on how the step ended; for a batch, an array of sentences."""
-        return describe_step_ending(self.termination, Termination)
+        """Return sentences on how the step ended; for a batch, an array of texts."""
+
+        def describe(termination: int, mode: int, guard: int) -> str:
+            ending, (mode_name, guards) = Termination(int(termination)), self.guard_names[mode]
+            if ending == Termination.SECTION_REACHED:
+                return ending.meaning
+            place = f"guard {guards[guard]!r} of mode" if guard >= 0 else "mode"
+            return f"{ending.meaning} This is {place} {mode_name!r}."
+
+        return format_each_batch_element(
+            describe, self.termination, self.last_mode, self.violated_guard
+        )
+
+    def __repr__(self) -> str:
+        if isinstance(self.termination, jax.core.Tracer):
+            return f"HybridStep({self.section_state}, {self.duration})"
+        if np.ndim(self.termination):
+            return f"HybridStep of a batch ({format_outcome_counts(self.outcome, Outcome)})"
+        rows = [
+            ("section state", format_numbers(self.section_state)),
+            ("duration", format_quantity(self.duration, "s")),
+            *(
+                (f"duration of {name}", format_quantity(duration, "s"))
+                for (name, _), duration in zip(self.guard_names, self.mode_durations, strict=True)
+            ),
+            ("ending", self.ending),
+        ]
+        return format_heading_and_rows("HybridStep", rows)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -199,8 +239,7 @@ class HybridSystem(AbstractWalker):
             require_known_name(name, ("height", "slope"), "property of the ground")
         for measure in self.measures:
             check_type("a measure", measure, Measure, "decorate its function with vrw.measure")
-            if measure.phase:
-                require_known_name(measure.phase, tuple(self.modes), "mode")
+            self.find_modes(measure)
         if len(self._start_modes) > 1:
             raise ValueError(
                 f"{self.section!r} leads to the modes {sorted(self._start_modes)}, but each step "
@@ -224,16 +263,11 @@ class HybridSystem(AbstractWalker):
         measures: Sequence[Measure] | None = None,
     ) -> dict[str, Array]:
         measures = self.measures if measures is None else measures
-        of_modes = tuple(measure for measure in measures if measure.phase)
-        values = {m.name: jnp.asarray(m(step, params)) for m in measures if not m.phase}
-        if not of_modes:
-            return values
-        end = compile_step(_append_integrals(self, of_modes))(params, x, options)
-        for measure, integral in zip(of_modes, end.section_state[len(self.state) :], strict=True):
-            duration = end.mode_durations[self._find_mode(measure.phase)]
-            divisor = jnp.where(duration > 0.0, duration, 1.0)
-            values[measure.name] = integral / divisor if measure.reduction == "mean" else integral
-        return values
+        of_modes = tuple(measure for measure in measures if measure.phases)
+        values = {m.name: jnp.asarray(m(step, params)) for m in measures if not m.phases}
+        return values | (
+            _compile_mode_measures(self, of_modes)(params, x, options) if of_modes else {}
+        )
 
     @property
     def guard_names(self) -> tuple[str, ...]:
@@ -261,6 +295,10 @@ class HybridSystem(AbstractWalker):
             return names.index(next(iter(self._start_modes)))
         require_known_name(mode_name, names, "mode")
         return names.index(mode_name)
+
+    def find_modes(self, measure: Measure) -> np.ndarray:
+        """Return the indices of the modes in which a measure is taken, or raise an error."""
+        return np.array([self._find_mode(name) for name in measure.phases], np.int32)
 
     def is_inside_mode(self, params: Any, y: StateArray, mode_index: Array) -> Any:
         """Return whether all guards of a mode are zero or positive at a state."""
@@ -294,6 +332,7 @@ class HybridSystem(AbstractWalker):
         options: StepOptions,
         log: Any,
         update_log: Callable,
+        evaluate_margins: Callable[[StateArray], Array] = no_margins,
     ) -> EventRun:
         """Simulate until the end of a step, and record its events in a log."""
         section_guards = [
@@ -314,6 +353,7 @@ class HybridSystem(AbstractWalker):
             log,
             update_log,
             is_section,
+            evaluate_margins,
         )
 
     def take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
@@ -351,6 +391,9 @@ class HybridSystem(AbstractWalker):
             run.n_events,
             run.solver_steps,
             run.termination,
+            run.mode,
+            run.violated_guard,
+            tuple((name, tuple(mode.guards)) for name, mode in self.modes.items()),
         )
 
     def sample_motion(
@@ -396,9 +439,9 @@ class HybridSystem(AbstractWalker):
         )
         columns = {name: samples[..., i] for i, name in enumerate(self.state)}
         for measure in self.measures:
-            if measure.phase:
+            if measure.phases:
                 evaluate = lambda y, measure=measure: measure(y, params)
-                is_mode = modes == self._find_mode(measure.phase)
+                is_mode = jnp.isin(modes, self.find_modes(measure))
                 values = jax.vmap(jax.vmap(evaluate))(samples)
                 columns[measure.name] = jnp.where(is_mode[:, None], values, 0.0)
         return columns, durations
@@ -545,7 +588,7 @@ def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> Hy
     def append_rates(mode_name: str, field: Any) -> Callable:
         def evaluate(y: Array, params: Any) -> Array:
             rates = [
-                measure(y[:n], params) if measure.phase == mode_name else 0.0 * y[0]
+                measure(y[:n], params) if mode_name in measure.phases else 0.0 * y[0]
                 for measure in measures
             ]
             return jnp.concatenate([field(y[:n], params), jnp.stack(rates)])
@@ -574,6 +617,54 @@ def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> Hy
         ),
         max_events=system.max_events,
     )
+
+
+@functools.lru_cache
+def _compile_mode_measures(system: HybridSystem, measures: tuple[Measure, ...]) -> Any:
+    """Return the compiled function of the measures of modes in a step, by name."""
+    extrema = tuple(m for m in measures if m.reduction in ("min", "max"))
+    integrals = tuple(m for m in measures if m not in extrema)
+    extended = _append_integrals(system, integrals) if integrals else system
+    n, names = len(system.state), tuple(system.modes)
+    signs = np.array([1.0 if m.reduction == "min" else -1.0 for m in extrema])
+    is_measured = np.array([[name in m.phases for m in extrema] for name in names], bool)
+
+    def measure_modes(params: Any, x: Array, options: StepOptions) -> dict[str, Array]:
+        evaluate_extrema = lambda y: jnp.stack(
+            [sign * m(y[:n], params) for sign, m in zip(signs, extrema, strict=True)]
+        )
+
+        def log_event(log: Any, n_events: Array, has_event: Array, event: Event) -> tuple:
+            durations, minima = log
+            is_mode = has_event & (jnp.arange(len(names)) == event.mode)
+            is_entry = jnp.any(is_mode[:, None] & is_measured, 0) & (event.duration > 0.0)
+            return (
+                durations + jnp.where(is_mode, event.duration, 0.0),
+                jnp.where(is_entry, jnp.minimum(minima, event.margin_minima), minima),
+            )
+
+        start, mode_index = extended.embed(x, params), jnp.asarray(system._find_mode(None))
+        zero = 0.0 * start[0]
+        log = jnp.zeros(len(names)) + zero, jnp.full(len(extrema), jnp.inf) + zero
+        run = extended._run_step(
+            params,
+            start,
+            mode_index.astype(jnp.int32),
+            options,
+            log,
+            log_event,
+            evaluate_extrema if extrema else no_margins,
+        )
+        durations, minima = run.log
+        values = {}
+        for m, integral in zip(integrals, run.state[n:], strict=True):
+            duration = jnp.sum(durations[system.find_modes(m)])
+            divisor = jnp.where(duration > 0.0, duration, 1.0)
+            values[m.name] = integral / divisor if m.reduction == "mean" else integral
+        minima = jnp.where(jnp.isfinite(minima), signs * minima, 0.0)
+        return values | {m.name: minimum for m, minimum in zip(extrema, minima, strict=True)}
+
+    return lanes.jit(measure_modes)
 
 
 @functools.lru_cache

@@ -19,6 +19,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.checks import check_type
 from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem
@@ -37,21 +38,36 @@ from vrw_jax.lanes.batching import BatchFunction, unbatch
 from vrw_jax.lanes.lane_function import compile_batch_function, with_lane_axis
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES, make_measure_attributes
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.phases import AbstractPhase, PhaseInstant, make_paper_phases
+from vrw_jax.wheel.phases import PAPER_PHASES, AbstractPhase, PhaseInstant, make_paper_phases
 
 
-def _reconstruct_forces(
+def _compute_forces(wheel: Any, phase: AbstractPhase, q: Array, v: Array) -> Array:
+    """Return the normal force on the fore foot and, in double support, also the total force."""
+    instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)))
+    fore_force = jnp.asarray(instant.fore_force.normal)
+    if instant.rear_force is None:
+        return fore_force[None]
+    return jnp.stack([fore_force, fore_force + instant.rear_force.normal])
+
+
+def _reconstruct_phases(
     system: CollocationSystem,
     parameters: Array,
     solution: CollocationSolution,
     has_polynomials: bool = False,
+    compute_quantities: Callable[..., Array] = _compute_forces,
 ) -> tuple[list[list[PhaseMotion]], list[Scalar]]:
-    """Return the motion and forces of each phase in each gait step, and each landing's impulse."""
+    """Return the motion of each phase in each gait step, and each landing's impulse.
+
+    - `compute_quantities`: function of wheel, phase, coordinates and rates whose extrema are
+      located.
+    """
     sequence, constants = system.phase_sequence, system.phase_constants_function(*parameters)
     section_state, motions_by_step, impulses = tuple(solution.section_state), [], []
     for step_index in range(system.period_n):
         step_constants = sequence.select_constants(constants, (step_index % 2,))
-        symbols = system.make_wheel(parameters, step_index).symbols()
+        wheel = system.make_wheel(parameters, step_index)
+        symbols = wheel.symbols()
         start = sequence.step_start_map(step_constants, section_state)
         paper_phases = make_paper_phases(symbols, start.held_constants[0], stop_at_lift_off=False)
         motions = []
@@ -62,7 +78,7 @@ def _reconstruct_forces(
                 solution.durations[step_index, i],
                 solution.accelerations[i][step_index],
                 functools.partial(_compute_acceleration, paper_phases[i]),
-                functools.partial(_compute_forces, paper_phases[i]),
+                functools.partial(compute_quantities, wheel, paper_phases[i]),
                 has_polynomials,
             )
             motions.append(motion)
@@ -77,15 +93,6 @@ def _reconstruct_forces(
 def _compute_acceleration(phase: AbstractPhase, q: Array, v: Array) -> Array:
     motion = phase.compute_motion(tuple(q), tuple(v))
     return jnp.stack(phase.solve_acceleration(motion)[: phase.n_dof])
-
-
-def _compute_forces(phase: AbstractPhase, q: Array, v: Array) -> Array:
-    """Return the normal force on the fore foot and, in double support, also the total force."""
-    instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)))
-    fore_force = jnp.asarray(instant.fore_force.normal)
-    if instant.rear_force is None:
-        return fore_force[None]
-    return jnp.stack([fore_force, fore_force + instant.rear_force.normal])
 
 
 ForceExtrema = list[list[LocatedExtrema]]
@@ -113,7 +120,7 @@ def _locate_force_peaks(
     system: CollocationSystem, parameters: Array, solution: CollocationSolution
 ) -> tuple[dict[str, Scalar], ForceExtrema]:
     """Return the measures of the forces, and the extrema."""
-    motions, impulses = _reconstruct_forces(system, parameters, solution, True)
+    motions, impulses = _reconstruct_phases(system, parameters, solution, True)
     located = [[locate_extrema(motion) for motion in step_motions] for step_motions in motions]
     extrema = [[x for x, _ in step] for step in located]
     values = [[x for _, x in step] for step in located]
@@ -130,12 +137,48 @@ def _compute_peak_derivatives(
     (state, extrema), (state_tangents, _) = gait_and_tangents
 
     def evaluate(parameters: Array, solution: CollocationSolution) -> dict[str, Scalar]:
-        motions, impulses = _reconstruct_forces(system, parameters, solution)
+        motions, impulses = _reconstruct_phases(system, parameters, solution)
         values = [list(map(evaluate_extrema, *step)) for step in zip(motions, extrema, strict=True)]
         return _summarize_steps(extrema, values, solution.durations, impulses)
 
     directions = jnp.eye(len(parameters), dtype=parameters.dtype), state_tangents.solution
     return lax.map(lambda x: jax.jvp(evaluate, (parameters, state.solution), x)[1], directions)
+
+
+def measure_extremum(
+    system: CollocationSystem, parameters: Array, solution: CollocationSolution, measure: Measure
+) -> Array:
+    """Return the extremum of a measure of the user over its phases, as the mean over the steps."""
+
+    def compute_quantity(wheel: Any, phase: AbstractPhase, q: Array, v: Array) -> Array:
+        if phase.phase_name not in measure.phases:
+            return jnp.zeros(1, q.dtype)
+        instant = PhaseInstant(phase, phase.compute_motion(tuple(q), tuple(v)))
+        return jnp.asarray(measure(instant, wheel))[None]
+
+    reconstruct = functools.partial(_reconstruct_phases, system)
+    motions_by_step, _ = reconstruct(parameters, solution, False, compute_quantity)
+    # Only values at the extrema need derivatives.
+    fixed = lax.stop_gradient((parameters, solution))
+    fixed_motions_by_step, _ = reconstruct(*fixed, True, compute_quantity)
+    sign, of_steps = (1.0 if measure.reduction == "max" else -1.0), []
+    for motions, fixed_motions, durations in zip(
+        motions_by_step, fixed_motions_by_step, solution.durations, strict=True
+    ):
+        candidates = []
+        for motion, fixed_motion, phase, duration in zip(
+            motions, fixed_motions, PAPER_PHASES, durations, strict=True
+        ):
+            if phase.phase_name in measure.phases:
+                extrema, _ = locate_extrema(fixed_motion)
+                values = evaluate_extrema(motion, extrema)
+                is_extremum = extrema.is_maximum if sign > 0.0 else extrema.is_minimum
+                is_candidate = jnp.append(is_extremum[0], jnp.ones(2, bool)) & (duration > 0.0)
+                values_and_ends = sign * jnp.append(values.values[0], values.ends[0])
+                candidates.append(jnp.where(is_candidate, values_and_ends, -jnp.inf))
+        largest = jnp.max(jnp.concatenate(candidates))
+        of_steps.append(jnp.where(jnp.isfinite(largest), sign * largest, 0.0))
+    return jnp.mean(jnp.stack(of_steps))
 
 
 def _compile_for_gaits(function: Callable, system: CollocationSystem) -> BatchFunction:

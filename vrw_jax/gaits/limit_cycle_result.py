@@ -28,7 +28,7 @@ from vrw_jax.gaits.collocation_search import (
 )
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import attach_monodromy_derivatives, solve_cycle_with_derivatives
-from vrw_jax.gaits.force_peaks import measure_force_peaks
+from vrw_jax.gaits.force_peaks import measure_extremum, measure_force_peaks
 from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
@@ -249,7 +249,7 @@ def evaluate_own_measure(
     integrates the motion: both have order 8.
     """
     params = system.make_wheel(parameters)
-    if not measure.phase:
+    if not measure.phases:
         if system.period_n > 1:
             raise ValueError(
                 f"{measure.name} is a function of a step, but the cycle has {system.period_n}: "
@@ -257,23 +257,28 @@ def evaluate_own_measure(
             )
         return jnp.asarray(measure(step(params, section_state, model=model), params))
     phase_names = [phase.phase_name for phase in PAPER_PHASES]
-    require_known_name(measure.phase, phase_names, "phase")
-    index = phase_names.index(measure.phase)
-    mesh = system.phase_meshes[index]
-    weights = jnp.ravel(mesh.interval_length_fractions[:, None] * END_WEIGHTS)
-    values = []
+    for name in measure.phases:
+        require_known_name(name, phase_names, "phase")
+    if measure.reduction in ("min", "max"):
+        return measure_extremum(system, parameters, solution, measure)
+    indices, values = [phase_names.index(name) for name in measure.phases], []
     for k, points in enumerate(system.evaluate_phase_points(parameters, solution)):
         params = system.make_wheel(parameters, k)
-        phase = make_paper_phases(
+        phases = make_paper_phases(
             params.symbols(), points[0].phase_start_point.held_constants[0], stop_at_lift_off=False
-        )[index]
-        evaluate = lambda q, v, phase=phase, params=params: jnp.asarray(
-            measure(PhaseInstant(phase, phase.compute_motion(q, v)), params)
         )
-        nodes = points[index].node_points
-        mean = weights @ jax.vmap(evaluate)(nodes.q, nodes.v)
-        duration = solution.durations[k, index]
-        values.append(mean if measure.reduction == "mean" else duration * mean)
+        integral = jnp.zeros((), parameters.dtype)
+        for index in indices:
+            mesh, nodes = system.phase_meshes[index], points[index].node_points
+            weights = jnp.ravel(mesh.interval_length_fractions[:, None] * END_WEIGHTS)
+            evaluate = lambda q, v, phase=phases[index], params=params: jnp.asarray(
+                measure(PhaseInstant(phase, phase.compute_motion(q, v)), params)
+            )
+            mean = weights @ jax.vmap(evaluate)(nodes.q, nodes.v)
+            integral = integral + solution.durations[k, index] * mean
+        duration = sum(solution.durations[k, index] for index in indices)
+        is_mean = measure.reduction == "mean"
+        values.append(integral / jnp.where(duration > 0.0, duration, 1.0) if is_mean else integral)
     return sum(values[1:], start=values[0]) / len(values)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_reals, has_traced_leaf, require_known_name
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
@@ -41,7 +42,11 @@ from vrw_jax.base.walker import (
     name_missing_parameters,
 )
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
-from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point_implicit
+from vrw_jax.gaits.fixed_points import (
+    MAX_NEWTON_ITERATIONS,
+    FixedPointResult,
+    solve_fixed_point_implicit,
+)
 from vrw_jax.gaits.gait_walks import walk_until_periodic
 from vrw_jax.gaits.slope_response import SlopeResponse
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
@@ -62,7 +67,7 @@ class HybridGait(NamedTuple):
     - `last_step`: the last step of the gait, for a `HybridSystem` a `HybridStep`;
     - `fixed_point`: the fixed point, with the Jacobian and the status of Newton's method;
     - `outcome`: STEPPED if a gait was found, or the `Outcome` that states why not. All numbers of
-      the gait are then zero;
+      the gait are then zero, except for the codes of `last_step`, the first step that failed;
     - `values`: the walker's measures by name, as means over the steps of the gait.
 
     Examples:
@@ -133,13 +138,25 @@ class HybridGait(NamedTuple):
     @property
     def why(self) -> Any:
         """Return a sentence on how the search ended; for a batch, an array of sentences."""
-        describe = lambda code, newton: (
-            newton
-            if code in (Outcome.STEPPED, Outcome.NO_CYCLE_FOUND)
-            else f"A step of the search failed: {Outcome(int(code)).name}. "
-            f"{Outcome(int(code)).meaning}"
+
+        def describe(code: int, newton: str, n_iterations: int, step_code: int, end: str) -> str:
+            if code == Outcome.STEPPED:
+                return newton
+            if code != Outcome.NO_CYCLE_FOUND:
+                outcome = Outcome(int(code))
+                reason = end if end and code == step_code else outcome.meaning
+                return f"A step of the search failed: {outcome.name}. {reason}"
+            is_interrupted = n_iterations < MAX_NEWTON_ITERATIONS
+            return newton + " One of its steps failed." * is_interrupted
+
+        return format_each_batch_element(
+            describe,
+            self.outcome,
+            self.fixed_point.ending,
+            self.fixed_point.n_iterations,
+            self.last_step.outcome,
+            getattr(self.last_step, "ending", ""),
         )
-        return format_each_batch_element(describe, self.outcome, self.fixed_point.ending)
 
     def __repr__(self) -> str:
         if isinstance(self.period, jax.core.Tracer):
@@ -322,17 +339,26 @@ def _search_from_guess(
     for parameter in list_tree_parameters(params):
         is_valid &= jnp.all(parameter.domain.contains_parameter_value(parameter.value))
     outcome = jnp.where(is_valid, Outcome.STEPPED, Outcome.BAD_INPUT)
+    last_step: Any = None
     for _ in range(period_n):
         step = compile_step(walker)(params, x, options)
         values.append(walker.measure_step(params, x, step, options))
+        # The last step of a gait, or the first one that has failed.
+        is_walking = outcome == Outcome.STEPPED
+        last_step = select_trees_by_condition(is_walking, step, last_step) if last_step else step
         outcome = jnp.where(outcome == Outcome.STEPPED, step.outcome, outcome)
         x, period = step.section_state, period + step.duration
     has_failed = (outcome == Outcome.STEPPED) & ~fixed_point.converged
     outcome = jnp.where(has_failed, Outcome.NO_CYCLE_FOUND, outcome)
     means = {name: sum(value[name] for value in values) / period_n for name in values[0]}
-    x, period, step, means = jax.tree.map(
-        lambda value: jnp.where(outcome == Outcome.STEPPED, value, jnp.zeros_like(value)),
-        (fixed_point.x, period, step, means),
+    # Codes remain, which describe the failure.
+    x, period, last_step, means = jax.tree.map(
+        lambda value: (
+            value
+            if jnp.issubdtype(jnp.result_type(value), jnp.integer)
+            else jnp.where(outcome == Outcome.STEPPED, value, jnp.zeros_like(value))
+        ),
+        (fixed_point.x, period, last_step, means),
     )
     make_finite = lambda value: jnp.where(jnp.isfinite(value), value, 0.0)
     fixed_point = fixed_point._replace(
@@ -340,7 +366,7 @@ def _search_from_guess(
         jacobian=make_finite(fixed_point.jacobian),
         residual=make_finite(fixed_point.residual),
     )
-    return HybridGait(x, period, step, fixed_point, outcome.astype(jnp.int32), means)
+    return HybridGait(x, period, last_step, fixed_point, outcome.astype(jnp.int32), means)
 
 
 class ParameterizedWalker(eqx.Module):

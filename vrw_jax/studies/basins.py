@@ -276,7 +276,14 @@ def _make_orbit_variables(
         )
         for margin_name in margin_names:
             orbit_measures[margin_name][i] = step_measures[margin_name].min()
+    component_names = (
+        PRE_TOUCHDOWN_COMPONENT_NAMES
+        if has_wheel_measures
+        else tuple(name_coordinates(model, n_coordinates))
+    )
+    has_names = len(component_names) == n_entries
     return {
+        **({"component": xr.Variable("component", list(component_names))} if has_names else {}),
         "orbit_state": xr.Variable(
             ("attractor_index", "orbit_step", "component"),
             padded_orbit_states,
