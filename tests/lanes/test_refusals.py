@@ -43,6 +43,15 @@ def test_operations_across_lanes_are_refused(function, sentence):
         call_program(function, X)
 
 
+def test_xla_computes_functions_whose_arrays_exceed_the_stack():
+    halve = lambda x: lax.scan(lambda c, _: (0.5 * c, c), x, None, length=1_000_000)[1]
+    function = lanes.jit(halve)
+    with pytest.warns(UserWarning, match="do not fit on the stack: return fewer numbers"):
+        batch = function.batch(np.array([1.0, 2.0]))
+    np.testing.assert_array_equal(batch[:, 3], [0.125, 0.25])
+    np.testing.assert_array_equal(function(1.0)[:4], [1.0, 0.5, 0.25, 0.125])
+
+
 @pytest.mark.parametrize(
     ("function", "sentence"),
     [

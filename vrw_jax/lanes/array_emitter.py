@@ -73,6 +73,11 @@ class ArrayEmitter:
     """Whether the code is in an innermost loop, where constants need no table."""
     objects_kept_alive: list[Any] = field(default_factory=list)
     """Objects that are identified by `id`."""
+    n_stack_bytes: int = 0
+    MAX_STACK_BYTES: ClassVar[int] = 6 * 2**20
+    """Largest memory of one LLVM function. Threads usually have 8 MB of stack, and a function that
+    needs more ends the process.
+    """
     MAX_REGISTER_ENTRIES: ClassVar[int] = 32
     """Largest number of entries of an array that a loop carries in registers.
 
@@ -264,8 +269,17 @@ class ArrayEmitter:
     ) -> MemoryArray:
         """Return a new uninitialized array of shape `array_shape` in memory.
 
-        The memory is allocated once, at the start of the LLVM function.
+        The memory is allocated once, at the start of the LLVM function, on the stack.
         """
+        largest_number_bytes = 8
+        self.n_stack_bytes += (
+            largest_number_bytes * math.prod(array_shape) * getattr(entry_type, "count", 1)
+        )
+        if self.n_stack_bytes > self.MAX_STACK_BYTES:
+            raise NotImplementedError(
+                f"its arrays need {self.n_stack_bytes / 2**20:.0f} MB, which do not fit on the "
+                "stack: return fewer numbers, or repeat a shorter loop."
+            )
         with self.llvm_builder.goto_entry_block():
             base_pointer = self.llvm_builder.alloca(
                 entry_type, ir.Constant(I64, max(1, math.prod(array_shape)))
