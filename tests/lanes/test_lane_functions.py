@@ -242,6 +242,13 @@ def test_arrays_in_any_memory_order_are_read_alike(n):
         np.testing.assert_array_equal(compiled.run(ordered), expected)
 
 
+def test_results_without_entries_are_returned_beside_others():
+    function = lanes.jit(lambda x: (x[:0], 2.0 * x))
+    for empty, double in (function(np.ones(3)), function.batch(np.ones((5, 3)))):
+        assert empty.shape == (*double.shape[:-1], 0)
+        assert (double == 2.0).all()
+
+
 def test_batches_of_different_lengths_are_refused_in_one_sentence():
     compiled = lanes.jit(lambda x, y: x + y)
     with pytest.raises(ValueError, match=r"lengths \[3, 4\]: give 0 or None for each argument"):

@@ -110,6 +110,9 @@ def write_llvm_kernel(
                     "it outside, or add zeros of the lanes."
                 )
 
+            if 0 in aval.shape:
+                return
+
             def store_entry(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
                 address, stored_type = emit_address(base, aval, entry_index)
                 value = value_emitter.to_lane_vector(
