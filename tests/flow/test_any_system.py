@@ -134,7 +134,8 @@ def test_an_event_time_dominated_by_round_off_is_reported(depth):
         wrong = float(abs(mpmath.mpf(float(result.times[0])) - compute_event(1)))
     np.testing.assert_allclose(result.time_roundoff[0], shifted, rtol=1e-3)
     assert (shifted > 1e-12) == (depth == 1e-8)
-    assert wrong < max(1e-12, 2.0 * float(result.time_roundoff[0]))
+    # The state errs by its own rounding, and by some of the solver steps on the way.
+    assert wrong < max(1e-12, 3.0 * float(result.time_roundoff[0]))
 
 
 def make_switching_system(rate):

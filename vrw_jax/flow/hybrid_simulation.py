@@ -18,6 +18,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from vrw_jax import lanes
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
 from vrw_jax.base.elementwise import make_opaque_loop_condition, select_entry_by_mask
 from vrw_jax.base.forward_only import forbid_reverse_mode
@@ -31,6 +32,7 @@ from vrw_jax.flow.phase_integration import (
     StateArray,
     VectorField,
     integrate_phase,
+    is_machine_code_better,
 )
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
@@ -193,9 +195,22 @@ def simulate_hybrid(
                     "count from 0."
                 )
     options.check_tolerances(start.dtype)
-    mode_index = jnp.asarray(mode, jnp.int32)
-    solution = call_compiled_program(simulate_modes, (modes, events), options, start, mode_index)
+    if is_machine_code_better(modes, options, events * start.size):
+        solution = _simulate_modes_compiled(lambda: (modes, events, mode), options, start)
+    else:
+        solution = call_compiled_program(
+            simulate_modes, (modes, events), options, start, jnp.asarray(mode, jnp.int32)
+        )
     return forbid_reverse_mode("simulate_hybrid", solution)
+
+
+@lanes.jit
+def _simulate_modes_compiled(
+    get_static_arguments: Callable, options: StepOptions, start: Array
+) -> HybridSolution:
+    """Return the simulation of modes that a function returns, with which the code is compiled."""
+    modes, events, mode = get_static_arguments()
+    return simulate_modes((modes, events), options, start, jnp.asarray(mode, jnp.int32))
 
 
 def time_errors(

@@ -9,6 +9,7 @@ from the implicit function theorem, so they are accurate to the order of the sol
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -44,6 +45,8 @@ from vrw_jax.flow.tableaus import (
     take_rk_step,
 )
 from vrw_jax.flow.tangents import BatchPhase
+from vrw_jax.lanes.batching import is_inside_jit
+from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 
 StateArray = Float[Array, " dim"]
 VectorField = Callable[[StateArray], StateArray]
@@ -256,6 +259,35 @@ which is more than a hundred times the round-off.
 """
 
 
+MAX_MACHINE_CODE_NUMBERS = 2_000
+"""Largest number of recorded numbers of a simulation by machine code, which has them on the stack.
+
+The value is chosen because the records and their copies for 16 lanes then need about 2 MB.
+"""
+
+
+def has_explicit_steps(options: StepOptions) -> bool:
+    """Return whether this package takes the solver steps; diffrax takes those of all others."""
+    return options.engine != "diffrax" and load_explicit_tableau(options.solver) is not None
+
+
+def is_machine_code_better(system: Any, options: StepOptions, n_recorded_numbers: int) -> bool:
+    """Return whether to simulate by machine code, which compiles faster than XLA's programs.
+
+    Inside `jax.jit`, a simulation becomes part of the caller's program. Functions of `system` whose
+    closures contain traced values have no key, and only XLA can differentiate with respect to them.
+    """
+    if (
+        is_inside_jit()
+        or not has_explicit_steps(options)
+        or n_recorded_numbers > MAX_MACHINE_CODE_NUMBERS
+    ):
+        return False
+    with contextlib.suppress(UnresolvableFunctionError):
+        return bool(make_key(system))
+    return False
+
+
 def _make_phase(
     field: VectorField, options: StepOptions, state_units: StateArray | None
 ) -> tuple[BatchPhase, ButcherTableau]:
@@ -267,7 +299,7 @@ def _make_phase(
     evaluate_field = lanes.mark_noinline(field)
     evaluate_rates = lambda _, v: StageAccelerations((), (), (evaluate_field(v[0]),))
     tableau: Any = load_explicit_tableau(options.solver)
-    if tableau is not None and options.engine != "diffrax":
+    if has_explicit_steps(options):
 
         def take_step(state: StageState, h: Scalar) -> tuple[list[StageState], Array]:
             stage_states = take_rk_step(tableau, evaluate_rates, state, h)

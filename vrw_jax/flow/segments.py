@@ -6,8 +6,8 @@ orthogonal iteration around the period makes every factor triangular (a periodic
 multiplier is then a product of diagonal entries, all of which are accurate.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,11 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from vrw_jax import lanes
 from vrw_jax.base.forward_only import forbid_reverse_mode
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.phase_integration import VectorField, sample_phase
+from vrw_jax.flow.phase_integration import VectorField, is_machine_code_better, sample_phase
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
@@ -72,10 +73,20 @@ def segment_maps(
         )
     static_arguments = (field, n_segments, n_tangents)
     duration = jnp.asarray(duration, start.dtype)
-    flow_segments = call_compiled_program(
-        _integrate_flow_segments, static_arguments, start, duration, options
-    )
+    if is_machine_code_better(field, options, n_segments * start.size * n_tangents):
+        flow_segments = _integrate_segments_compiled(
+            lambda: static_arguments, start, duration, options
+        )
+    else:
+        flow_segments = call_compiled_program(
+            _integrate_flow_segments, static_arguments, start, duration, options
+        )
     return forbid_reverse_mode("segment_maps", flow_segments)
+
+
+@lanes.jit
+def _integrate_segments_compiled(get_static_arguments: Callable, *arguments: Any) -> FlowSegments:
+    return _integrate_flow_segments(get_static_arguments(), *arguments)
 
 
 def _integrate_flow_segments(
