@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax import lanes
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 
 TIGHT_OPTIONS = vrw.StepOptions.tight()
@@ -23,9 +24,8 @@ def find_phase_end(
     """Integrate with guards given as functions of the state."""
     values = lambda y: jnp.stack([g(y) for g in (*guards, *monitors)])
     watched = GuardsAndMargins(values, len(guards), count_start)
-    return jax.jit(
-        lambda start: integrate_phase(field, watched, start, jnp.asarray(True), options)
-    )(jnp.asarray(start))
+    integrate = lambda start: integrate_phase(field, watched, start, jnp.asarray(True), options)
+    return lanes.jit(integrate)(jnp.asarray(start))
 
 
 def test_the_earliest_guard_wins_whatever_its_place_in_the_list():
@@ -123,6 +123,7 @@ def test_a_tiny_phase_is_integrated_and_not_skipped():
 
 def test_event_time_and_state_have_accurate_first_and_second_derivatives():
     # Fall from height z0 with rate v0: z = z0 + v0 t - t^2 / 2, landing at v0 + sqrt(v0^2 + 2 z0).
+    @lanes.jit
     def land(z):
         field = lambda y: jnp.stack([y[1], -jnp.ones_like(y[1])])
         watched = GuardsAndMargins(lambda y: y[:1], 1)
