@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
+from vrw_jax import lanes
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 from vrw_jax.models.contact_impacts import ContactLaw, classify_event, resolve_event
 from vrw_jax.models.contact_mechanics import (
@@ -283,9 +284,8 @@ def test_a_wheel_on_two_stiff_legs_slides_like_a_block():
         False,
         make_contact_state((ContactMode.SLIP_DOWN, ContactMode.SLIP_DOWN), [True] * 8),
     )
-    solution = compute_forces(
-        flow, make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))
-    ).force_solution
+    motion = make_resting_motion(-math.pi / 8, vx=jnp.asarray(0.1))
+    solution = jax.jit(partial(compute_forces, flow))(motion).force_solution
     g, slope = 9.81, 0.30
     downhill_acceleration = g * (math.sin(slope) - friction * math.cos(slope))
     np.testing.assert_allclose(
@@ -303,7 +303,7 @@ def test_a_wheel_in_the_air_falls_freely():
         make_contact_state((ContactMode.OFF, ContactMode.OFF), [True] * 8),
     )
     motion = make_resting_motion(-0.3, z=jnp.asarray(2.0), dtheta=jnp.asarray(3.0))
-    contact_forces = compute_forces(flow, motion)
+    contact_forces = jax.jit(partial(compute_forces, flow))(motion)
     expected = [9.81 * math.sin(0.3), -9.81 * math.cos(0.3), 0.0]
     np.testing.assert_allclose(
         jnp.stack(contact_forces.force_solution.hub_motion), expected, atol=1e-12
@@ -318,7 +318,7 @@ def test_a_vertical_leg_lands_with_its_own_mass_alone():
     in_the_air = make_contact_state((ContactMode.OFF, ContactMode.OFF), [True] * 8)
     event = classify_event(make_guard_layout(8, False), jnp.int32(0))
     law = make_contact_law(s, 0.7)
-    change = jax.jit(lambda motion: resolve_event(law, motion, in_the_air, event))(motion)
+    change = lanes.jit(lambda motion: resolve_event(law, motion, in_the_air, event))(motion)
     # The leg's 1 kg stops, the other 17 kg go on; the spring then begins to work.
     assert abs(float(change.normal_impulse[0]) - 1.0 * speed) < 1e-12
     assert abs(float(change.impact_energy_loss) - 0.5 * speed**2) < 1e-12
@@ -329,8 +329,10 @@ def test_a_vertical_leg_lands_with_its_own_mass_alone():
 
 def test_a_single_leg_bounces_as_a_damped_oscillator():
     """Upright on flat ground: 17 kg on one spring and damper, until the foot no longer pushes."""
-    stiff = {"stiffness": 2000.0, "damping": 60.0, "natural_length": 1.005}
-    s, speed = vrw.WheelParams(slope=0.0, **stiff).symbols(), 3.0
+    make_symbols = lambda: vrw.WheelParams(
+        slope=0.0, stiffness=2000.0, damping=60.0, natural_length=1.005
+    ).symbols()
+    s, speed = make_symbols(), 3.0
     mass, omega = s.Mt - s.m, jnp.sqrt(s.k / (s.Mt - s.m) - (0.5 * s.c / (s.Mt - s.m)) ** 2)
     decay, rest = 0.5 * s.c / mass, s.Ls - mass * s.g / s.k
     a, b = s.L0 - rest, (-speed + decay * (s.L0 - rest)) / omega
@@ -348,26 +350,25 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
     motion = make_resting_motion(0.0, vz=jnp.asarray(-speed))._replace(
         dL=jnp.zeros(8).at[0].set(-speed)
     )
-    flow = make_contact_mode_dynamics(
-        s,
-        jnp.asarray(0.7),
-        False,
-        make_contact_state((ContactMode.STICK, ContactMode.OFF), [False] + [True] * 7),
-    )
     lift = make_guard_layout(8, False).first_liftoff_guard
 
-    def evaluate_lift(y):
-        motion, _ = unpack_state(y)
-        contact_quantities = compute_contact_quantities(flow, motion)
-        return evaluate_guards(flow, motion, contact_quantities)[lift : lift + 1]
+    @lanes.jit
+    def integrate_until_lift(start):
+        contact_state = make_contact_state(
+            (ContactMode.STICK, ContactMode.OFF), [False] + [True] * 7
+        )
+        flow = make_contact_mode_dynamics(make_symbols(), jnp.asarray(0.7), False, contact_state)
 
-    watched = GuardsAndMargins(evaluate_lift, 1)
-    start = pack_state(motion, EnergyLossAccumulators(zero, zero, zero, zero))
-    # XLA compiles each stage of a method: half as many as with the tight options.
-    options = vrw.StepOptions(solver="Tsit5", rtol=1e-12, atol=1e-12)
-    end = integrate_phase(
-        partial(evaluate_vector_field, flow), watched, start, jnp.asarray(True), options
-    )
+        def evaluate_lift(y):
+            motion, _ = unpack_state(y)
+            contact_quantities = compute_contact_quantities(flow, motion)
+            return evaluate_guards(flow, motion, contact_quantities)[lift : lift + 1]
+
+        field, watched = partial(evaluate_vector_field, flow), GuardsAndMargins(evaluate_lift, 1)
+        options = vrw.StepOptions(solver="Tsit5", rtol=1e-12, atol=1e-12)
+        return integrate_phase(field, watched, start, jnp.asarray(True), options)
+
+    end = integrate_until_lift(pack_state(motion, EnergyLossAccumulators(zero, zero, zero, zero)))
     landed, tally = unpack_state(end.state)
     assert abs(float(end.duration) - time) < 1e-8
     assert abs(float(landed.L[0]) - length(time)) < 1e-9
@@ -384,7 +385,8 @@ def test_a_foot_that_lands_sliding_takes_coulombs_impulse(friction):
     motion = make_resting_motion(0.0, vz=jnp.asarray(-1.0), vx=jnp.asarray(5.0))
     in_the_air = make_contact_state((ContactMode.OFF, ContactMode.OFF), [True] * 8)
     event = classify_event(make_guard_layout(8, False), jnp.int32(0))
-    change = resolve_event(make_contact_law(s, friction), motion, in_the_air, event)
+    resolve = lambda f: resolve_event(make_contact_law(s, f), motion, in_the_air, event)
+    change = lanes.jit(resolve)(friction)
     normal, tangential = float(change.normal_impulse[0]), float(change.tangential_impulse[0])
     assert int(change.contact_state.contact_modes[0]) == ContactMode.SLIP_DOWN
     assert abs(tangential + friction * normal) < 1e-12
