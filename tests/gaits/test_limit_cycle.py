@@ -572,10 +572,10 @@ def test_section_newton_differentiates_fixed_point_and_multiplier():
     a = 0.7
     root = math.sqrt(1.0 + 4.0 * a)
     expected = np.array([(root - 1.0) / 2.0, 1.0 / root, -2.0 / root**3, 12.0 / root**5])
-    first, second = jax.jacfwd(evaluate), jax.jacfwd(jax.jacrev(evaluate))
+    first, second = jax.jacfwd(evaluate), jax.jit(jax.jacfwd(jax.jacrev(evaluate)))
     for function, value in zip((evaluate, first), expected, strict=False):
         np.testing.assert_allclose(function(a), [value, -2.0 * value], rtol=1e-13)
-    further = [second(a)[0], jax.jacfwd(second)(a)[0]]  # of the point alone
+    further = [second(a)[0], jax.jit(jax.jacfwd(second))(a)[0]]  # of the point alone
     np.testing.assert_allclose(further, expected[2:], rtol=1e-12)
     np.testing.assert_allclose(
         jax.jit(jax.grad(lambda a: evaluate(a)[0]))(a), expected[1], rtol=1e-13

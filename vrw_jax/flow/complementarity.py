@@ -73,6 +73,13 @@ def enumerate_lcp_solutions(
         raise ValueError(
             "matrix or free_gap contains a number that is not finite: give finite numbers."
         )
+    return _enumerate_solutions(matrix, free_gap, tolerance)
+
+
+@jax.jit
+def _enumerate_solutions(matrix: Array, free_gap: Array, tolerance: ArrayLike) -> LCPSolutions:
+    """Return the result of `enumerate_lcp_solutions` by one program, which compiles at once."""
+    n_contacts = free_gap.size
     # Round-off of sums of n terms changes signs as well.
     zero_tolerance = jnp.maximum(tolerance, n_contacts * jnp.finfo(free_gap.dtype).eps)
     # Combinations with more closed contacts come first.
