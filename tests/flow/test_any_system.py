@@ -13,6 +13,7 @@ import pytest
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
+from vrw_jax import lanes
 from vrw_jax.continuation import solve_fixed_point
 from vrw_jax.hybrid import (
     Guard,
@@ -79,6 +80,16 @@ def test_derivatives_of_event_times_agree_with_the_closed_form():
     ).times[2]
     reference = lambda height: jnp.sqrt(2.0 * height / G) * (1.0 + 2.0 * (0.8 + 0.64))
     np.testing.assert_allclose(jax.jacfwd(third)(1.3), jax.grad(reference)(1.3), rtol=1e-12)
+
+
+def test_a_simulation_inside_machine_code_has_derivatives_in_reverse_mode(recwarn):
+    @lanes.jit
+    def fall(height):
+        start = jnp.stack([height, 0.0 * height])
+        return simulate_hybrid([make_ball_mode()], start, events=1, options=TIGHT_OPTIONS).times[0]
+
+    np.testing.assert_allclose(jax.grad(fall)(1.3), 0.5 * np.sqrt(2.0 / (1.3 * G)), rtol=1e-12)
+    assert not recwarn.list
 
 
 def test_modes_follow_the_target_modes_of_their_guards():
@@ -250,6 +261,7 @@ def make_impact_oscillator(depth):
 def test_the_product_of_multipliers_is_accurate_at_a_grazing_event(depth):
     modes, start, restitution = make_impact_oscillator(depth)
 
+    @lanes.jit
     def back(x):
         return simulate_hybrid(
             modes, jnp.stack([1.0 + 0.0 * x[0], *x]), events=1, options=TIGHT_OPTIONS

@@ -8,6 +8,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import PyTree
 
+from vrw_jax.lanes.code_cache import targets_machine_code
+
 _FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
 """Identity operation whose transpose raises an error."""
 
@@ -32,8 +34,11 @@ def forbid_reverse_mode(function_name: str, function_result: PyTree) -> PyTree:
     """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
     error.
 
-    `function_name` is the function in `flow` that computed the result.
+    `function_name` is the function in `flow` that computed the result. Inside `lanes.jit` there is
+    no mark, because reverse mode transposes the derivatives that machine code computes.
     """
+    if targets_machine_code():
+        return function_result
 
     def mark_leaf_as_forward_only(leaf: Any) -> Any:
         if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
