@@ -160,19 +160,6 @@ class AbstractContinuation(abc.ABC):
         """Return the test function of a quantity, whose name may end with the label of a leg."""
         return self.test_functions.get(name.partition("[")[0])
 
-    def evaluate_margin(self, name: str, quantities: QuantitiesByName) -> np.ndarray:
-        """Return a margin at each point, combined with its substitute if there is one.
-
-        The combined quantity is positive if and only if both are positive. It crosses zero
-        continuously, because the substitute vanishes linearly where the margin vanishes. If the
-        substitute is negative, the combined quantity equals the substitute.
-        """
-        margin = quantities[name]
-        substitute = quantities.get(self.linear_margin_substitutes.get(name, ""))
-        if substitute is None:
-            return margin
-        return np.where(substitute < 0.0, substitute, np.minimum(substitute, margin))
-
     def mask_undefined_quantities(
         self, quantities: QuantitiesByName, owners: np.ndarray
     ) -> QuantitiesByName:
@@ -219,12 +206,18 @@ class AbstractContinuation(abc.ABC):
         quantities |= evaluate_bifurcations(points.return_map_jacobian)
         quantities = self.mask_undefined_quantities(quantities, owners)
         tests = {
-            name: self.evaluate_margin(name, quantities)
+            name: values
             for name, values in quantities.items()
             if values.ndim == 1
             and self.find_test_function(name)
             and name not in self.linear_margin_substitutes.values()
         }
+        # The combined quantity is positive if and only if both are positive. It crosses zero
+        # continuously, because the substitute vanishes linearly where the margin vanishes.
+        for name in tests.keys() & self.linear_margin_substitutes.keys():
+            if (substitute := quantities.get(self.linear_margin_substitutes[name])) is not None:
+                least = np.minimum(substitute, tests[name])
+                tests[name] = np.where(substitute < 0.0, substitute, least)
         with np.errstate(divide="ignore", invalid="ignore"):
             tests[BRANCH_POINT] = tests[FOLD] / points.fraction_rate
         tests[MODULI] = np.abs(compute_multipliers(points.return_map_jacobian))
@@ -264,6 +257,7 @@ class AbstractContinuation(abc.ABC):
         effects of two impacts do not commute. The search for the gait beyond a jump starts from the
         last gait, with the smallest change of the parameter that leads to a similar gait.
         """
+        lower_bound, upper_bound = self.parameter_bounds
         may_continue = set(range(len(tracks)))
         for _ in range(MAX_JUMPS_PER_DIRECTION):
             stalled = [
@@ -277,37 +271,25 @@ class AbstractContinuation(abc.ABC):
                 rows = np.array([i for i in stalled if i not in may_continue], int)
                 if not len(rows):
                     break
-                for i, new_track in self._continue_after(owners, tracks, rows, change).items():
-                    tracks[i] = new_track._replace(points=[*tracks[i].points, *new_track.points])
+                ends = stack_points([tracks[i].points[-1] for i in rows])
+                p = ends.p + np.sign(ends.fraction_rate) * change * (upper_bound - lower_bound)
+                is_inside = (lower_bound < p) & (p < upper_bound)
+                rows, ends, p = select_tree_rows((rows, ends, p), is_inside)
+                signs = np.sign(ends.fraction_rate)
+                new_tracks = self.continue_branches(owners[rows], ends.z, p, signs)
+                is_found = np.array([len(track.points) > 1 for track in new_tracks], bool)
+                found = np.flatnonzero(is_found)
+                if not len(found):
+                    continue
+                starts = stack_points([new_tracks[k].points[0] for k in found])
+                before, after = (
+                    self.make_table(points, owners[rows[found]])
+                    for points in (select_tree_rows(ends, found), starts)
+                )
+                for k in found[self.is_same_gait(before, after)]:
+                    i, track = int(rows[k]), new_tracks[k]
+                    tracks[i] = track._replace(points=[*tracks[i].points, *track.points])
                     may_continue.add(i)
-
-    def _continue_after(
-        self, owners: np.ndarray, tracks: Sequence[Track], rows: np.ndarray, change: float
-    ) -> dict[int, Track]:
-        """Return the tracks of similar gaits that start a change of the parameter after the ends.
-
-        - `rows`: indices of tracks;
-        - `change`: fraction of the parameter's range.
-        """
-        lower_bound, upper_bound = self.parameter_bounds
-        ends = stack_points([tracks[i].points[-1] for i in rows])
-        signs = np.sign(ends.fraction_rate)
-        p = ends.p + signs * change * (upper_bound - lower_bound)
-        is_inside = (lower_bound < p) & (p < upper_bound)
-        rows, p, signs = rows[is_inside], p[is_inside], signs[is_inside]
-        new_tracks = self.continue_branches(owners[rows], ends.z[is_inside], p, signs)
-        found = [k for k, track in enumerate(new_tracks) if len(track.points) > 1]
-        if not found:
-            return {}
-        before, after = (
-            self.make_table(stack_points(points), owners[rows[found]])
-            for points in (
-                [tracks[rows[k]].points[-1] for k in found],
-                [new_tracks[k].points[0] for k in found],
-            )
-        )
-        is_same = self.is_same_gait(before, after)
-        return {int(rows[k]): new_tracks[k] for k, same in zip(found, is_same, strict=True) if same}
 
     def solve_on_chords(
         self,

@@ -162,7 +162,6 @@ class Track(NamedTuple):
 
     points: list[ContinuationPoint]
     status: ContinuationStatus
-    n_linearizations: int = 0
 
 
 class Correction(NamedTuple):
@@ -380,9 +379,8 @@ class ArclengthDriver:
         correction = yield from self.correct(
             z, fraction, (self.coordinates(z, fraction), along_parameter)
         )
-        n_linearizations = correction.n_iterations
         if not correction.has_converged:
-            return Track([], ContinuationStatus.START_NOT_FOUND, n_linearizations)
+            return Track([], ContinuationStatus.START_NOT_FOUND)
         points = [self.make_point(args, correction, direction_sign * along_parameter, fraction)]
         previous, ds, is_range_end, is_kink = points[0], options.initial_ds, False, False
         # A suspicious step may have reached another branch; shorter steps then avoid the jump. If
@@ -393,22 +391,18 @@ class ArclengthDriver:
                 previous, points[-1], ds
             )
             if is_point_new:
-                for has_ended, status in (
-                    (
-                        len(points) > 3 and self.is_closed_by(points),
-                        ContinuationStatus.CURVE_CLOSED,
-                    ),
-                    (not points[-1].is_admissible, ContinuationStatus.POINT_NOT_ADMISSIBLE),
-                    (is_range_end or length <= 1e-12, ContinuationStatus.RANGE_END_REACHED),
-                    (len(points) >= options.max_points, ContinuationStatus.MAX_POINTS_REACHED),
-                ):
-                    if has_ended:
-                        return Track(points, status, n_linearizations)
+                has_ended = {
+                    ContinuationStatus.CURVE_CLOSED: len(points) > 3 and self.is_closed_by(points),
+                    ContinuationStatus.POINT_NOT_ADMISSIBLE: not points[-1].is_admissible,
+                    ContinuationStatus.RANGE_END_REACHED: is_range_end or length <= 1e-12,
+                    ContinuationStatus.MAX_POINTS_REACHED: len(points) >= options.max_points,
+                }
+                for status in filter(has_ended.get, has_ended):
+                    return Track(points, status)
             if ds < options.min_ds:
-                return Track(points, ContinuationStatus.STEP_SIZE_UNDERFLOW, n_linearizations)
+                return Track(points, ContinuationStatus.STEP_SIZE_UNDERFLOW)
             is_range_end = is_next_range_end
             correction = yield from self.correct(trial_z, trial_fraction, plane, ds)
-            n_linearizations += correction.n_iterations
             current = points[-1]
             tangent = self.coordinates(current.arclength_tangent, current.fraction_rate)
             new_tangent = self.coordinates(correction.fraction_tangent, 1.0)

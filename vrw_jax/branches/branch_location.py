@@ -5,7 +5,6 @@ part of each branch are located next. Finally, all sign changes and changes of s
 between neighboring admissible points are located.
 """
 
-import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -25,7 +24,6 @@ from vrw_jax.branches.abstract_continuation import (
 )
 from vrw_jax.branches.arclength import ContinuationPoint, ContinuationStatus
 from vrw_jax.branches.branch import SpecialPoint
-from vrw_jax.branches.roots import locate_function_roots
 from vrw_jax.branches.test_functions import (
     BIFURCATIONS,
     BRANCH_POINT,
@@ -82,6 +80,57 @@ class Root(NamedTuple):
         (beside,) = np.abs(self.evaluate(self.beside.tests))
         at_ends = np.max(np.abs(self.evaluate(tests)[list(self.pair)]))
         return not beside > MAX_VALUE_BESIDE_ROOT * at_ends
+
+
+class RootLocations(NamedTuple):
+    """Locations of roots in [0, 1], and the ends of the brackets that enclose them.
+
+    Each array has the shape (brackets,).
+    """
+
+    best_locations: np.ndarray  # bracket end with the smaller absolute value
+    left_bracket_ends: np.ndarray  # bracket end with the sign of location 0
+    right_bracket_ends: np.ndarray  # bracket end with the sign of location 1
+
+
+def locate_function_roots(
+    function: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    bracket_end_values: tuple[np.ndarray, np.ndarray],
+    max_bracket_width: np.ndarray,
+) -> RootLocations:
+    """Locate the roots of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
+
+    `function` maps locations and the indices of their brackets to function values. Each round
+    evaluates it once for all brackets. `bracket_end_values` contains the function values at 0 and
+    at 1. The search ends when every bracket is narrower than `max_bracket_width` or has an exact
+    root. If the function is NaN at a location, that location is treated as having the sign of
+    location 1.
+    """
+    from scipy.optimize import elementwise  # its import takes longer than that of the library
+
+    end_values, widths_per_bracket = np.stack(bracket_end_values), 1.0 / max_bracket_width
+
+    def evaluate(locations: np.ndarray, indices: np.ndarray) -> np.ndarray:
+        # The unit of the locations is the width, and the values at both ends are known.
+        indices = indices.astype(int)
+        locations = locations / widths_per_bracket[indices]
+        values = np.array(end_values[(locations > 0.5).astype(int), indices])
+        inner = (locations > 0.0) & (locations < 1.0)
+        if inner.any():
+            values[inner] = function(locations[inner], indices[inner])
+        return np.where(np.isnan(values), end_values[1, indices], values)
+
+    result = elementwise.find_root(
+        evaluate,
+        (0.0 * widths_per_bracket, widths_per_bracket),
+        args=(np.arange(len(widths_per_bracket)),),
+        tolerances={"xatol": 1.0, "xrtol": 0.0, "fatol": 0.0, "frtol": 0.0},
+    )
+    left, right = np.stack(result.bracket) / widths_per_bracket
+    is_left_better = np.abs(result.f_bracket[0]) <= np.abs(result.f_bracket[1])
+    best = np.where(is_left_better, left, right)
+    is_exact = np.any(np.stack(result.f_bracket) == 0.0, 0)
+    return RootLocations(best, *np.where(is_exact, best, [left, right]))
 
 
 AdmissibleRange = tuple[int, np.ndarray, dict[int, tuple[int, int]]]
@@ -397,9 +446,13 @@ class _SpecialPointLocator(NamedTuple):
             for pair in regular_pairs
             if has_turned[pair] and np.prod(tests[FOLD][list(pair)]) > 0.0
         ]
+        # The sum is NaN where the quantity is.
+        compare = lambda name, value: (
+            lambda tests: np.where(tests[name] == value, 1.0, -1.0) + 0.0 * tests[name]
+        )
         # Between two values of a stepwise quantity there may be further values.
         requests += [
-            Root(pair, test.kind, functools.partial(_compare_with, name, value))
+            Root(pair, test.kind, compare(name, value))
             for name, test in located.items()
             if test.is_stepwise
             for pair in self.table.find_pairs(np.flatnonzero(np.isfinite(tests[name])))
@@ -485,12 +538,6 @@ class _SpecialPointLocator(NamedTuple):
             root.n_multipliers > 0 and any(map(root.is_between, replaced_pairs))
         )
         return [root for root in roots if not is_replaced(root)] + multiple
-
-
-def _compare_with(name: str, value: float, tests: QuantitiesByName) -> np.ndarray:
-    """Return 1 for each point at which a stepwise quantity has the given value, and else -1."""
-    values = tests[name]
-    return np.where(np.isnan(values), np.nan, np.where(values == value, 1.0, -1.0))
 
 
 class BranchData(NamedTuple):

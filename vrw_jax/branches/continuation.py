@@ -277,7 +277,7 @@ def split_legs(quantities: QuantitiesByName, n_legs: int) -> QuantitiesByName:
     for name, margin in MARGIN_MEASURES.items():
         if margin.leg_dimension and name in quantities:
             quantities |= {
-                f"{name}[{leg}]": quantities[name][:, leg - 3] for leg in range(3, n_legs + 1)
+                f"{name}[{leg}]": quantities[name][..., leg - 3] for leg in range(3, n_legs + 1)
             }
     return quantities
 

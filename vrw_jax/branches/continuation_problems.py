@@ -152,10 +152,10 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         """Return the index of the continued parameter."""
         return self.model.parameter_names.index(self.parameter_name)
 
-    def replace_parameter(self, wheels: BranchWheel, p: Any) -> np.ndarray:
-        """Return the parameters of wheels, in which the continued parameter has the value p."""
+    def replace_parameter(self, wheels: BranchWheel, p: Any, name: str = "") -> np.ndarray:
+        """Return the parameters of wheels, where the continued or a named one has the value p."""
         values = np.array(wheels.values)
-        values[..., self.parameter_index] = p
+        values[..., self.model.parameter_names.index(name or self.parameter_name)] = p
         return values
 
     def read_gaits(

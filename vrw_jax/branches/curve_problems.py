@@ -275,15 +275,9 @@ class GaitCurveProblem(AbstractCurveProblem):
     second_name: str
     quantity_names: tuple[str, ...]
 
-    @property
-    def second_index(self) -> int:
-        """Return the index of the second parameter."""
-        return self.gait_problem.model.parameter_names.index(self.second_name)
-
     def replace_second(self, wheels: BranchWheel, second: np.ndarray) -> BranchWheel:
         """Return the wheels with other values of the second parameter."""
-        values = np.array(wheels.values)
-        values[:, self.second_index] = second
+        values = self.gait_problem.replace_parameter(wheels, second, self.second_name)
         return wheels._replace(values=values)
 
     def linearize_in_two_parameters(
@@ -293,7 +287,7 @@ class GaitCurveProblem(AbstractCurveProblem):
         branch_wheels = self.replace_second(wheels.branch_wheel, p[:, 1])
         linearize_trials = make_trial_linearizer(
             gaits.collocation_system,
-            (gaits.parameter_index, self.second_index),
+            (gaits.parameter_index, gaits.model.parameter_names.index(self.second_name)),
             QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names),
         )
         correction, tangents, monodromy, *quantities = linearize_trials(

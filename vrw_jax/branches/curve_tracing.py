@@ -19,7 +19,7 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.branches.abstract_continuation import AbstractContinuation, QuantitiesByName
+from vrw_jax.branches.abstract_continuation import QuantitiesByName
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
 from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
@@ -45,7 +45,7 @@ from vrw_jax.branches.curve_problems import (
     select_test_quantity,
 )
 from vrw_jax.branches.test_functions import BIFURCATIONS, BRANCH_POINT, FOLD, TestFunction
-from vrw_jax.branches.walker_curves import RANGE_EDGE
+from vrw_jax.branches.walker_curves import RANGE_EDGE, AbstractCurveContinuation
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.phase_collocation import CollocationSolution
@@ -56,25 +56,21 @@ from vrw_jax.wheel.params import WheelParams
 
 
 @dataclass(frozen=True)
-class CurveContinuation(AbstractContinuation):
-    """Continuation of special points as curves in two parameters.
+class CurveContinuation(AbstractCurveContinuation):
+    """Continuation of special points of gaits that collocation finds.
 
     The quantities at a point of a curve are those of its gait, except the quantity that vanishes on
     the whole curve.
     """
 
-    continuation_problem: GaitCurveProblem
     special_point_names: tuple[str, ...]  # one name per wheel
 
     test_functions: ClassVar[Mapping[str, TestFunction]] = {
         **GAIT_TEST_FUNCTIONS,
-        RANGE_EDGE: TestFunction("lost", "The second parameter's range ends.", True),
+        **AbstractCurveContinuation.edge_functions,
         INITIAL_FORCE_FALL_NAME: TestFunction("lost", "The force begins to rise.", True),
     }
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
-
-    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable:
-        return lambda: point
 
     def evaluate_point_quantities(
         self, wheels: CurveWheel, points: ContinuationPoint
@@ -83,12 +79,8 @@ class CurveContinuation(AbstractContinuation):
         quantities = split_legs(problem.measure_gaits(wheels, points), problem.gait_problem.n_legs)
         # Without double support, the rear foot's force must not be positive.
         rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
-        fraction = points.z[:, 0]
-        return quantities | {
-            "lambda_4_plus": rear_force_sign * quantities["lambda_4_plus"],
-            "second": problem.compute_second_parameter(points.z),
-            RANGE_EDGE: np.minimum(fraction, 1.0 - fraction),
-        }
+        quantities["lambda_4_plus"] = rear_force_sign * quantities["lambda_4_plus"]
+        return self.add_second_parameter(quantities, points)
 
     def mask_undefined_quantities(
         self, quantities: QuantitiesByName, owners: np.ndarray
@@ -191,6 +183,9 @@ RELATIVE_CODIM2_TOLERANCE = 1e-9
 DLS_DURATION_GUESS_S = 0.1
 
 
+PHASE_DURATIONS = ("duration_dls", "duration_sls1", "duration_sls2")
+
+
 class CurveTracer(NamedTuple):
     """Tracer of curves of special points within the ranges of two parameters."""
 
@@ -199,15 +194,14 @@ class CurveTracer(NamedTuple):
     model: ViscoelasticWheel
     arclength_options: ArclengthOptions
     step_options: StepOptions
-    report_stage: Callable[[str], Any] | None = None
+    report_stage: Callable[[str], Any] = lambda stage: None
     measures_force_peaks: bool = False  # whether branches measure the peaks of the gait's force
 
-    def with_parameters(
-        self, params: WheelParams, parameter_values: Iterable[float]
-    ) -> WheelParams:
-        """Return the wheel with new values of the two parameters."""
-        get_values = lambda params: [getattr(params, name) for name in self.parameter_names]
-        return eqx.tree_at(get_values, params, [jnp.asarray(value) for value in parameter_values])
+    def with_parameters(self, params: WheelParams, values: np.ndarray) -> WheelParams:
+        """Return a batch of wheels with new values of the two parameters, shape (wheels, 2)."""
+        wheels = jax.tree.map(lambda x: jnp.broadcast_to(x, len(values)), params)
+        select = lambda wheel: [getattr(wheel, name) for name in self.parameter_names]
+        return eqx.tree_at(select, wheels, list(jnp.asarray(values.T)))
 
     def compute_parameter_fractions(self, parameter_values: Any) -> np.ndarray:
         """Return the two parameters as fractions of their ranges, on the last axis."""
@@ -224,8 +218,7 @@ class CurveTracer(NamedTuple):
         """
         parameter_name = self.parameter_names[parameter_index]
         lower_bound, upper_bound = self.parameter_ranges[parameter_index]
-        if self.report_stage:
-            self.report_stage(f"following {len(params.damping)} branches along {parameter_name}")
+        self.report_stage(f"following {len(params.damping)} branches along {parameter_name}")
         branches = continue_branches(
             params,
             parameter_name,
@@ -254,6 +247,12 @@ class CurveTracer(NamedTuple):
     ) -> list[TracedCurve]:
         """Trace the curves through all seeds that lie on no known curve."""
         curves = list(known_curves)
+
+        def is_known(seed: CurveSeed) -> bool:
+            fractions = self.compute_parameter_fractions(seed.parameter_values)
+            point = np.append(seed.z.section_state, fractions)[None]
+            return any(curve.contains_points(seed.special_point_name, point) for curve in curves)
+
         seeds_by_group: dict[tuple[str, ...], list[CurveSeed]] = {}
         for seed in curve_seeds:
             group = find_test_quantity_group(
@@ -262,7 +261,7 @@ class CurveTracer(NamedTuple):
             seeds_by_group.setdefault(group, []).append(seed)
         for group in sorted(seeds_by_group):
             remaining = seeds_by_group[group]
-            while remaining := [seed for seed in remaining if not self._is_on_any(seed, curves)]:
+            while remaining := [seed for seed in remaining if not is_known(seed)]:
                 # A batch has one seed per name, because seeds of one name may lie on one curve.
                 first_by_name = {seed.special_point_name: seed for seed in reversed(remaining)}
                 names = dict.fromkeys(seed.special_point_name for seed in remaining)
@@ -272,12 +271,6 @@ class CurveTracer(NamedTuple):
                         curves.append(curve)
                 remaining = [seed for seed in remaining if not any(seed is x for x in batch)]
         return curves[len(known_curves) :]
-
-    def _is_on_any(self, seed: CurveSeed, curves: Sequence[TracedCurve]) -> bool:
-        """Return whether a seed lies on a curve of the same special point."""
-        fractions = self.compute_parameter_fractions(seed.parameter_values)
-        point = np.append(seed.z.section_state, fractions)[None]
-        return any(curve.contains_points(seed.special_point_name, point) for curve in curves)
 
     def _trace_curves_of_batch(
         self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed]
@@ -289,8 +282,7 @@ class CurveTracer(NamedTuple):
         - `quantity_group`: names of the quantities that are evaluated together.
         """
         names = ", ".join(sorted({seed.special_point_name for seed in curve_seeds}))
-        if self.report_stage:
-            self.report_stage(f"following special points: {names}")
+        self.report_stage(f"following special points: {names}")
         traced_curves = []
         for n_refinements_left in range(MAX_BRANCH_MESH_REFINEMENTS, -1, -1):
             # All curves are continued on the finest mesh that any of the seeds has.
@@ -418,8 +410,27 @@ class CurveTracer(NamedTuple):
                     seed._replace(special_point_name=name, parameter_values=values, z=z)
                 )
             codim2_points.append(Codim2Point(name, meeting, special_point.ends_branch))
-        curve = self._make_labeled_curve(
-            seed, branch_data._replace(end_reasons=end_reasons), tuple(codim2_points)
+        jacobians, quantities = branch_data.points.return_map_jacobian, branch_data.quantities
+        spectral_radius = np.abs(np.linalg.eigvals(jacobians)).max(-1)
+        columns = {"spectral_radius": spectral_radius}
+        columns |= {name: quantities[name] for name in PHASE_DURATIONS}
+        variables: dict[str, Any] = make_labeled_variables(columns, "point")
+        variables["mesh_error"] = ("point", quantities["mesh_error"])
+        variables["section_state"] = (("point", "component"), quantities["section_state"])
+        coordinates = dict(zip(self.parameter_names, parameter_points.T, strict=True))
+        start_provenance = collect_provenance_attributes(
+            seed.collocation_system.make_wheel(jnp.asarray(seed.branch_wheel.values)),
+            self.model,
+            self.step_options,
+        )
+        name, axes = seed.special_point_name, " and ".join(self.parameter_names)
+        dataset = xr.Dataset(
+            variables,
+            make_labeled_variables(coordinates, "point"),
+            {"title": f"Curve of {name} over {axes}"} | start_provenance,
+        )
+        curve = SpecialPointCurve(
+            name, self.parameter_names, dataset, tuple(codim2_points), end_reasons
         )
         return TracedCurve(curve, vertices, tuple(new_seeds))
 
@@ -451,41 +462,6 @@ class CurveTracer(NamedTuple):
             0.0 if seed.special_point_name == DLS_VANISHING_NAME else DLS_DURATION_GUESS_S
         )
         return seed._replace(parameter_values=tuple(extrapolate(parameter_points)), z=z)
-
-    def _make_labeled_curve(
-        self, curve_seed: CurveSeed, branch_data: BranchData, codim2_points: tuple[Codim2Point, ...]
-    ) -> SpecialPointCurve:
-        spectral_radius = np.abs(np.linalg.eigvals(branch_data.points.return_map_jacobian)).max(-1)
-        quantities = branch_data.quantities | {"spectral_radius": spectral_radius}
-        column_names = ("duration_dls", "duration_sls1", "duration_sls2", "spectral_radius")
-        curve_variables: dict[str, Any] = make_labeled_variables(
-            {column_name: quantities[column_name] for column_name in column_names}, "point"
-        )
-        curve_variables["mesh_error"] = ("point", quantities["mesh_error"])
-        curve_variables["section_state"] = (("point", "component"), quantities["section_state"])
-        first_parameter_name, second_parameter_name = self.parameter_names
-        curve_coordinates = make_labeled_variables(
-            {
-                first_parameter_name: np.asarray(branch_data.points.p),
-                second_parameter_name: quantities["second"],
-            },
-            "point",
-        )
-        start_provenance = collect_provenance_attributes(
-            curve_seed.collocation_system.make_wheel(jnp.asarray(curve_seed.branch_wheel.values)),
-            self.model,
-            self.step_options,
-        )
-        axes = " and ".join(self.parameter_names)
-        title = {"title": f"Curve of {curve_seed.special_point_name} over {axes}"}
-        curve_dataset = xr.Dataset(curve_variables, curve_coordinates, title | start_provenance)
-        return SpecialPointCurve(
-            curve_seed.special_point_name,
-            self.parameter_names,
-            curve_dataset,
-            codim2_points,
-            branch_data.end_reasons,
-        )
 
 
 def compute_distances_to_polyline(

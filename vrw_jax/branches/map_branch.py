@@ -79,13 +79,14 @@ from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 from vrw_jax.models.measures import make_labeled_variables
 
+DEFAULT_OPTIONS = ArclengthOptions()
 
-def check_arclength_options(options: ArclengthOptions | None) -> ArclengthOptions:
-    """Check the options of a continuation.
 
-    Return them, or `ArclengthOptions()` if they are None.
-    """
-    options = ArclengthOptions() if options is None else options
+def check_arclength_options(
+    options: ArclengthOptions | None, default: ArclengthOptions = DEFAULT_OPTIONS
+) -> ArclengthOptions:
+    """Check the options of a continuation, and return them, or the default if they are None."""
+    options = default if options is None else options
     check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     return options
 
@@ -96,17 +97,14 @@ def make_stability_variables(return_map_jacobians: np.ndarray) -> dict[str, xr.V
     """
     multipliers = compute_multipliers(return_map_jacobians)
     spectral_radius = np.max(np.abs(multipliers), -1)
-    multiplier_parts = (
-        ("multiplier_real", multipliers.real, "real part of a multiplier"),
-        ("multiplier_imag", multipliers.imag, "imaginary part"),
-    )
-    multiplier_variables = {
-        variable_name: xr.Variable(
-            ("point", "multiplier"), multiplier_part, {"units": "1", "long_name": long_name}
-        )
-        for variable_name, multiplier_part, long_name in multiplier_parts
+    parts = {
+        "multiplier_real": (multipliers.real, "real part of a multiplier"),
+        "multiplier_imag": (multipliers.imag, "imaginary part"),
     }
-    return multiplier_variables | make_labeled_variables(
+    return {
+        name: xr.Variable(("point", "multiplier"), part, {"units": "1", "long_name": long_name})
+        for name, (part, long_name) in parts.items()
+    } | make_labeled_variables(
         {"spectral_radius": spectral_radius, "spectral_margin": 1.0 - spectral_radius}, "point"
     )
 

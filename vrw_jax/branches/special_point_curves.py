@@ -11,11 +11,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.base.checks import check_names, check_range, check_type
+from vrw_jax.base.checks import check_type
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
@@ -24,7 +22,11 @@ from vrw_jax.base.walker import AbstractWalker, is_own_walker
 from vrw_jax.branches.abstract_continuation import COARSE_MESH_END_NAME
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import SpecialPointCurve
-from vrw_jax.branches.continuation import BRANCH_ENDING_QUANTITIES, SECOND_PEAK_RATE_NAME
+from vrw_jax.branches.continuation import (
+    BRANCH_ENDING_QUANTITIES,
+    SECOND_PEAK_RATE_NAME,
+    split_legs,
+)
 from vrw_jax.branches.curve_problems import (
     DLS_VANISHING_NAME,
     FORCE_QUANTITY_NAMES,
@@ -36,9 +38,13 @@ from vrw_jax.branches.curve_tracing import (
     TracedCurve,
     compute_distances_to_polyline,
 )
-from vrw_jax.branches.map_branch import MarginFunctions
+from vrw_jax.branches.map_branch import MarginFunctions, check_arclength_options
 from vrw_jax.branches.test_functions import BIFURCATIONS
-from vrw_jax.branches.walker_curves import DEFAULT_CURVE_OPTIONS, continue_walker_special_point
+from vrw_jax.branches.walker_curves import (
+    DEFAULT_CURVE_OPTIONS,
+    check_parameter_plane,
+    continue_walker_special_point,
+)
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.batching import select_tree_rows
@@ -126,34 +132,6 @@ def continue_special_point(
     return curve
 
 
-def _check_parameter_plane(
-    parameters: Any, bounds: Any, known_names: Sequence[str] = PARAMETER_NAMES
-) -> tuple[tuple[str, str], np.ndarray]:
-    """Check the names and bounds of two parameters.
-
-    Return the names, and the bounds as an array of shape (2, 2). Raise TypeError or ValueError if
-    names or bounds are invalid.
-    """
-    check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
-    bounds_by_parameter = {**DEFAULT_PARAMETER_BOUNDS, **(bounds or {})}
-    parameter_names = check_names("parameters", parameters)
-    for parameter_name, bounds_of_parameter in bounds_by_parameter.items():
-        check_parameter_name(parameter_name, known_names, "parameter that has bounds")
-        bounds_by_parameter[parameter_name] = check_range(
-            f"bounds[{parameter_name!r}]", bounds_of_parameter
-        )
-    for parameter_name in parameter_names:
-        check_parameter_name(parameter_name, tuple(bounds_by_parameter), "parameter with bounds")
-    if len(parameter_names) != 2 or len(set(parameter_names)) != 2:
-        raise ValueError(
-            f"parameters are {parameter_names}, but a curve needs two different ones: write "
-            "('damping', 'slope')."
-        )
-    return (parameter_names[0], parameter_names[1]), np.array(
-        [bounds_by_parameter[parameter_name] for parameter_name in parameter_names], float
-    )
-
-
 @with_default_jax_settings
 def continue_special_points(
     names: tuple[str, ...],
@@ -168,8 +146,10 @@ def continue_special_points(
     `continue_special_point` does.
     """
     known_names = cycle.model.parameter_names if isinstance(cycle, LimitCycle) else PARAMETER_NAMES
-    parameters, parameter_ranges = _check_parameter_plane(parameters, bounds, known_names)
-    first_parameter_name, second_parameter_name = parameters
+    check_name = lambda name: check_parameter_name(name, known_names, "parameter")
+    parameters, limits = check_parameter_plane(
+        parameters, bounds, check_name, DEFAULT_PARAMETER_BOUNDS
+    )
     check_type(
         "cycle",
         cycle,
@@ -180,56 +160,41 @@ def continue_special_points(
         raise ValueError(
             f"the gait has {cycle.period_n} steps, but a curve needs a gait of one step: give one."
         )
-    options = DEFAULT_CURVE_OPTIONS if options is None else options
+    options = check_arclength_options(options, DEFAULT_CURVE_OPTIONS)
     step_options = StepOptions.tight() if step_options is None else step_options
-    check_type("options", options, ArclengthOptions, "give vrw.ArclengthOptions()")
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
     curve_tracer = CurveTracer(
         parameters,
-        parameter_ranges,
+        np.array(limits),
         cycle.model,
         options,
         step_options,
         measures_force_peaks=not set(names).isdisjoint(FORCE_QUANTITY_NAMES),
     )
     params = cycle.system.make_wheel(cycle.parameters)
-    seeds_by_name: dict[str, CurveSeed] = {}
-    for parameter_index, parameter_name in enumerate(parameters):
-        if set(names) - set(seeds_by_name):
-            curve_seeds = curve_tracer.find_seeds(
-                parameter_index, *select_tree_rows((params, cycle), None)
-            )
+    seeds: dict[str, CurveSeed] = {}
+    for i, parameter_name in enumerate(parameters):
+        if set(names) - set(seeds):
             start_value = float(cycle.model.get_parameter(params, parameter_name))
-            compute_distance = lambda seed, index=parameter_index, start_value=start_value: abs(
-                seed.parameter_values[index] - start_value
-            )
+            found = curve_tracer.find_seeds(i, *select_tree_rows((params, cycle), None))
             # The nearest seed of each name comes last and replaces the others.
-            seeds_by_name = {
-                curve_seed.special_point_name: curve_seed
-                for curve_seed in sorted(curve_seeds, key=compute_distance, reverse=True)
-            } | seeds_by_name
-    missing_special_point_names = sorted(set(names) - set(seeds_by_name))
-    if missing_special_point_names:
+            found.sort(key=lambda x: -abs(x.parameter_values[i] - start_value))
+            seeds = {seed.special_point_name: seed for seed in found} | seeds
+    missing = sorted(set(names) - set(seeds))
+    if missing:
         raise ValueError(
-            f"no special point {missing_special_point_names[0]!r} on branches along "
-            f"{first_parameter_name} and {second_parameter_name} within their bounds (found: "
-            f"{', '.join(sorted(seeds_by_name)) or 'none'}): give a gait nearer to it, or wider "
-            "bounds."
+            f"no special point {missing[0]!r} on branches along {parameters[0]} and "
+            f"{parameters[1]} within their bounds (found: {', '.join(sorted(seeds)) or 'none'}): "
+            "give a gait nearer to it, or wider bounds."
         )
-    curves_by_name = {
-        traced_curve.special_point_curve.name: traced_curve.special_point_curve
-        for traced_curve in curve_tracer.trace_curves(
-            [seeds_by_name[special_point_name] for special_point_name in names], ()
-        )
-    }
-    untraced_special_point_names = sorted(set(names) - set(curves_by_name))
-    if untraced_special_point_names:
+    traced = curve_tracer.trace_curves([seeds[name] for name in names], ())
+    curves = {x.special_point_curve.name: x.special_point_curve for x in traced}
+    for name in sorted(set(names) - set(curves)):
         raise ValueError(
-            f"special point {untraced_special_point_names[0]} at "
-            f"{seeds_by_name[untraced_special_point_names[0]].parameter_values[0]:.9g} can't be "
-            "continued: give a gait nearer to the special point."
+            f"special point {name} at {seeds[name].parameter_values[0]:.9g} can't be continued: "
+            "give a gait nearer to the special point."
         )
-    return tuple(curves_by_name[special_point_name] for special_point_name in names)
+    return tuple(curves[name] for name in names)
 
 
 GAIT_CHANGE_NAME = "gait"
@@ -300,60 +265,40 @@ def trace_special_points(
     second force peak appears are also traced. A sign change between two samples is unexplained if
     no curve is near it. `on_stage` is called with a description of each stage.
     """
-    parameter_names = tuple(map(str, scan_dataset.outcome.dims))
-    parameter_ranges = np.array(
-        [scan_dataset[parameter_name].values[[0, -1]] for parameter_name in parameter_names], float
-    )
-    curve_tracer = CurveTracer(
-        (parameter_names[0], parameter_names[1]),
-        parameter_ranges,
+    first, second = map(str, scan_dataset.outcome.dims)
+    axes = [scan_dataset[name].values.astype(float) for name in (first, second)]
+    tracer = CurveTracer(
+        (first, second),
+        np.array([values[[0, -1]] for values in axes]),
         model,
         DEFAULT_CURVE_OPTIONS,
         StepOptions.tight(),
-        on_stage,
+        on_stage or (lambda stage: None),
         measures_force_peaks=SECOND_PEAK_RATE_NAME in scan_dataset,
     )
-    curve_seeds = find_seeds_on_parallel_lines(curve_tracer, params)
-    traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, [])
-    sign_changes = find_sign_changes_in_scan(scan_dataset, curve_tracer.parameter_names)
-    examined_sign_changes: list[ScanSignChange] = []
-    find_remaining_sign_changes = lambda: find_unexplained_sign_changes(
-        sign_changes,
-        [traced_curve.special_point_curve for traced_curve in traced_curves],
-        scan_dataset,
+    seeds = find_seeds_on_parallel_lines(tracer, params)
+    traced = _trace_curves_and_meetings(tracer, seeds, [])
+    sign_changes = find_sign_changes_in_scan(scan_dataset, (first, second))
+    examined: list[ScanSignChange] = []
+    find_remaining = lambda: find_unexplained_sign_changes(
+        sign_changes, [curve.special_point_curve for curve in traced], scan_dataset
     )
     for _ in range(MAX_SEARCH_ROUNDS):
-        new_sign_changes: list[ScanSignChange] = []
-        for sign_change in find_remaining_sign_changes():
-            if not any(map(sign_change.is_near, (*examined_sign_changes, *new_sign_changes))):
-                new_sign_changes.append(sign_change)
-        if not new_sign_changes:
+        n_examined, seeds = len(examined), []
+        for change in find_remaining():
+            if not any(map(change.is_near, examined)):
+                examined.append(change)
+        if len(examined) == n_examined:
             break
-        examined_sign_changes += new_sign_changes
-        curve_seeds = []
         for parameter_index in range(2):
-            wheels_beside_sign_change = [
-                curve_tracer.with_parameters(
-                    params,
-                    [
-                        float(scan_dataset[parameter_name][sample_index])
-                        for parameter_name, sample_index in zip(
-                            curve_tracer.parameter_names, sign_change.sample_indices, strict=True
-                        )
-                    ],
-                )
-                for sign_change in new_sign_changes
-                if sign_change.parameter_index == parameter_index
+            starts = [
+                [values[i] for values, i in zip(axes, change.sample_indices, strict=True)]
+                for change in examined[n_examined:]
+                if change.parameter_index == parameter_index
             ]
-            curve_seeds += _find_seeds_in_batches(
-                curve_tracer,
-                parameter_index,
-                wheels_beside_sign_change,
-            )
-        traced_curves = _trace_curves_and_meetings(curve_tracer, curve_seeds, traced_curves)
-    return tuple(traced_curve.special_point_curve for traced_curve in traced_curves), tuple(
-        find_remaining_sign_changes()
-    )
+            seeds += _find_seeds_in_batches(tracer, parameter_index, params, np.array(starts))
+        traced = _trace_curves_and_meetings(tracer, seeds, traced)
+    return tuple(curve.special_point_curve for curve in traced), tuple(find_remaining())
 
 
 # Number of rounds in which special points on new curves are continued.
@@ -361,70 +306,47 @@ N_MEETING_ROUNDS = 3
 
 
 def _trace_curves_and_meetings(
-    curve_tracer: CurveTracer,
-    curve_seeds: list[CurveSeed],
-    traced_curves: list[TracedCurve],
+    tracer: CurveTracer, seeds: list[CurveSeed], traced: list[TracedCurve]
 ) -> list[TracedCurve]:
     """Trace the curves through the seeds, and the curves through special points on new curves.
 
     Return these curves together with the known curves.
     """
     for _ in range(N_MEETING_ROUNDS):
-        new_curves = curve_tracer.trace_curves(curve_seeds, traced_curves)
-        known_curves = [
-            traced_curve for traced_curve in traced_curves if not traced_curve.is_on_any(new_curves)
-        ]
-        traced_curves = [*known_curves, *new_curves]
-        curve_seeds = [
-            curve_seed for traced_curve in new_curves for curve_seed in traced_curve.meeting_seeds
-        ]
-    return traced_curves
+        new = tracer.trace_curves(seeds, traced)
+        traced = [*(curve for curve in traced if not curve.is_on_any(new)), *new]
+        seeds = [seed for curve in new for seed in curve.meeting_seeds]
+    return traced
 
 
-def find_seeds_on_parallel_lines(
-    curve_tracer: CurveTracer,
-    params: WheelParams,
-) -> list[CurveSeed]:
+def find_seeds_on_parallel_lines(tracer: CurveTracer, params: WheelParams) -> list[CurveSeed]:
     """Find seeds on parallel branches in each of the two parameters.
 
     A branch in one parameter starts at the middle of that parameter's range. The branches differ by
     evenly spaced values of the other parameter.
     """
-    curve_seeds = []
+    seeds = []
     for parameter_index in range(2):
-        lower_bound, upper_bound = curve_tracer.parameter_ranges[1 - parameter_index]
-        line_parameter_values = lower_bound + (
-            np.arange(N_PARALLEL_BRANCHES) + 0.5
-        ) / N_PARALLEL_BRANCHES * (upper_bound - lower_bound)
-        start_values = np.empty((N_PARALLEL_BRANCHES, 2))
-        start_values[:, parameter_index] = curve_tracer.parameter_ranges[parameter_index].mean()
-        start_values[:, 1 - parameter_index] = line_parameter_values
-        wheels_on_line = [
-            curve_tracer.with_parameters(params, start_values_on_line)
-            for start_values_on_line in start_values
-        ]
-        curve_seeds += _find_seeds_in_batches(curve_tracer, parameter_index, wheels_on_line)
-    return curve_seeds
+        fractions = (np.arange(N_PARALLEL_BRANCHES) + 0.5) / N_PARALLEL_BRANCHES
+        lower, upper = tracer.parameter_ranges.T
+        starts = lower + fractions[:, None] * (upper - lower)
+        starts[:, parameter_index] = tracer.parameter_ranges[parameter_index].mean()
+        seeds += _find_seeds_in_batches(tracer, parameter_index, params, starts)
+    return seeds
 
 
 def _find_seeds_in_batches(
-    curve_tracer: CurveTracer, parameter_index: int, wheels: list[WheelParams]
+    tracer: CurveTracer, parameter_index: int, params: WheelParams, starts: np.ndarray
 ) -> list[CurveSeed]:
-    """Find seeds on the wheels' branches, which are continued in batches of the same size.
+    """Find seeds on branches that start at values of the two parameters, shape (branches, 2).
 
-    A single size needs only one compiled program.
+    The branches are continued in batches of a single size, which needs only one compiled program.
     """
-    curve_seeds = []
-    for first_wheel_index in range(0, len(wheels), N_PARALLEL_BRANCHES):
-        wheels_of_batch = wheels[first_wheel_index : first_wheel_index + N_PARALLEL_BRANCHES]
-        padded_wheels = [
-            *wheels_of_batch,
-            *wheels_of_batch[-1:] * (N_PARALLEL_BRANCHES - len(wheels_of_batch)),
-        ]
-        curve_seeds += curve_tracer.find_seeds(
-            parameter_index, jax.tree.map(lambda *x: jnp.stack(x), *padded_wheels)
-        )
-    return curve_seeds
+    seeds, n = [], N_PARALLEL_BRANCHES
+    for first in range(0, len(starts), n):
+        batch = starts[np.minimum(np.arange(first, first + n), len(starts) - 1)]
+        seeds += tracer.find_seeds(parameter_index, tracer.with_parameters(params, batch))
+    return seeds
 
 
 def find_sign_changes_in_scan(
@@ -435,59 +357,42 @@ def find_sign_changes_in_scan(
     A sign change of a measure is ignored if exactly one of the two samples has double support.
     """
     scan_dataset = scan_dataset.transpose(*parameter_names, ...)
-    has_gait_at_sample = scan_dataset.outcome.values == Outcome.STEPPED
-    has_coarse_mesh_at_sample = scan_dataset.outcome.values == Outcome.MESH_TOO_COARSE
-    signed_quantities = {STABILITY_CHANGE_NAME: 1.0 - scan_dataset[STABILITY_CHANGE_NAME].values}
-    margin_names = [name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES]
-    peak_names = [SECOND_PEAK_RATE_NAME] if SECOND_PEAK_RATE_NAME in scan_dataset else []
-    for measure_name in ("lambda_4_plus", *peak_names, *margin_names):
-        measure = scan_dataset[measure_name]
-        if "leg" in measure.dims:
-            signed_quantities |= {
-                f"{measure_name}[{leg_number}]": measure.values[..., i]
-                for i, leg_number in enumerate(scan_dataset.leg.values)
-            }
-        else:
-            signed_quantities[measure_name] = measure.values
-    signed_quantities[GAIT_CHANGE_NAME] = np.where(
-        has_gait_at_sample, 1.0, np.where(has_coarse_mesh_at_sample, np.nan, -1.0)
-    )
-    signed_quantities[COARSE_MESH_END_NAME] = np.where(
-        has_gait_at_sample, 1.0, np.where(has_coarse_mesh_at_sample, -1.0, np.nan)
-    )
+    outcome = scan_dataset.outcome.values
+    has_gait, is_coarse = outcome == Outcome.STEPPED, outcome == Outcome.MESH_TOO_COARSE
+    names = [
+        "lambda_4_plus",
+        *(name for name in MARGIN_MEASURES if name not in LINEAR_MARGIN_SUBSTITUTES),
+    ]
+    if SECOND_PEAK_RATE_NAME in scan_dataset:
+        names.append(SECOND_PEAK_RATE_NAME)
+    measures = {name: scan_dataset[name].values for name in names}
+    quantities = {
+        STABILITY_CHANGE_NAME: 1.0 - scan_dataset[STABILITY_CHANGE_NAME].values,
+        **split_legs(measures, 2 + scan_dataset.sizes.get("leg", 0)),
+        GAIT_CHANGE_NAME: np.select([has_gait, is_coarse], [1.0, np.nan], -1.0),
+        COARSE_MESH_END_NAME: np.select([has_gait, is_coarse], [1.0, -1.0], np.nan),
+    }
     sign_changes = []
-    for parameter_index in range(2):
-        get_neighbor_values = lambda x, parameter_index=parameter_index: (
-            np.moveaxis(x, parameter_index, 0)[:-1],
-            np.moveaxis(x, parameter_index, 0)[1:],
-        )
-        has_first_sample_gait, has_second_sample_gait = get_neighbor_values(has_gait_at_sample)
-        has_same_double_support = np.equal(
-            *get_neighbor_values(signed_quantities["lambda_4_plus"] > 0.0)
-        )
-        for quantity_name, quantity_values in signed_quantities.items():
-            first_sample_values, second_sample_values = get_neighbor_values(quantity_values)
-            has_sign_change = first_sample_values * second_sample_values < 0.0
-            if quantity_name not in (GAIT_CHANGE_NAME, COARSE_MESH_END_NAME):
-                has_sign_change &= (
-                    has_first_sample_gait
-                    & has_second_sample_gait
-                    & (has_same_double_support | (quantity_name == "lambda_4_plus"))
+    for axis in range(2):
+        # The first index is that of the parameter that varies.
+        select_neighbors = lambda x, axis=axis: (x.swapaxes(0, axis)[:-1], x.swapaxes(0, axis)[1:])
+        starts_at_gait, ends_at_gait = select_neighbors(has_gait)
+        has_same_support = np.equal(*select_neighbors(quantities["lambda_4_plus"] > 0.0))
+        for name, values in quantities.items():
+            if values.ndim > 2:
+                continue  # Each leg has its own quantity.
+            before, after = select_neighbors(values)
+            has_changed = before * after < 0.0
+            if name not in (GAIT_CHANGE_NAME, COARSE_MESH_END_NAME):
+                has_changed &= starts_at_gait & ends_at_gait
+                has_changed &= has_same_support | (name == "lambda_4_plus")
+            for i, j in np.argwhere(has_changed).tolist():
+                start = i if starts_at_gait[i, j] else i + 1
+                position = i + float(before[i, j] / (before[i, j] - after[i, j]))
+                sample, place = (
+                    ((start, j), (position, j)) if axis == 0 else ((j, start), (j, position))
                 )
-            for i, j in np.argwhere(has_sign_change).tolist():
-                sign_change_fraction = first_sample_values[i, j] / (
-                    first_sample_values[i, j] - second_sample_values[i, j]
-                )
-                sample_indices = (i if has_first_sample_gait[i, j] else i + 1), j
-                position_in_cells = float(i + sign_change_fraction), float(j)
-                if parameter_index == 1:  # The first index is that of the second parameter.
-                    sample_indices = sample_indices[::-1]
-                    position_in_cells = position_in_cells[::-1]
-                sign_changes.append(
-                    ScanSignChange(
-                        quantity_name, parameter_index, sample_indices, position_in_cells
-                    )
-                )
+                sign_changes.append(ScanSignChange(name, axis, sample, place))
     return sign_changes
 
 
@@ -501,38 +406,29 @@ def find_unexplained_sign_changes(
     scan_dataset: xr.Dataset,
 ) -> list[ScanSignChange]:
     """Return the sign changes that are not near any curve that explains them."""
-    unexplained_sign_changes = []
-    for quantity_name in sorted({sign_change.quantity_name for sign_change in sign_changes}):
-        sign_changes_of_quantity = [
-            sign_change
-            for sign_change in sign_changes
-            if sign_change.quantity_name == quantity_name
-        ]
-        explaining_names = EXPLAINING_CURVE_NAMES.get(quantity_name, (quantity_name,))
-        sign_change_positions = np.array(
-            [sign_change.scan_position_in_cells for sign_change in sign_changes_of_quantity]
+    lines = [
+        (
+            curve.name,
+            np.stack(
+                [
+                    np.interp(
+                        curve.dataset[name], scan_dataset[name], range(scan_dataset.sizes[name])
+                    )
+                    for name in curve.parameters
+                ],
+                -1,
+            ),
         )
-        curve_distances = np.full(len(sign_changes_of_quantity), np.inf)
-        for special_point_curve in special_point_curves:
-            if special_point_curve.name not in explaining_names:
-                continue
-            curve_positions = [
-                np.interp(
-                    special_point_curve.dataset[parameter_name].values,
-                    scan_dataset[parameter_name].values,
-                    np.arange(scan_dataset.sizes[parameter_name]),
-                )
-                for parameter_name in special_point_curve.parameters
-            ]
-            curve_distances = np.minimum(
-                curve_distances,
-                compute_distances_to_polyline(sign_change_positions, np.stack(curve_positions, -1)),
-            )
-        unexplained_sign_changes += [
-            sign_change
-            for sign_change, curve_distance in zip(
-                sign_changes_of_quantity, curve_distances, strict=True
-            )
-            if curve_distance > MAX_DISTANCE_TO_EXPLAINING_CURVE
-        ]
-    return unexplained_sign_changes
+        for curve in special_point_curves
+    ]
+
+    def is_unexplained(change: ScanSignChange) -> bool:
+        names = EXPLAINING_CURVE_NAMES.get(change.quantity_name, (change.quantity_name,))
+        position = np.array([change.scan_position_in_cells])
+        return all(
+            compute_distances_to_polyline(position, line) > MAX_DISTANCE_TO_EXPLAINING_CURVE
+            for name, line in lines
+            if name in names
+        )
+
+    return sorted(filter(is_unexplained, sign_changes), key=lambda change: change.quantity_name)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -103,28 +104,44 @@ class WalkerCurveProblem(AbstractCurveProblem):
 
 
 @dataclass(frozen=True)
-class WalkerCurveContinuation(AbstractContinuation):
-    """Continuation of a special point of a walker as a curve in two parameters."""
+class AbstractCurveContinuation(AbstractContinuation):
+    """Base class of continuations of special points as curves in two parameters."""
 
-    continuation_problem: WalkerCurveProblem
+    continuation_problem: Any
+
+    edge_functions: ClassVar[Mapping[str, TestFunction]] = {
+        RANGE_EDGE: TestFunction("lost", "The second parameter's range ends.", True)
+    }
+
+    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Any:
+        return lambda: point
+
+    def add_second_parameter(
+        self, quantities: QuantitiesByName, points: ContinuationPoint
+    ) -> QuantitiesByName:
+        """Return quantities with the second parameter, and its distance from its range's edge."""
+        second = self.continuation_problem.compute_second_parameter(points.z)
+        distance = np.minimum(points.z[:, 0], 1.0 - points.z[:, 0])
+        return quantities | {"second": second, RANGE_EDGE: distance}
+
+
+@dataclass(frozen=True)
+class WalkerCurveContinuation(AbstractCurveContinuation):
+    """Continuation of a special point of a walker as a curve in two parameters."""
 
     @property
     def test_functions(self) -> Mapping[str, TestFunction]:  # type: ignore[override]
-        edge = TestFunction("lost", "The second parameter's range ends.", True)
-        return {**self.continuation_problem.gaits.test_functions, RANGE_EDGE: edge}
+        return {**self.continuation_problem.gaits.test_functions, **self.edge_functions}
 
     @property
     def parameter_unit(self) -> float:
         return float(np.ptp(self.parameter_bounds))
 
-    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Any:
-        return lambda: point
-
     def evaluate_point_quantities(self, params: Any, points: ContinuationPoint) -> QuantitiesByName:
-        problem, fraction = self.continuation_problem, points.z[:, 0]
+        problem = self.continuation_problem
         second = problem.compute_second_parameter(points.z)
         quantities = problem.measure_gaits(params, points._replace(z=points.z[:, 1:]), second)
-        return quantities | {"second": second, RANGE_EDGE: np.minimum(fraction, 1.0 - fraction)}
+        return self.add_second_parameter(quantities, points)
 
     def mask_undefined_quantities(
         self, quantities: QuantitiesByName, owners: np.ndarray
@@ -160,12 +177,30 @@ def continue_walker_special_point(
             "a curve needs a gait of a walker without invariants, but "
             f"{'the walker has some' if walker.invariants else gait.why}: give another gait."
         )
-    options = check_arclength_options(DEFAULT_CURVE_OPTIONS if options is None else options)
+    options = check_arclength_options(options, DEFAULT_CURVE_OPTIONS)
     step_options = StepOptions.tight() if step_options is None else step_options
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
-    names, limits = _check_plane(params, parameters, bounds)
+    find_leaf = functools.partial(find_tree_parameter, params)
+    names, limits = check_parameter_plane(parameters, bounds, find_leaf, {})
+    start_values = [jax.tree.leaves(params)[find_leaf(name)] for name in names]
+    for parameter_name, value, (lower, upper) in zip(names, start_values, limits, strict=True):
+        if np.ndim(value) or not lower <= value <= upper:
+            raise ValueError(
+                f"{parameter_name} is {value}, but the curve is traced from a gait with one value "
+                f"within the bounds: give one in [{lower:g}, {upper:g}]."
+            )
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
-    values, start = _find_start(walker, params, name, names, limits, gait, step_options, margins)
+    values, start = _find_start(
+        walker,
+        params,
+        name,
+        names,
+        list(map(float, start_values)),
+        limits,
+        gait,
+        step_options,
+        margins,
+    )
 
     def map_section_state(params: Any, x: Array, values: Array) -> Array:
         for i, parameter_name in enumerate(names):
@@ -222,30 +257,31 @@ def continue_walker_special_point(
     return SpecialPointCurve(name, names, dataset, codim2_points, data.end_reasons)
 
 
-def _check_plane(
-    params: Any, parameters: Any, bounds: Any
+def check_parameter_plane(
+    parameters: Any,
+    bounds: Any,
+    check_name: Callable[[str], object],
+    default_bounds: Mapping[str, tuple[float, float]],
 ) -> tuple[tuple[str, str], list[tuple[float, float]]]:
-    """Return the names and bounds of two parameters, or raise an error."""
+    """Return the names of two parameters and their bounds, or raise an error.
+
+    - `check_name`: function that raises an error for the name of no parameter.
+    """
     names = check_names("parameters", parameters)
     if len(set(names)) != 2 or len(names) != 2:
         raise ValueError(
-            f"parameters are {names}, but a curve needs two different ones: give two names."
+            f"parameters are {names}, but a curve needs two different ones: write ('damping', "
+            "'slope'), say."
         )
-    check_type("bounds", bounds, Mapping, "give (lower, upper) of each parameter by name")
-    limits = []
-    for name in names:
-        value = jax.tree.leaves(params)[find_tree_parameter(params, name)]
-        if name not in bounds:
+    check_type("bounds", bounds, (Mapping, type(None)), "write {'damping': (100.0, 200.0)}")
+    limits = {**default_bounds, **(bounds or {})}
+    for name in (*limits, *names):
+        check_name(name)
+        if name not in limits:
             raise ValueError(f"bounds has no {name!r}: give (lower, upper) of each parameter.")
-        lower, upper = check_range(f"bounds[{name!r}]", bounds[name])
-        if np.ndim(value) or not lower <= value <= upper:
-            raise ValueError(
-                f"{name} is {value}, but the curve is traced from a gait with one value within "
-                f"the bounds: give one in [{lower:g}, {upper:g}]."
-            )
-        limits.append((lower, upper))
+        limits[name] = check_range(f"bounds[{name!r}]", limits[name])
     first, second = names
-    return (first, second), limits
+    return (first, second), [limits[first], limits[second]]
 
 
 def _find_start(
@@ -253,6 +289,7 @@ def _find_start(
     params: Any,
     name: str,
     names: tuple[str, str],
+    start_values: list[float],
     limits: list[tuple[float, float]],
     gait: HybridGait,
     step_options: StepOptions,
@@ -262,9 +299,6 @@ def _find_start(
 
     The point is on a branch in the first parameter, or else on one in the second.
     """
-    start_values = [
-        float(jax.tree.leaves(params)[find_tree_parameter(params, name)]) for name in names
-    ]
     found_names: list[str] = []
     for i, bounds in enumerate(limits):
         branch = continue_hybrid_branch(
