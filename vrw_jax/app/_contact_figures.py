@@ -1,5 +1,7 @@
 """Motion of the feet for any model, and figures of their contact modes."""
 
+import string
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,11 +93,6 @@ class HubAndFootMotion(NamedTuple):
         return interpolate(self.hub_positions), interpolate(self.foot_positions), index_after
 
 
-def reports_contact_modes(walk: xr.Dataset) -> bool:
-    """Return whether a trajectory contains the contact mode of each leg."""
-    return "contact" in walk.variables
-
-
 def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
     """Return the motion of hub and feet in a trajectory that was computed with any model.
 
@@ -103,7 +100,7 @@ def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
     support.
     """
     hub_positions = np.stack([walk.hub_x.values, walk.hub_z.values], -1)
-    if reports_contact_modes(walk):
+    if "contact" in walk:
         foot_positions = np.stack([walk.foot_x.values, walk.foot_z.values], -1)
         foot_forces = np.stack([walk.tangential.values, walk.normal.values], -1)
         contact_modes = walk.contact.values
@@ -146,15 +143,24 @@ def find_constant_spans(
     - `sampled_codes`: code for each sample of the trajectory.
     """
     is_span_end = np.any(np.diff([walk.step.values, sampled_codes]), axis=0)
-    span_start_indices = np.flatnonzero(is_span_end) + 1
-    return [
-        (span_times[0], span_times[-1], int(span_codes[0]))
-        for span_times, span_codes in zip(
-            np.split(walk.time.values, span_start_indices),
-            np.split(sampled_codes, span_start_indices),
-            strict=True,
-        )
-    ]
+    spans = np.split(np.arange(len(sampled_codes)), np.flatnonzero(is_span_end) + 1)
+    times = walk.time.values
+    return [(times[span[0]], times[span[-1]], int(sampled_codes[span[0]])) for span in spans]
+
+
+def make_time_panels(
+    width_inches: float, height: float, height_ratios: Sequence[float], times: np.ndarray
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with panels over time, one below the other, and their axes."""
+    figure = StyledFigure(figsize=(width_inches, height))
+    panels = figure.subplots(
+        len(height_ratios), 1, sharex=True, squeeze=False, height_ratios=height_ratios
+    )[:, 0]
+    for axes, letter in zip(panels, string.ascii_lowercase, strict=False):
+        if len(panels) > 1:
+            draw_panel_letter(axes, letter)
+    panels[-1].set(xlabel="time [s]", xlim=(times[0], times[-1]))
+    return figure, panels
 
 
 def draw_feet(
@@ -213,14 +219,12 @@ def make_contact_panels(walk: xr.Dataset, width_inches: float, forces_only: bool
         for leg_number in moving_legs
     }
     panel_height_ratios = [1.0, 1.0, 0.35 + 0.11 * len(touching_legs), 1.0, 1.2, 1.2]
-    first_panel = 4 if forces_only else 0
-    panel_height_ratios = panel_height_ratios[first_panel:]
-    figure = StyledFigure(figsize=(width_inches, 3.4 if forces_only else 8.0))
-    panel_axes = figure.subplots(
-        len(panel_height_ratios), 1, sharex=True, height_ratios=panel_height_ratios
+    figure, panel_axes = make_time_panels(
+        width_inches,
+        3.4 if forces_only else 8.0,
+        panel_height_ratios[4 if forces_only else 0 :],
+        foot_motion.sample_times,
     )
-    for axes, panel_letter in zip(panel_axes, "abcdef", strict=False):
-        draw_panel_letter(axes, panel_letter)
     leg_panels = [
         (panel_axes[-2], touching_legs, walk.normal, "normal\nforce [N]"),
         (panel_axes[-1], touching_legs, walk.tangential, "tangential\nforce [N]"),
@@ -229,7 +233,20 @@ def make_contact_panels(walk: xr.Dataset, width_inches: float, forces_only: bool
         angle_axes, length_axes, mode_axes, height_axes, *_ = panel_axes
         angle_axes.plot(times_with_gaps, insert_landing_gaps(walk, walk.theta), color="black")
         angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
-        _draw_contact_modes(mode_axes, walk, foot_motion.contact_modes, touching_legs)
+        modes = foot_motion.contact_modes
+        for row, leg_number in enumerate(touching_legs):
+            for start, end, mode in find_constant_spans(walk, modes[:, leg_number - 1]):
+                if mode != ContactMode.OFF:
+                    bar = (start, end - start)
+                    color = CONTACT_MODE_COLORS[mode]
+                    mode_axes.broken_barh([bar], (row - 0.35, 0.7), color=color)
+        mode_axes.set_yticks(range(len(touching_legs)), list(map(str, touching_legs)))
+        mode_axes.set(ylabel="foot on\nthe ground", ylim=(len(touching_legs) - 0.5, -0.5))
+        mode_handles = [
+            Patch(color=CONTACT_MODE_COLORS[mode], label=CONTACT_MODE_NAMES[mode])
+            for mode in np.unique(modes[is_foot_touching])
+        ]
+        add_side_legend(mode_axes, mode_handles)
         leg_panels += [
             (length_axes, moving_legs, walk.length, "$L$ [m]"),
             (height_axes, touching_legs, walk.foot_z, "height of\nfoot [m]"),
@@ -247,33 +264,9 @@ def make_contact_panels(walk: xr.Dataset, width_inches: float, forces_only: bool
         axes.set_ylabel(panel_label)
     for axes in panel_axes[-3:]:
         axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4, zorder=0)
-    panel_axes[-1].set(xlabel="time [s]", xlim=foot_motion.sample_times[[0, -1]])
     add_side_legend(panel_axes[0] if forces_only else length_axes)
     figure.align_ylabels(panel_axes)
     return figure
-
-
-def _draw_contact_modes(
-    axes: Axes, walk: xr.Dataset, contact_modes: np.ndarray, touching_legs: list[int]
-) -> None:
-    """Draw a bar in the color of the contact mode for each foot while it touches the ground."""
-    for bar_row_index, leg_number in enumerate(touching_legs):
-        for start_time, end_time, contact_mode in find_constant_spans(
-            walk, contact_modes[:, leg_number - 1]
-        ):
-            if contact_mode != ContactMode.OFF:
-                axes.broken_barh(
-                    [(start_time, end_time - start_time)],
-                    (bar_row_index - 0.35, 0.7),
-                    color=CONTACT_MODE_COLORS[contact_mode],
-                )
-    axes.set_yticks(range(len(touching_legs)), list(map(str, touching_legs)))
-    axes.set(ylabel="foot on\nthe ground", ylim=(len(touching_legs) - 0.5, -0.5))
-    mode_handles = [
-        Patch(color=CONTACT_MODE_COLORS[contact_mode], label=CONTACT_MODE_NAMES[contact_mode])
-        for contact_mode in np.unique(contact_modes[contact_modes != ContactMode.OFF])
-    ]
-    add_side_legend(axes, mode_handles)
 
 
 def draw_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
@@ -287,7 +280,7 @@ def draw_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
     sample_indices = np.searchsorted(foot_motion.sample_times, stick_times)
     is_leg_drawn = foot_motion.contact_modes != ContactMode.OFF
     is_leg_drawn[:, :2] = True
-    has_contact_modes = reports_contact_modes(walk)
+    has_contact_modes = "contact" in walk
     line_width = 0.7 if has_contact_modes else 0.8
     for sample_index in sample_indices:
         drawn_legs = np.flatnonzero(is_leg_drawn[sample_index])

@@ -99,22 +99,17 @@ def fit_figure(result: FitResult, *, level: float = 0.95, width: FigureWidth = N
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=position_name != "time"))
     if columns:
         axes.legend(fontsize=7.0)
-        _draw_residuals(next(panels), result, positions, position_label)
+        axes = next(panels)
+        axes.axhspan(-2.0, 2.0, color=LIGHT_GRAY_COLOR, zorder=0)
+        for name in columns:
+            axes.plot(positions, table[f"{name}_residual"], ".", label=name)
+        axes.set(xlabel=position_label, ylabel="residual [standard errors]")
+        axes.legend(fontsize=7.0)
     for i, j in pairs:
         _draw_ellipse(next(panels), result, i, j, level)
     for axes in panels:
         axes.remove()
     return figure
-
-
-def _draw_residuals(
-    axes: Axes, result: FitResult, positions: np.ndarray, position_label: str
-) -> None:
-    axes.axhspan(-2.0, 2.0, color=LIGHT_GRAY_COLOR, zorder=0)
-    for name in result.data.names:
-        axes.plot(positions, result.residuals[f"{name}_residual"], ".", label=name)
-    axes.set(xlabel=position_label, ylabel="residual [standard errors]")
-    axes.legend(fontsize=7.0)
 
 
 def _draw_ellipse(axes: Axes, result: FitResult, i: int, j: int, level: float) -> None:

@@ -109,6 +109,7 @@ class FiguresByName(dict[str, Any]):
         )
 
 
+@figure_style()
 def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Figure]:
     """Return the figures of a scan, by name.
 
@@ -159,7 +160,6 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
     )
 
 
-@figure_style()
 def draw_scan_slices(
     scan: xr.Dataset, x: str, y: str, panel_column_parameter: str | None, width: FigureWidth
 ) -> Figure:
@@ -244,7 +244,6 @@ def draw_scan_slices(
     return figure
 
 
-@figure_style()
 def draw_scan_samples(
     scan: xr.Dataset, parameter_names: Sequence[str], width: FigureWidth
 ) -> Figure:
@@ -277,7 +276,6 @@ def draw_scan_samples(
     return figure
 
 
-@figure_style()
 def draw_parameter_pairs(
     scan: xr.Dataset, parameter_names: Sequence[str], width: FigureWidth
 ) -> Figure:
@@ -371,7 +369,6 @@ def _draw_outcome_samples(
     axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
 
 
-@figure_style()
 def draw_sobol_indices(indices: xr.Dataset, width: FigureWidth) -> Figure:
     """Return a figure of the Sobol' indices of each measure, with their confidence intervals."""
     measure_names = list(map(str, indices.measure.values))
@@ -423,7 +420,6 @@ def draw_sobol_indices(indices: xr.Dataset, width: FigureWidth) -> Figure:
     return figure
 
 
-@figure_style()
 def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
     """Return a figure of the measures in `SHOWN_MEASURE_NAMES` as functions of one parameter.
 

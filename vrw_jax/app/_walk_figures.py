@@ -1,6 +1,5 @@
 """Figures of walks: Figs 6 to 10 of the paper, and an animation of a walk."""
 
-import string
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from vrw_jax.app._contact_figures import (
     insert_landing_gaps,
     make_contact_mode_handles,
     make_contact_panels,
-    reports_contact_modes,
+    make_time_panels,
 )
 from vrw_jax.app.figure_style import (
     COLUMN_FIGURE_WIDTH_INCHES,
@@ -114,12 +113,12 @@ def _make_coordinate_panels(walk: xr.Dataset, width: FigureWidth) -> Figure:
     # A line has a gap at each event, where a reset may change the state.
     gaps = np.flatnonzero(np.diff(times) == 0.0) + 1
     width_inches = find_width_inches(width, 0.8 * PAGE_FIGURE_WIDTH_INCHES)
-    figure = StyledFigure(figsize=(width_inches, 0.6 + 1.25 * len(walk.data_vars)))
-    panel_axes = figure.subplots(len(walk.data_vars), 1, sharex=True, squeeze=False)[:, 0]
+    n_panels = len(walk.data_vars)
+    figure, panel_axes = make_time_panels(
+        width_inches, 0.6 + 1.25 * n_panels, [1.0] * n_panels, times
+    )
     step_ends = times[np.flatnonzero(np.diff(walk.step.values)) + 1]
-    for axes, (name, variable), letter in zip(
-        panel_axes, walk.data_vars.items(), string.ascii_lowercase, strict=False
-    ):
+    for axes, (name, variable) in zip(panel_axes, walk.data_vars.items(), strict=True):
         for start_time, end_time, mode in spans:
             tint = MODE_TINTS[mode % len(MODE_TINTS)]
             axes.axvspan(start_time, end_time, color=tint, linewidth=0.0, zorder=0)
@@ -128,8 +127,6 @@ def _make_coordinate_panels(walk: xr.Dataset, width: FigureWidth) -> Figure:
         axes.plot(np.insert(times, gaps, np.nan), np.insert(variable.values, gaps, np.nan), "k")
         unit = variable.attrs.get("units", "1")
         axes.set_ylabel(typeset_greek_symbols(str(name)) + f" [{unit}]" * (unit != "1"))
-        draw_panel_letter(axes, letter)
-    panel_axes[-1].set(xlabel="time [s]", xlim=(times[0], times[-1]))
     handles: list[Any] = [
         Patch(facecolor=MODE_TINTS[mode % len(MODE_TINTS)], edgecolor="#888888", linewidth=0.4,
               label=mode_names[mode].replace("_", " "))
@@ -167,24 +164,19 @@ def ground_forces(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
 def _make_gait_panels(gait: xr.Dataset, width: FigureWidth, forces_only: bool) -> Figure:
     _require_nonempty_walk("gait", gait)
     width_inches = find_width_inches(width, 0.8 * PAGE_FIGURE_WIDTH_INCHES)
-    if reports_contact_modes(gait):
+    if "contact" in gait:
         return make_contact_panels(gait, width_inches, forces_only)
     times, theta, L1, L2, rear_foot_height, *forces = (
         insert_landing_gaps(gait, gait[variable_name].values)
         for variable_name in ("time", "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES)
     )
-    panel_height_ratios = [1.5] if forces_only else [1, 1, 1, 1, 1.5]
-    figure = StyledFigure(figsize=(width_inches, 2.3 if forces_only else 7.4))
-    panel_axes = figure.subplots(
-        len(panel_height_ratios), 1, sharex=True, squeeze=False, height_ratios=panel_height_ratios
-    )[:, 0]
+    height, ratios = (2.3, [1.5]) if forces_only else (7.4, [1, 1, 1, 1, 1.5])
+    figure, panel_axes = make_time_panels(width_inches, height, ratios, times)
     leg_1_style, leg_2_style = (
         {"color": line_color, "linestyle": line_style}
         for line_color, line_style in LEG_LINE_STYLES.values()
     )
     if not forces_only:
-        for axes, panel_letter in zip(panel_axes, "abcde", strict=True):
-            draw_panel_letter(axes, panel_letter)
         angle_axes, length_axes, load_axes, height_axes, _ = panel_axes
         angle_axes.plot(times, theta, color="black")
         angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
@@ -207,9 +199,7 @@ def _make_gait_panels(gait: xr.Dataset, width: FigureWidth, forces_only: bool) -
             **(leg_1_style if i < 2 else leg_2_style),
         )
     force_axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4)
-    force_axes.set(
-        xlabel="time [s]", ylabel="ground reaction\nforce [N]", xlim=(times[0], times[-1])
-    )
+    force_axes.set_ylabel("ground reaction\nforce [N]")
     if forces_only and count_panel_columns(width_inches, 2) == 1:  # The names of phases are above.
         add_figure_legend(figure, force_axes.get_legend_handles_labels()[0], 4)
     else:
@@ -320,11 +310,6 @@ GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
 """Line styles of the gaits in one figure."""
 
 
-def _format_gait_label(gait: xr.Dataset, varied_parameter: str) -> str:
-    """Return the legend label of a gait: its varied parameter, such as "c = 50 N·s/m"."""
-    return format_value_label(varied_parameter, gait.attrs[f"parameter_{varied_parameter}"])
-
-
 @figure_style()
 def foot_height(
     gaits: Sequence[xr.Dataset], vary: str = "damping", *, width: FigureWidth = None
@@ -353,7 +338,7 @@ def foot_height(
         foot_height_mm = 1e3 * gait.foot_2_z
         lowest_mm = float(foot_height_mm.min())
         clearance_text = f"lowest −{-lowest_mm:.1f} mm" if lowest_mm < -1e-6 else "clear"
-        gait_label = _format_gait_label(gait, vary)
+        gait_label = format_value_label(vary, gait.attrs[f"parameter_{vary}"])
         step_axes.plot(gait.time, gait.foot_2_z, linestyle=line_style, label=gait_label)
         takeoff_axes.plot(gait.time, foot_height_mm, linestyle=line_style, label=clearance_text)
     for panel_letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
@@ -362,8 +347,8 @@ def foot_height(
         axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
         axes.set_xlabel("time since landing [s]")
         axes.legend(loc="upper left")
-    min_height = min(float(gait.foot_2_z.min()) for gait in gaits)
-    max_height = max(float(gait.foot_2_z.max()) for gait in gaits)
+    heights = np.concatenate([gait.foot_2_z for gait in gaits])
+    min_height, max_height = heights.min(), heights.max()
     takeoff_times = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
     step_axes.set(
         xlim=(0.0, max(float(gait.time.max()) for gait in gaits)),
@@ -414,7 +399,7 @@ def rear_force(
             double_support.time,
             double_support.lambda_4,
             linestyle=line_style,
-            label=_format_gait_label(gait, vary),
+            label=format_value_label(vary, gait.attrs[f"parameter_{vary}"]),
         )
         axes.plot(
             0.0,
@@ -578,7 +563,7 @@ def walk_frames(
         sample_index = _draw_wheel_at_time(axes, foot_motion, t, rotate_to_view)
         camera_x, camera_z = rotate_to_view((camera_position, 0.75))
         axes.set(xlim=(camera_x - 1.35, camera_x + 1.35), ylim=(camera_z - 1.25, camera_z + 1.225))
-        if reports_contact_modes(step):
+        if "contact" in step:
             legend_handles = make_contact_mode_handles(foot_motion.contact_modes)
             axes.legend(handles=legend_handles, loc="lower left", fontsize=8)
         else:

@@ -150,13 +150,13 @@ class PaperClaimGroup:
         claim_value_namespace = SimpleNamespace(**claim_values_by_name)
         return [
             PaperFact(
-                group=self.group_title,
-                claim=paper_claim.claim,
-                source=paper_claim.source,
-                published_value=paper_claim.published_value,
-                computed=paper_claim.computed_value_format.format(**claim_values_by_name),
-                holds=bool(paper_claim.agreement_test(claim_value_namespace)),
-                tolerance_reason=paper_claim.tolerance_reason,
+                self.group_title,
+                paper_claim.claim,
+                paper_claim.source,
+                paper_claim.published_value,
+                paper_claim.computed_value_format.format(**claim_values_by_name),
+                bool(paper_claim.agreement_test(claim_value_namespace)),
+                paper_claim.tolerance_reason,
             )
             for paper_claim in self.claims
         ]

@@ -88,21 +88,6 @@ def simulate_gaits_at_dampings(dampings: Sequence[float]) -> list[xr.Dataset]:
     return gait_trajectories
 
 
-def measure_gaits_along_damping(on_progress: Callable[[float], None] | None = None) -> xr.Dataset:
-    """Return the measures of the gaits for integer c from 1 to 219 N s/m, for Fig. 10 of the paper.
-
-    The dataset also contains the walks for c up to 224 N s/m.
-    """
-    params, start_state = WheelParams(), find_table_1_section_state()
-    gaits_on_each_side = [
-        measure_gaits_along_parameter(
-            params, "damping", range(200, 0, -1), start_state, on_progress
-        ),
-        measure_gaits_along_parameter(params, "damping", range(201, 225), start_state),
-    ]
-    return xr.concat(gaits_on_each_side, "damping", data_vars="minimal", combine_attrs="override")
-
-
 def collect_paper_evidence(
     on_progress: ReproductionProgressCallback = ignore_progress,
 ) -> PaperEvidence:
@@ -114,8 +99,17 @@ def collect_paper_evidence(
 
     task_name = "gaits along c from 1 to 224"
     on_progress(0.1, task_name)
-    damping_branch = measure_gaits_along_damping(
-        lambda completed_fraction: on_progress(0.1 + 0.5 * completed_fraction, task_name)
+    report = lambda fraction: on_progress(0.1 + 0.5 * fraction, task_name)
+    start = table_1_wheel, "damping"
+    table_1_state = find_table_1_section_state()
+    damping_branch = xr.concat(
+        [
+            measure_gaits_along_parameter(*start, range(200, 0, -1), table_1_state, report),
+            measure_gaits_along_parameter(*start, range(201, 225), table_1_state),
+        ],
+        "damping",
+        data_vars="minimal",
+        combine_attrs="override",
     )
 
     on_progress(0.65, "gaits at slope 0.10")

@@ -40,12 +40,6 @@ def write_figures(
     ]
 
 
-def write_scan_figures(scan: xr.Dataset, folder: Path, figure_config: FigureConfig) -> list[Path]:
-    """Write the figures of a scan, and return the paths."""
-    figure_by_name = plot.scan_figures(scan, width=figure_config.width)
-    return write_figures(figure_by_name, folder, figure_config)
-
-
 def write_tuning_report(
     tune_result: TuneResult, folder: Path, figure_config: FigureConfig | None
 ) -> list[Path]:

@@ -119,9 +119,11 @@ def draw_scan_figures(
         for figure_path in figure_paths:
             stdout_console.print(f"up to date: {figure_path}", highlight=False, soft_wrap=True)
         return
-    from vrw_jax.app.reports import write_scan_figures
+    from vrw_jax import plot
+    from vrw_jax.app.reports import write_figures
 
-    figure_paths = write_scan_figures(scan_dataset, store_path.parent, figure_config)
+    figures = plot.scan_figures(scan_dataset, width=figure_config.width)
+    figure_paths = write_figures(figures, store_path.parent, figure_config)
     figure_record = figure_origin | {"files": [str(path) for path in figure_paths]}
     record_path.write_text(json.dumps(figure_record, indent=2), encoding="utf-8")
     printing.print_written_paths(figure_paths)
