@@ -16,7 +16,7 @@ import xarray as xr
 import vrw_jax as vrw
 from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
-from vrw_jax.studies.fit_laws import make_leg_laws
+from vrw_jax.studies.fit import make_leg_laws
 
 N_EXPERIMENTS, SEED = 4_000, 20_261_129
 DAMPING = 150.0  # N s/m

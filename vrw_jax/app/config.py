@@ -311,7 +311,7 @@ class Config:
     tune: TuneConfig | None = None
     branch: BranchConfig | None = None
     figures: FigureConfig = dataclasses.field(default_factory=FigureConfig)
-    design: designs.AbstractSampleDesign | None = None
+    design: designs.SampleDesign | None = None
     source_text: str = ""
     file_name: str = ""
 
@@ -557,7 +557,7 @@ def _read_parameters(table: ConfigTable, kind: Any) -> dict[str, Any]:
 
 def _parse_design_table(
     kind: str, table: ConfigTable, allowed_parameter_names: tuple[str, ...]
-) -> designs.AbstractSampleDesign:
+) -> designs.SampleDesign:
     """Return the sample design that a table defines.
 
     It may sweep only parameters in `allowed_parameter_names`.

@@ -50,8 +50,9 @@ from vrw_jax.models.stepping import (
     convert_step_options,
     require_single_wheel,
 )
+from vrw_jax.studies.scan_design import draw_unit_points
 from vrw_jax.wheel import transitions
-from vrw_jax.wheel.params import WheelParams, compute_wheel_units
+from vrw_jax.wheel.params import compute_wheel_units
 
 StartGrid = Mapping[str, float | Sequence[float] | np.ndarray]
 """One or more values of each component of a start, by name. A component with a single number is not
@@ -213,23 +214,15 @@ def select_start_components(
 def embed_starts(
     params: Any, model: Any, component_names: tuple[str, ...], starts: np.ndarray
 ) -> np.ndarray:
-    """Return the section states of starts, which are those of a walker of the user themselves."""
-    if is_own_walker(model):
-        return starts
-    section_states = compute_section_states_of_starts(params, component_names, starts)
-    embed = functools.partial(model.complete_section_state, params)
-    return np.asarray(jax.vmap(embed)(jnp.asarray(section_states)))
-
-
-def compute_section_states_of_starts(
-    params: WheelParams, start_component_names: tuple[str, ...], starts: np.ndarray
-) -> np.ndarray:
-    """Return section states for starts before touchdown or after landing, shape (starts, 3).
+    """Return the section states of starts before touchdown or after landing, or of starts of a
+    walker of the user, which are section states themselves.
 
     A start after landing is (theta+, dtheta+). Its section state is that with dL1- = 0 whose
     landing results in this start. The angular rates before and after this landing are proportional.
     A section state is NaN if no landing leads to the start.
     """
+    if is_own_walker(model):
+        return starts
     s = params.symbols()
 
     def find_section_state_before(post_landing_state: jax.Array) -> jax.Array:
@@ -245,10 +238,11 @@ def compute_section_states_of_starts(
             jnp.nan,
         )
 
-    section_states = starts
-    if start_component_names == POST_LANDING_COMPONENT_NAMES:
-        section_states = np.asarray(jax.vmap(find_section_state_before)(jnp.asarray(starts)))
-    return np.where(np.isfinite(section_states).all(-1, keepdims=True), section_states, np.nan)
+    if component_names == POST_LANDING_COMPONENT_NAMES:
+        starts = np.asarray(jax.vmap(find_section_state_before)(jnp.asarray(starts)))
+    starts = np.where(np.isfinite(starts).all(-1, keepdims=True), starts, np.nan)
+    embed = functools.partial(model.complete_section_state, params)
+    return np.asarray(jax.vmap(embed)(jnp.asarray(starts)))
 
 
 def _make_orbit_variables(
@@ -573,7 +567,7 @@ def basin_share(
     """
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
     check_choice("sampling", sampling, get_args(StartSamplingName))
-    seed, box_bounds = check_int("seed", seed, 0), parse_start_box(box, model)
+    box_bounds = parse_start_box(box, model)
     stable_gait = StableGait.from_cycle("vrw.basin_share", params, model, cycle, options)
     return compute_basin_share(stable_gait, box_bounds, n_starts, max_steps, sampling, seed)
 
@@ -592,16 +586,8 @@ def compute_basin_share(
 ) -> BasinShare:
     """Return the `BasinShare` for a stable gait and for valid arguments of `basin_share`."""
     start_component_names, lower_bounds, upper_bounds = box_bounds
-    n_start_components = len(start_component_names)
-    random_generator = np.random.default_rng(seed)
-    if sampling_name == "random":
-        unit_cube_points = random_generator.random((n_starts, n_start_components))
-    else:
-        from scipy.stats import qmc  # This import is slow.
-
-        sobol_sampler = qmc.Sobol(n_start_components, rng=random_generator)
-        unit_cube_points = sobol_sampler.random_base2((n_starts - 1).bit_length())[:n_starts]
-    starts = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
+    points = draw_unit_points(sampling_name, n_starts, len(start_component_names), seed)
+    starts = lower_bounds + (upper_bounds - lower_bounds) * points
     start_states = embed_starts(
         stable_gait.params, stable_gait.model, start_component_names, starts
     )

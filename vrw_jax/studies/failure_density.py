@@ -55,14 +55,12 @@ class GaussianMixture(NamedTuple):
 
         The weight of this mixture is 1 - `added_mixture_weight`.
         """
-        weighted_mixtures = [
-            mixture._replace(gaussian_weights=mixture_weight * mixture.gaussian_weights)
-            for mixture, mixture_weight in (
-                (self, 1.0 - added_mixture_weight),
-                (added_mixture, added_mixture_weight),
-            )
-        ]
-        return concatenate_tree_rows(*weighted_mixtures)
+        scale = lambda mixture, weight: mixture._replace(
+            gaussian_weights=weight * mixture.gaussian_weights
+        )
+        return concatenate_tree_rows(
+            scale(self, 1.0 - added_mixture_weight), scale(added_mixture, added_mixture_weight)
+        )
 
     def compute_gaussian_log_densities(self, slope_deviations: np.ndarray) -> np.ndarray:
         """Return the logarithm of each Gaussian's density times its weight, shape (components,

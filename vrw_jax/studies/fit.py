@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -25,13 +26,12 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import list_parameters
+from vrw_jax.base.parameters import list_parameters, parameter
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.finder_selection import resolve_finder
 from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_model
 from vrw_jax.studies import fit_data, fit_problem
-from vrw_jax.studies.fit_laws import make_leg_laws
 from vrw_jax.studies.fit_problem import FitProblem, FitTarget, solve_fits
 from vrw_jax.studies.fit_result import FitResult, make_result, summarize
 
@@ -145,14 +145,13 @@ def fit(
         entries = fit_problem.START_NAMES[:2]
     model = finder.model
     domains, parameter_names = model.parameter_domains, model.parameter_names
-    table = fit_data.read_data(data, covariance, units, parameter_names)
-    fit_data.check_plausible(table, units, time_unit)
+    table = fit_data.read_data(data, covariance, units, parameter_names, time_unit)
     if table.kind == "series" and not model.is_compliant:
         raise ValueError(
             "data have a column 'time', but series need legs with springs: fit the steps or gaits."
         )
-    labels = table.labels.get("walk", np.zeros(table.values.shape[1]))
-    walks, row_walks = np.unique(labels, return_inverse=True)
+    n_rows = table.values.shape[1]
+    walks, row_walks = np.unique(table.labels.get("walk", np.zeros(n_rows)), return_inverse=True)
     starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
     first_states: Any = _find_first_states(
         table.kind, params, finder, start, len(walks), table.conditions
@@ -167,23 +166,24 @@ def fit(
         for entry in entries
         if has_unknown_starts
     ]
-    row_steps = table.labels.get("step")
-    n_steps = 1
+    row_steps, times, n_steps = table.labels.get("step"), table.labels.get("time"), 1
     if row_steps is not None:
         row_steps = row_steps.astype(int) - int(row_steps.min())
         n_steps = int(row_steps.max()) + 1
-    times = table.labels.get("time")
-    if times is not None:
+    if times is None:
+        window = None
+    else:
         spacing = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
         window = spacing if window is None else float(check_real("window", window))
-    if times is not None and window is not None and not starts_from_gait:
-        if times.min() < window:
-            raise ValueError(
-                f"the series begins {times.min():g} s after the first touchdown, but its samples "
-                f"are means over {window:g} s before and after them: begin later, or give window=."
-            )
-        last_time = float(times.max()) + window
-        n_steps = max(n_steps, _count_steps(finder, params, first_states, last_time, options))
+        if not starts_from_gait:
+            if times.min() < window:
+                raise ValueError(
+                    f"the series begins {times.min():g} s after the first touchdown, but its "
+                    f"samples are means over {window:g} s before and after them: begin later, or "
+                    "give window=."
+                )
+            last_time = float(times.max()) + window
+            n_steps = max(n_steps, _count_steps(finder, params, first_states, last_time, options))
     offset_names = [f"{name}{fit_problem.OFFSET_SUFFIX}" for name in parameter_names]
     if table.kind == "series":
         offset_names.append(fit_problem.TIME_OFFSET)
@@ -207,17 +207,9 @@ def fit(
     first = np.array([float(known_values.get(name, 0.0)) for name in (*free, *extra)])
     if start_names:
         first = np.append(first, first_states[:, : len(entries)])
-    lower, upper = _collect_bounds(unknown_names, bounds, domains, first)
-    prior_means, prior_weights = np.zeros(len(first)), np.zeros(len(first))
-    for name, prior in priors.items():
-        mean, width = (check_real(f"the prior of {name}", x) for x in prior)
-        if width <= 0.0:
-            raise ValueError(
-                f"the prior of {name} has the standard deviation {width:g}, but it is positive: "
-                "give (mean, standard deviation)."
-            )
-        index = unknown_names.index(name)
-        prior_means[index], prior_weights[index] = mean, 1.0 / width
+    lower, upper, scale, prior_means, prior_weights = _describe_unknowns(
+        unknown_names, first, bounds, priors, domains
+    )
     n_numbers = table.values[0].size + len(priors)
     if n_numbers < len(first):
         raise ValueError(
@@ -225,21 +217,25 @@ def fit(
             f"{', '.join(unknown_names)}), which cannot be estimated from fewer: measure more, or "
             "give start= or fewer free parameters."
         )
-    widths = [priors[x][1] if x in priors else _guess_scale(x, domains) for x in unknown_names]
-    as_array = lambda x: None if x is None else jnp.asarray(x)
+    arrays = jax.tree.map(
+        jnp.asarray,
+        {
+            "base_values": tuple(base_values),
+            "conditions": _arrange_conditions(table, model, row_walks, row_steps, n_steps),
+            "row_walks": row_walks,
+            "row_steps": row_steps,
+            "times": times,
+            "window": window,
+            "starts": first_states,
+            "whitener": table.whitener,
+        },
+    )
     problem = FitProblem(
         finder=finder,
-        base_values=tuple(map(jnp.asarray, base_values)),
-        conditions=_arrange_conditions(table, model, row_walks, row_steps, n_steps, len(walks)),
-        row_walks=jnp.asarray(row_walks),
-        row_steps=as_array(row_steps),
-        times=as_array(times),
-        window=None if times is None else jnp.asarray(window),
-        starts=as_array(first_states),
-        whitener=jnp.asarray(table.whitener),
+        **arrays,
         lower=lower,
         upper=upper,
-        scale=np.where(first == 0.0, widths, np.abs(first)),
+        scale=scale,
         options=options,
         names=table.names,
         unknown_names=unknown_names,
@@ -250,25 +246,14 @@ def fit(
         starts_from_gait=starts_from_gait,
         observe=observe,
     )
-    targets = FitTarget(
-        table.values,
-        np.ones((1, table.values.shape[1])),
-        prior_means[None],
-        prior_weights[None],
-    )
-    n_candidates = 1 if n_starts == 1 else max(n_starts, N_CANDIDATES)
-    candidates = _make_candidates(first, lower, upper, bounds, unknown_names, free, n_candidates)
-    starts = fit_problem.select_starts(problem, targets, candidates, n_starts)
+    targets = FitTarget(table.values, np.ones((1, n_rows)), prior_means[None], prior_weights[None])
+    starts = _choose_starts(problem, targets, first, {*bounds}, {*free}, n_starts)
+    units = {**units, **{name: domain.unit for name, domain in domains.items()}, "time": "s"}
     quantities = [
-        name.removesuffix(fit_problem.OFFSET_SUFFIX)
-        .removeprefix(fit_problem.START_PREFIX)
-        .partition("[")[0]
+        name.removesuffix(fit_problem.OFFSET_SUFFIX).removeprefix(fit_problem.START_PREFIX)
         for name in unknown_names
     ]
-    unknown_units = tuple(
-        "s" if name == "time" else domains[name].unit if name in domains else units.get(name, "1")
-        for name in quantities
-    )
+    unknown_units = tuple(units.get(name.partition("[")[0], "1") for name in quantities)
     walker = problem.unpack(problem.base_values)[0]
     arguments = table, unknown_units, params, walker
     mean_targets = targets._replace(values=targets.values.mean(0, keepdims=True))
@@ -385,48 +370,59 @@ def _count_steps(
     return n_needed
 
 
-def _collect_bounds(
-    names: Sequence[str], bounds: Mapping[str, Any], domains: Mapping[str, Any], first: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    lower, upper = np.full(len(names), -np.inf), np.full(len(names), np.inf)
-    for i, name in enumerate(names):
+def _describe_unknowns(
+    names: Sequence[str],
+    first: np.ndarray,
+    bounds: Mapping[str, Any],
+    priors: Mapping[str, Any],
+    domains: Mapping[str, Any],
+) -> tuple[np.ndarray, ...]:
+    """Return bounds, typical sizes, and means and inverse widths of the priors of unknowns."""
+    rows = []
+    for name, start in zip(names, first, strict=True):
+        domain, mean, weight = domains.get(name), 0.0, 0.0
+        low, high = (domain.lower_bound, domain.upper_bound) if domain else (-np.inf, np.inf)
+        size = 10.0 if domain and domain.unit != "1" else 1.0
+        if name.endswith(fit_problem.OFFSET_SUFFIX):
+            size = 0.01  # s or rad
         if name in bounds:
-            lower[i], upper[i] = check_range(f"the range of {name}", bounds[name])
-            if not lower[i] <= first[i] <= upper[i]:
+            low, high = check_range(f"the range of {name}", bounds[name])
+            if not low <= start <= high:
                 raise ValueError(
-                    f"the start has {name} {first[i]:g}, outside its bounds ({lower[i]:g}, "
-                    f"{upper[i]:g}): widen the bounds, or start inside them."
+                    f"the start has {name} {start:g}, outside its bounds ({low:g}, {high:g}): "
+                    "widen the bounds, or start inside them."
                 )
-        elif name in domains:
-            lower[i] = domains[name].lower_bound
-            upper[i] = domains[name].upper_bound
+        if name in priors:
+            mean, size = (check_real(f"the prior of {name}", x) for x in priors[name])
+            if size <= 0.0:
+                raise ValueError(
+                    f"the prior of {name} has the standard deviation {size:g}, but it is "
+                    "positive: give (mean, standard deviation)."
+                )
+            weight = 1.0 / size
+        rows.append((low, high, abs(start) or size, mean, weight))
+    lower, upper, *others = np.array(rows).T
     large = 1e30  # beyond it, a bound is that of floating-point numbers
-    return np.where(lower < -large, -np.inf, lower), np.where(upper > large, np.inf, upper)
-
-
-def _guess_scale(name: str, domains: Mapping[str, Any]) -> float:
-    """Return the typical size of an unknown whose first value is zero."""
-    if name.endswith(fit_problem.OFFSET_SUFFIX):
-        return 0.01  # s or rad
-    return 10.0 if name in domains and domains[name].unit != "1" else 1.0
+    lower, upper = np.where(lower < -large, -np.inf, lower), np.where(upper > large, np.inf, upper)
+    return lower, upper, *others
 
 
 def _arrange_conditions(
     table: fit_data.FitData,
     model: Any,
-    row_walks: Any,
-    row_steps: Any,
+    row_walks: np.ndarray,
+    row_steps: np.ndarray | None,
     n_steps: int,
-    n_walks: int,
 ) -> dict[str, Any]:
     """Return the conditions of each row of gaits, or of each walk and its steps."""
     if table.kind == "gaits":
-        return {name: jnp.asarray(x) for name, x in table.conditions.items()}
+        return dict(table.conditions)
+    n_walks = row_walks.max() + 1
     arranged = {}
     for name, column in table.conditions.items():
         by_walk = [column[row_walks == walk] for walk in range(n_walks)]
         if name != fit_data.HEIGHT_COLUMN and all(np.ptp(x) == 0.0 for x in by_walk):
-            arranged[name] = jnp.asarray([x[0] for x in by_walk])
+            arranged[name] = np.array([x[0] for x in by_walk])
             continue
         if row_steps is None or (model.is_wheel and name not in ("slope", fit_data.HEIGHT_COLUMN)):
             raise ValueError(
@@ -438,28 +434,72 @@ def _arrange_conditions(
         values[row_walks, row_steps] = column
         if name == fit_data.HEIGHT_COLUMN:
             values = np.concatenate([np.zeros((n_walks, 1)), values], 1)
-        arranged[name] = jnp.asarray(values)
+        arranged[name] = values
     return arranged
 
 
-def _make_candidates(
+def _choose_starts(
+    problem: FitProblem,
+    targets: FitTarget,
     first: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    bounds: Mapping[str, Any],
-    names: Sequence[str],
-    free: Sequence[str],
-    n_candidates: int,
+    bounded: Collection[str],
+    free: Collection[str],
+    n_starts: int,
 ) -> np.ndarray:
-    """Return candidates for the starts of searches: the given walker, and random ones around it."""
+    """Return the starts of searches: the given walker, and the best of random ones around it."""
+    n_candidates = 1 if n_starts == 1 else max(n_starts, N_CANDIDATES)
     shares = np.random.default_rng(0).random((n_candidates, len(first)))
-    starts = np.tile(first, (n_candidates, 1))
-    for i, name in enumerate(names):
-        if name in bounds:
-            starts[1:, i] = lower[i] + shares[1:, i] * (upper[i] - lower[i])
+    candidates = np.tile(first, (n_candidates, 1))
+    for i, name in enumerate(problem.unknown_names):
+        if name in bounded:
+            width = problem.upper[i] - problem.lower[i]
+            candidates[1:, i] = problem.lower[i] + shares[1:, i] * width
         elif name in free and first[i] != 0.0:
-            starts[1:, i] = first[i] * START_RANGE_FACTOR ** (2.0 * shares[1:, i] - 1.0)
-    return np.clip(starts, lower, upper)
+            candidates[1:, i] = first[i] * START_RANGE_FACTOR ** (2.0 * shares[1:, i] - 1.0)
+    candidates = np.clip(candidates, problem.lower, problem.upper)
+    if n_candidates == n_starts:
+        return candidates
+    chi2 = fit_problem.measure_candidates(problem, targets, candidates)
+    best = 1 + np.argsort(np.asarray(chi2)[1:], kind="stable")[: n_starts - 1]
+    return candidates[np.append(0, best)]
+
+
+class QuadraticDamper(eqx.Module):
+    """The paper's leg with a quadratic damper in addition."""
+
+    c2: float = parameter(
+        0.0, unit="N s^2/m^2", symbol="c_2", domain=(0.0, math.inf), meaning="quadratic damping"
+    )
+
+    def __call__(self, L: Any, dL: Any, params: Any) -> Any:
+        spring = params.stiffness * (params.natural_length - L)
+        return spring - params.damping * dL - self.c2 * jnp.abs(dL) * dL
+
+
+class ProgressiveSpring(eqx.Module):
+    """The paper's leg with a spring that becomes stiffer."""
+
+    k3: float = parameter(
+        0.0, unit="N/m^3", symbol="k_3", domain=(0.0, math.inf), meaning="cubic stiffness"
+    )
+
+    def __call__(self, L: Any, dL: Any, params: Any) -> Any:
+        compression = params.natural_length - L
+        return params.stiffness * compression + self.k3 * compression**3 - params.damping * dL
+
+
+def make_leg_laws(params: Any) -> dict[str, Any]:
+    """Return the laws that `compare_laws` always compares, by name. None is the paper's law.
+
+    A search starts at their values, at which the forces change by some per cent. At zero, a bound,
+    a search would not move.
+    """
+    length, speed = params.locked_length, jnp.sqrt(params.gravity * params.locked_length)
+    return {
+        "linear": None,
+        "quadratic damper": QuadraticDamper(float(0.3 * params.damping / speed)),
+        "progressive spring": ProgressiveSpring(float(4.0 * params.stiffness / length**2)),
+    }
 
 
 @announce_wait("predictions with derivatives, and their fit for each law", "60 s")
@@ -521,30 +561,25 @@ def compare_laws(
         law_names = [x.name for x in list_parameters(law_model.leg_force, "leg")]
         fits[name] = fit(data, params, (*free, *law_names), model=law_model, **fit_options)
         prediction_errors.append(_predict_left_out(fits[name], n_folds))
-    columns: dict[str, Any] = {
-        "chi2": [x.chi2 for x in fits.values()],
-        "n_unknowns": [len(x.names) for x in fits.values()],
-        "p_value": [x.p_value for x in fits.values()],
-        "prediction_error": prediction_errors,
-        "converged": [x.converged for x in fits.values()],
+    stack = lambda name: np.array([getattr(x, name) for x in fits.values()])
+    chi2, n_unknowns = stack("chi2"), np.array([len(x.names) for x in fits.values()])
+    dims = ("law", fit_data.DATASET_DIMENSION)[: chi2.ndim]
+    aic = (chi2.T + 2.0 * n_unknowns).T
+    columns = {
+        "chi2": chi2,
+        "n_unknowns": n_unknowns,
+        "p_value": stack("p_value"),
+        "prediction_error": np.array(prediction_errors),
+        "converged": stack("converged"),
+        "aic": aic,
+        "aic_difference": aic - aic.min(0),
     }
-    has_batch = np.ndim(columns["chi2"]) > 1
-    dims = ("law", *(fit_data.DATASET_DIMENSION,) * has_batch)
-    aic = np.asarray(columns["chi2"]) + 2.0 * np.expand_dims(
-        np.asarray(columns["n_unknowns"]), 1 if has_batch else ()
-    )
-    columns |= {"aic": aic, "aic_difference": aic - aic.min(0)}
-    names = list(laws)
-    table = xr.Dataset(
-        {
-            name: (dims if np.ndim(x) == len(dims) else dims[:1], np.asarray(x))
-            for name, x in columns.items()
-        },
+    names = np.array(list(laws))
+    return xr.Dataset(
+        {name: (dims[: x.ndim], x) for name, x in columns.items()},
         {"law": names},
+        {"best": names[aic.argmin(0)] if chi2.ndim > 1 else str(names[aic.argmin()]), "fits": fits},
     )
-    table.attrs["best"] = np.array(names)[aic.argmin(0)] if has_batch else names[int(aic.argmin())]
-    table.attrs["fits"] = fits
-    return table
 
 
 def _predict_left_out(result: FitResult, n_folds: int) -> Any:
@@ -553,18 +588,17 @@ def _predict_left_out(result: FitResult, n_folds: int) -> Any:
     The rows are divided into parts, of which each is left out in turn.
     """
     n_rows = result.data.values.shape[1]
-    is_batch = result.values.ndim > 1
-    shape = (len(result.values),) if is_batch else ()
+    targets = result.target
+    if result.values.ndim == 1:
+        targets = FitTarget(*(x[None] for x in targets))
+    squares = np.zeros(result.values.shape[:-1])
     if not n_folds:
-        return np.full(shape, np.nan)[()]
-    n_folds = min(n_folds, n_rows)
-    squares = np.zeros(shape)
-    for fold in range(n_folds):
-        is_left_out = np.arange(n_rows) % n_folds == fold
-        targets = result.target if is_batch else FitTarget(*(x[None] for x in result.target))
-        kept = targets._replace(row_weights=np.where(is_left_out, 0.0, 1.0)[None])
+        return squares + np.nan
+    for fold in range(n_folds := min(n_folds, n_rows)):
+        is_left_out = np.arange(n_rows)[None] % n_folds == fold
+        kept = targets._replace(row_weights=1.0 - is_left_out)
         solution = solve_fits(result.problem, kept, np.atleast_2d(result.values))
-        left_out = targets._replace(row_weights=np.where(is_left_out, 1.0, 0.0)[None])
+        left_out = targets._replace(row_weights=1.0 * is_left_out)
         whitened = summarize(result.problem, left_out, solution).whitened
-        squares = squares + (whitened**2).sum((-2, -1)).reshape(shape)
+        squares = squares + (whitened**2).sum((-2, -1)).reshape(squares.shape)
     return np.sqrt(squares / result.data.values[0].size)[()]

@@ -67,12 +67,19 @@ class FitData(NamedTuple):
 
 
 def read_data(
-    data: Any, covariance: Any, units: Mapping[str, str], conditions: Sequence[str]
+    data: Any,
+    covariance: Any,
+    units: Mapping[str, str],
+    conditions: Sequence[str],
+    time_unit: float | None,
 ) -> FitData:
     """Return the numbers of a table, or raise an error with one sentence.
 
+    Durations and fractions that no gait can have are errors too.
+
     - `units`: SI units of the columns that the walker knows;
-    - `conditions`: names of its parameters, which a table may contain for each row.
+    - `conditions`: names of its parameters, which a table may contain for each row;
+    - `time_unit`: square root of leg length over gravity, s; None if the walker has no leg.
     """
     table, given_units = _read_table(data)
     table = {name: np.atleast_1d(column) for name, column in table.items()}
@@ -121,6 +128,22 @@ def read_data(
     values = np.stack(np.broadcast_arrays(*(repeat(table[name]) for name in names)), -1)
     errors, whitener = _read_errors(table, names, covariance, values.shape[-2:])
     is_batch = values.ndim == 3
+    for i, name in enumerate(names):
+        is_duration = name == "period" or name.startswith("duration")
+        low, high = float(values[..., i].min()), float(values[..., i].max())
+        is_negative = is_duration and low < -NOISE_RANGE * errors[:, i].max()
+        if is_negative or (name == "period" and low <= 0.0):
+            raise ValueError(f"{name} is {low:g} s, but time passes in a step: check the sign.")
+        if name.endswith("_fraction") and not 0.0 <= low <= high <= 1.0:
+            raise ValueError(
+                f"{name} is {high if high > 1.0 else low:g}, but a fraction lies between 0 and 1: "
+                "state the unit % if it is a percentage."
+            )
+        if is_duration and time_unit and high > SLOWEST_PERIOD * time_unit:
+            raise ValueError(
+                f"{name} is {high:g} s, but a step of these legs takes less than "
+                f"{SLOWEST_PERIOD * time_unit:.3g} s: state the unit, as ms."
+            )
     return FitData(
         kind,
         names,
@@ -133,29 +156,6 @@ def read_data(
     )
 
 
-def check_plausible(data: FitData, units: Mapping[str, str], time_unit: float | None) -> None:
-    """Raise a `ValueError` for durations, speeds and fractions that no gait can have.
-
-    - `time_unit`: square root of leg length over gravity, s; None if the walker has no leg.
-    """
-    for name, column in zip(data.names, np.moveaxis(data.values, -1, 0), strict=True):
-        is_duration = name == "period" or name.startswith("duration")
-        low, high = float(column.min()), float(column.max())
-        noise = NOISE_RANGE * data.errors[:, data.names.index(name)].max()
-        if (is_duration and low < -noise) or (name == "period" and low <= 0.0):
-            raise ValueError(f"{name} is {low:g} s, but time passes in a step: check the sign.")
-        if name.endswith("_fraction") and not 0.0 <= low <= high <= 1.0:
-            raise ValueError(
-                f"{name} is {high if high > 1.0 else low:g}, but a fraction lies between 0 and 1: "
-                "state the unit % if it is a percentage."
-            )
-        if is_duration and time_unit and high > SLOWEST_PERIOD * time_unit:
-            raise ValueError(
-                f"{name} is {high:g} s, but a step of these legs takes less than "
-                f"{SLOWEST_PERIOD * time_unit:.3g} s: state the unit, as ms."
-            )
-
-
 def _read_table(data: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return the columns of any form of data by name, and their stated units."""
     units: dict[str, str] = {}
@@ -166,7 +166,15 @@ def _read_table(data: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     elif isinstance(data, xr.Dataset):
         variables = {str(name): x for name, x in data.variables.items()}
         units = {name: x.attrs["units"] for name, x in variables.items() if "units" in x.attrs}
-        columns = {name: _order_axes(name, x) for name, x in variables.items()}
+        columns = {}
+        for name, x in variables.items():
+            if len({*x.dims} - {DATASET_DIMENSION}) > 1 and name != COVARIANCE_NAME:
+                raise ValueError(
+                    f"{name} has the dimensions {x.dims}, but a column has one, and perhaps "
+                    f"{DATASET_DIMENSION!r}: stack the others, as in data.stack(row=(...))."
+                )
+            # The data sets are first, and the rows last.
+            columns[name] = x.values.T if x.dims[-1:] == (DATASET_DIMENSION,) else x.values
         columns.pop(DATASET_DIMENSION, None)
         if COVARIANCE_NAME in columns:
             columns[COVARIANCE_NAME] = data[COVARIANCE_NAME].values
@@ -193,17 +201,6 @@ def _read_table(data: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
             ) from None
         table[name] = check_numpy_reals(name, numbers)
     return table, units
-
-
-def _order_axes(name: str, variable: xr.Variable) -> np.ndarray:
-    """Return a variable with the dimension over data sets first, and the rows last."""
-    dimensions = [x for x in variable.dims if x != DATASET_DIMENSION]
-    if len(dimensions) > 1 and name != COVARIANCE_NAME:
-        raise ValueError(
-            f"{name} has the dimensions {variable.dims}, but a column has one, and perhaps "
-            f"{DATASET_DIMENSION!r}: stack the others, as in data.stack(row=(...))."
-        )
-    return variable.values.T if variable.dims[-1:] == (DATASET_DIMENSION,) else variable.values
 
 
 def _read_errors(

@@ -180,14 +180,23 @@ class FitProblem(eqx.Module):
         """Return the prediction of all measured numbers for the unknowns `x`, in SI units."""
         model = self.finder.model
         if self.kind == "series" and model.is_wheel and model.reports_contacts:
-            return Prediction(*_predict_with_differences(x, self))
+            return _predict_with_differences(x, self)
         return self.predict_exactly(x)
 
     def predict_exactly(self, x: Float[Array, " unknowns"]) -> Prediction:
         """Return the prediction with the derivatives of steps, events and gaits."""
         values, others = self.place_unknowns(x)
         extra = {name: others[name] for name in self.extra_names}
-        select = lambda columns: self._select_columns(columns, extra)
+
+        def select(columns: Mapping[str, Array]) -> Array:
+            """Return what the sensors report, the measured columns last."""
+            if self.observe is not None:
+                columns = self.observe(columns, extra)
+            if not isinstance(columns, _GaitMeasures):
+                for name in self.names:
+                    require_known_name(name, tuple(columns), f"measure of {self.kind}")
+            return jnp.stack([columns[name] for name in self.names], -1)
+
         if self.kind == "gaits":
 
             def predict_row(conditions: dict[str, Array], row: Array) -> tuple[Array, Array]:
@@ -209,15 +218,6 @@ class FitProblem(eqx.Module):
         rows = self.row_steps if self.kind == "steps" else jnp.arange(len(self.row_walks))
         columns = {name: column[self.row_walks, rows] for name, column in columns.items()}
         return Prediction(select(columns), jnp.all(is_valid))
-
-    def _select_columns(self, columns: Mapping[str, Array], extra: dict[str, Array]) -> Array:
-        """Return what the sensors report, the measured columns last."""
-        if self.observe is not None:
-            columns = self.observe(columns, extra)
-        if not isinstance(columns, _GaitMeasures):
-            for name in self.names:
-                require_known_name(name, tuple(columns), f"measure of {self.kind}")
-        return jnp.stack([columns[name] for name in self.names], -1)
 
     def set_conditions(
         self, values: ParameterValues, conditions: Mapping[str, Array], others: Mapping[str, Array]
@@ -306,10 +306,23 @@ class FitProblem(eqx.Module):
     ) -> tuple[dict[str, Array], Array, Any]:
         """Return measures of a step, or samples of its phases, and the durations of the phases."""
         if is_series:
-            columns, durations, step = _sample_step(walker, params, x, self.options)
-            if self.observe is None:
-                for name in self.names:
-                    require_known_name(name, tuple(columns), "measure of series")
+            sampling = params, x, self.options, SAMPLES_PER_PHASE
+            if not walker.is_wheel:
+                columns, durations = walker.sample_motion(*sampling)
+                step = walker.advance(params, x, self.options)
+            else:
+                step = walker.sample_step(*sampling)
+                if walker.reports_contacts:
+                    n, durations = params.n_legs, step.duration
+                    state = step.state[..., np.array([2, 6, 7, 5, 6 + n, 7 + n])]
+                    forces = jnp.stack([step.tangential, step.normal], -1)[..., :2, :]
+                    forces = forces.reshape(*forces.shape[:-2], 4)
+                else:
+                    state, forces, durations = step.state, step.forces, step.durations
+                variables = jnp.moveaxis(jnp.concatenate([state, forces], -1), -1, 0)
+                columns = dict(zip(SERIES_NAMES, variables, strict=True))
+            # An unknown name is reported later.
+            if self.observe is None and columns.keys() >= {*self.names}:
                 columns = {name: columns[name] for name in self.names}
             return columns, durations, step
         if not walker.is_wheel:
@@ -360,26 +373,6 @@ class FitProblem(eqx.Module):
             [np.arcsin(2.0 * share - 1.0), np.sqrt((1.0 + distance) ** 2 - 1.0)],
             x / scale,
         )
-
-
-def _sample_step(
-    walker: Any, params: Any, x: Array, options: StepOptions
-) -> tuple[dict[str, Array], Array, Any]:
-    """Return samples of each phase of a step by name, the durations of the phases, and the step."""
-    if not walker.is_wheel:
-        columns, durations = walker.sample_motion(params, x, options, SAMPLES_PER_PHASE)
-        return columns, durations, walker.advance(params, x, options)
-    motion = walker.sample_step(params, x, options, SAMPLES_PER_PHASE)
-    if walker.reports_contacts:
-        n = params.n_legs
-        state = motion.state[..., np.array([2, 6, 7, 5, 6 + n, 7 + n])]
-        forces = jnp.stack([motion.tangential, motion.normal], -1)[..., :2, :]
-        variables = jnp.concatenate([state, forces.reshape(*forces.shape[:-2], 4)], -1)
-        durations = motion.duration
-    else:
-        variables = jnp.concatenate([motion.state, motion.forces], -1)
-        durations = motion.durations
-    return dict(zip(SERIES_NAMES, jnp.moveaxis(variables, -1, 0), strict=True)), durations, motion
 
 
 @functools.cache
@@ -472,10 +465,9 @@ def _sample_piecewise(
 
 
 @eqx.filter_custom_jvp
-def _predict_with_differences(x: Array, problem: FitProblem) -> tuple[Array, Array]:
+def _predict_with_differences(x: Array, problem: FitProblem) -> Prediction:
     """Return a prediction whose derivatives are central differences of fourth order."""
-    values, is_valid = problem.predict_exactly(x)
-    return values, is_valid
+    return problem.predict_exactly(x)
 
 
 @_predict_with_differences.def_jvp
@@ -487,8 +479,8 @@ def _differentiate_by_differences(primals: tuple, tangents: tuple) -> tuple:
     values = jax.vmap(jax.vmap(lambda x: problem.predict_exactly(x).values))(points)
     weights = jnp.array([8.0, -8.0, -1.0, 1.0]) / 12.0
     jacobian = jnp.einsum("k,kurc,u->rcu", weights, values, 1.0 / changes)
-    prediction = tuple(problem.predict_exactly(x))
-    return prediction, (jacobian @ tangents[0], None)
+    prediction: Any = problem.predict_exactly(x)
+    return prediction, prediction._replace(values=jacobian @ tangents[0], is_valid=None)
 
 
 def compute_residuals(
@@ -548,26 +540,17 @@ def _make_solver() -> Any:
 
 
 @eqx.filter_jit
-def _measure_candidates(problem: FitProblem, target: FitTarget, variables: Array) -> Array:
+def _measure_variables(problem: FitProblem, target: FitTarget, variables: Array) -> Array:
     """Return chi2 at each row of variables u. The programs are those of the search."""
     evaluate = lambda u: jnp.sum(_linearize_residuals(u, (problem, target))[0] ** 2)
     return jax.vmap(evaluate)(variables)
 
 
-def select_starts(
-    problem: FitProblem, targets: FitTarget, candidates: np.ndarray, n_starts: int
-) -> np.ndarray:
-    """Return the first candidate and those others with the smallest chi2, `n_starts` in all.
-
-    Of a batch of data sets, chi2 is that of their mean.
-    """
-    if len(candidates) == n_starts:
-        return candidates
+def measure_candidates(problem: FitProblem, targets: FitTarget, candidates: np.ndarray) -> Array:
+    """Return chi2 of the mean of all data sets at each row of unknowns."""
     target = FitTarget(*(jnp.asarray(np.mean(x, 0)) for x in targets))
-    measure = functools.partial(_measure_candidates, problem, target)
-    chi2 = map_in_batches(measure, FIT_BATCH_SIZES[:1], problem.invert(candidates))
-    best = 1 + np.argsort(np.asarray(chi2)[1:], kind="stable")[: n_starts - 1]
-    return candidates[np.append(0, best)]
+    measure = functools.partial(_measure_variables, problem, target)
+    return map_in_batches(measure, FIT_BATCH_SIZES[:1], problem.invert(candidates))
 
 
 @eqx.filter_jit

@@ -235,26 +235,23 @@ class FitResult:
 
     def describe(self) -> list[tuple[str, str]]:
         """Return pairs of label and text that summarize the result."""
+        units = ["" if unit == "1" else f" {unit}" for unit in self.units]
         if self.values.ndim > 1:
             spread = self.values[np.asarray(self.converged)].std(0, ddof=1)
             return [
                 ("data sets", f"{len(self.values):,}"),
                 ("converged", f"{int(np.sum(self.converged)):,}"),
                 *(
-                    (
-                        name,
-                        f"mean {np.mean(column):.6g}, spread {sd:.3g} "
-                        f"{'' if unit == '1' else unit}".rstrip(),
-                    )
-                    for name, column, sd, unit in zip(
-                        self.names, self.values.T, spread, self.units, strict=True
+                    (name, f"mean {mean:.6g}, spread {sd:.3g}{unit}")
+                    for name, mean, sd, unit in zip(
+                        self.names, self.values.mean(0), spread, units, strict=True
                     )
                 ),
             ]
         rows = [
-            (name, f"{value:.6g} +- {error:.3g} {'' if unit == '1' else unit}".rstrip())
+            (name, f"{value:.6g} +- {error:.3g}{unit}")
             for name, value, error, unit in zip(
-                self.names, self.values, self.standard_errors, self.units, strict=True
+                self.names, self.values, self.standard_errors, units, strict=True
             )
         ]
         correlation = np.abs(np.nan_to_num(self.correlation.values)) - np.eye(len(self.names))
@@ -376,9 +373,8 @@ def make_result(
 
     solution = solve_fits(problem, targets, starts)
     summary = summarize(problem, targets, solution)
-    n_numbers = int(np.sum(np.asarray(targets.row_weights).reshape(-1, data.values.shape[1])[0]))
-    n_priors = int(np.sum(np.asarray(targets.prior_weights).reshape(-1, len(units))[0] > 0.0))
-    dof = n_numbers * len(data.names) + n_priors - len(units)
+    n_numbers = int(np.sum(targets.row_weights[0])) * len(data.names)
+    dof = n_numbers + int(np.sum(targets.prior_weights[0] > 0.0)) - len(units)
     best = int(np.argmin(summary.chi2))
     pick = (lambda x: x) if is_batch else (lambda x: x[best])
     dims = (*(DATASET_DIMENSION,) * is_batch, "row")

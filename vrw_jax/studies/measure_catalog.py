@@ -140,11 +140,6 @@ def select_measure_catalog(
     )
 
 
-def make_error_variable_name(measure_name: str) -> str:
-    """Return the name of the dataset variable that contains the error of a measure."""
-    return measure_name + ERROR_VARIABLE_SUFFIX
-
-
 _DERIVATIVE_NAME_PATTERN = re.compile(r"d[ _](\w+?)(?: */ *d |_d_)([\w.]+)")
 
 

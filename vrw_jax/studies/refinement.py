@@ -21,7 +21,7 @@ import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
-from vrw_jax.lanes.batching import replace_rows, select_tree_rows
+from vrw_jax.lanes.batching import replace_rows
 from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET
 from vrw_jax.studies.fidelity import (
     QUANTITY_NAMES,
@@ -450,9 +450,24 @@ class _Refinement:
             contraction = length / np.maximum(last_length, np.finfo(float).tiny)
             is_slow = contraction > MAX_CONTRACTION_RATE
             is_stalled = length <= STALL_LENGTH_IN_TOLERANCES * float(batch.step_options.rtol)
-            is_accurate = self._find_accurate_gaits(estimates) & (n_corrections > 0)
+            goal = self.compute_error_goal(estimates.measure_values)
+            step_bound = estimates.numerical_error_bound
+            remaining_bound = REFINEMENT_SAFETY_FACTOR * estimates.correction_effect_on_measures
+            missed_bound = estimates.missed_contact_error_bound
+            is_accurate = np.all(
+                remaining_bound <= np.maximum(goal - step_bound, step_bound), axis=1
+            ) & (n_corrections > 0)
             is_finished = has_same_codes & np.where(is_slow, is_stalled, is_accurate)
-            self._record(gaits[is_finished], *select_tree_rows((estimates, step), is_finished))
+            finished = gaits[is_finished]
+            self.is_found[finished] = True
+            self.values[finished] = estimates.measure_values[is_finished]
+            self.error_bounds[finished] = remaining_bound[is_finished]
+            self.numerical_bounds[finished] = (step_bound + missed_bound)[is_finished]
+            speeds = evaluate_measures(("speed",), step.step_quantities)[:, 0]
+            self.speeds[finished] = speeds[is_finished]
+            self.has_large_presumed_error[finished] = np.any(
+                missed_bound > MAX_PRESUMED_ERROR_FRACTION * goal, axis=1
+            )[is_finished]
             is_continued = (
                 ~is_finished
                 & (step.step_outcomes == Outcome.STEPPED)
@@ -472,30 +487,6 @@ class _Refinement:
                 break
             step = self.take_steps(batch, gaits)
         return remaining
-
-    def _find_accurate_gaits(self, estimates: MeasureEstimates) -> np.ndarray:
-        """Return whether the remaining error of each gait is within the allowed error."""
-        goal, step_bound = (
-            self.compute_error_goal(estimates.measure_values),
-            estimates.numerical_error_bound,
-        )
-        remaining_bound = REFINEMENT_SAFETY_FACTOR * estimates.correction_effect_on_measures
-        return np.all(remaining_bound <= np.maximum(goal - step_bound, step_bound), axis=1)
-
-    def _record(self, gaits: np.ndarray, estimates: MeasureEstimates, step: StepQuantities) -> None:
-        """Store the measures of gaits whose corrections have ended."""
-        missed_bound = estimates.missed_contact_error_bound
-        goal = self.compute_error_goal(estimates.measure_values)
-        self.is_found[gaits] = True
-        self.values[gaits] = estimates.measure_values
-        self.error_bounds[gaits] = (
-            REFINEMENT_SAFETY_FACTOR * estimates.correction_effect_on_measures
-        )
-        self.numerical_bounds[gaits] = estimates.numerical_error_bound + missed_bound
-        self.speeds[gaits] = evaluate_measures(("speed",), step.step_quantities)[:, 0]
-        self.has_large_presumed_error[gaits] = np.any(
-            missed_bound > MAX_PRESUMED_ERROR_FRACTION * goal, axis=1
-        )
 
     def compare_tolerances(self, is_compared: np.ndarray) -> None:
         """Replace the numerical errors of gaits by bounds from steps at other tolerances."""

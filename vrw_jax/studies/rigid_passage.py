@@ -119,29 +119,6 @@ def _iterate(apply: Callable[..., tuple], tolerance: float, *start: Array) -> tu
     return tuple(state)
 
 
-def compute_mean_steps(
-    survival_analysis: SurvivalAnalysis,
-    survival_matrix: Array,
-    start_survival_row: Array,
-    start_failure_probability: Scalar,
-) -> Scalar:
-    """Return the mean number of gait steps from one start, including the failing step.
-
-    The mean m solves m = 1 + K m. The solution is M u + g with M = 1/(1 - kappa_1). Here u is the
-    leading eigenvector and q the quasi-stationary distribution. The remainder g stays small and
-    solves the equation
-    (I - K + u q) g = 1 - u.
-
-    - `start_survival_row`: row of the survival operator for the start;
-    - `start_failure_probability`: probability that the first step fails.
-    """
-    p, _, q, u = survival_analysis
-    n = len(u)
-    bounded_remainder = jnp.linalg.solve(jnp.eye(n) - survival_matrix + jnp.outer(u, q), 1.0 - u)
-    survival_factor = (1.0 - start_failure_probability + start_survival_row @ (u - 1.0)) / (1.0 - p)
-    return survival_factor / p + 1.0 - survival_factor + start_survival_row @ bounded_remainder
-
-
 N_DEVIATION_NODES = 80
 """Number of quadrature nodes over the next slope or height.
 
@@ -369,14 +346,22 @@ def _analyze_passage(
 ) -> RigidPassage:
     """Return first-passage times for a survival operator, see `RigidPassage`.
 
+    The mean number m of steps, including the failing step, solves m = 1 + K m. The solution is
+    M u + g with M = 1/(1 - kappa_1). Here u is the leading eigenvector and q the quasi-stationary
+    distribution. The remainder g stays small and solves the equation (I - K + u q) g = 1 - u.
+
     - `step_distances`: mean distance to the next foothold from each state, m;
     - `start_row`: row of the operator for a start on the gait, and its failure probability.
     """
     survival_analysis = analyze_survival_operator(survival_matrix, failure_probabilities)
+    p, _, q, u = survival_analysis
+    n, (start_survival, start_failure) = len(u), start_row
+    remainder = jnp.linalg.solve(jnp.eye(n) - survival_matrix + jnp.outer(u, q), 1.0 - u)
+    factor = (1.0 - start_failure + start_survival @ (u - 1.0)) / (1.0 - p)
     return RigidPassage(
         survival_analysis,
-        compute_mean_steps(survival_analysis, survival_matrix, *start_row),
-        survival_analysis.quasi_stationary_weights @ step_distances,
+        factor / p + 1.0 - factor + start_survival @ remainder,
+        q @ step_distances,
         states,
         omitted_probability,
     )

@@ -5,7 +5,7 @@ The gait sensitivity norm is the variation of a gait's measures on slightly unev
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -279,39 +279,30 @@ def measure_basins(
     checked_step_options = convert_step_options(options)
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
     box_bounds = None if box is None else parse_start_box(box, checked_model)
-    point_indices = _select_branch_points(branch, checked_model, n_points)
-    can_start_within_gait_step = checked_model.can_start_within_gait_step
-    variable_names = [
-        *(["basin_share", "basin_share_error"] if box_bounds else []),
-        *(
-            ["smallest_disturbance", "smallest_disturbance_error"]
-            if can_start_within_gait_step
-            else []
-        ),
-    ]
+    can_start_within_step = checked_model.can_start_within_gait_step
+    names = ["basin_share", "basin_share_error"] if box_bounds else []
+    if can_start_within_step:
+        names += ["smallest_disturbance", "smallest_disturbance_error"]
 
-    def measure_point(stable_gait: StableGait) -> list[float]:
-        values_at_point = []
+    def measure_gait(gait: StableGait) -> list[float]:
+        values: list[float] = []
         if box_bounds:
-            share_result = compute_basin_share(stable_gait, box_bounds, n_starts, max_steps)
-            values_at_point += [share_result.share, share_result.share_error]
-        if can_start_within_gait_step:
-            disturbance_result = compute_smallest_disturbance(stable_gait, None, max_steps)
-            values_at_point += [disturbance_result.size, disturbance_result.size_error]
-        return values_at_point
+            share = compute_basin_share(gait, box_bounds, n_starts, max_steps)
+            values += [share.share, share.share_error]
+        if can_start_within_step:
+            disturbance = compute_smallest_disturbance(gait, None, max_steps)
+            values += [disturbance.size, disturbance.size_error]
+        return values
 
-    point_values = [
-        measure_point(_load_branch_gait(branch, i, checked_model, checked_step_options))
-        if branch.stable[i]
-        else [np.nan] * len(variable_names)
-        for i in point_indices
-    ]
-    return _make_point_dataset(
+    return _measure_along_branch(
         branch,
-        point_indices,
-        point_values,
-        {variable_name: BASIN_VARIABLE_ATTRS[variable_name] for variable_name in variable_names},
-        f"Basins of the gaits along {branch.parameter}",
+        checked_model,
+        checked_step_options,
+        n_points,
+        measure_gait,
+        lambda: {name: BASIN_VARIABLE_ATTRS[name] for name in names},
+        "Basins of the gaits",
+        has_unstable_gaits=False,
     )
 
 
@@ -353,45 +344,57 @@ def measure_gait_sensitivity(
     """
     checked_model = convert_model_argument(model)
     measure_names = check_names("measures", measures)
-    point_indices = _select_branch_points(branch, checked_model, n_points)
-    point_norms = []
-    for i in point_indices:
-        branch_gait = _load_branch_gait(branch, i, checked_model, StepOptions())
-        params, point_model = branch_gait.params, branch_gait.model
-        cycle_finder = resolve_finder(params, point_model, options)
+
+    def measure_gait(gait: StableGait) -> Any:
+        cycle_finder = resolve_finder(gait.params, gait.model, options)
         parse_sensitivity_measures(cycle_finder, measure_names)
-        guess = branch_gait.section_states[0]
-        cycle: Any = limit_cycle(params, guess=guess, model=point_model, options=options)
+        cycle: Any = limit_cycle(
+            gait.params, guess=gait.section_states[0], model=gait.model, options=options
+        )
         is_same_gait = (
             int(cycle.outcome) == Outcome.STEPPED
-            and branch_gait.is_on_gait(np.asarray(cycle.section_state)[None])[0]
+            and gait.is_on_gait(np.asarray(cycle.section_state)[None])[0]
         )
-        point_norms.append(
-            compute_gait_sensitivity(cycle_finder, params, cycle, measure_names).norm
-            if is_same_gait
-            else [np.nan] * len(measure_names)
-        )
-    variable_attrs = {
-        f"gait_sensitivity_{measure_name}": (
-            f"{MEASURES[measure_name].unit} per rad",
-            f"gait sensitivity norm of {MEASURES[measure_name].long_name}",
-        )
-        for measure_name in measure_names
-    }
-    return _make_point_dataset(
+        if not is_same_gait:
+            return [np.nan] * len(measure_names)
+        return compute_gait_sensitivity(cycle_finder, gait.params, cycle, measure_names).norm
+
+    return _measure_along_branch(
         branch,
-        point_indices,
-        point_norms,
-        variable_attrs,
-        f"Gait sensitivity norms along {branch.parameter}",
+        checked_model,
+        StepOptions(),
+        n_points,
+        measure_gait,
+        lambda: {
+            f"gait_sensitivity_{name}": (
+                f"{MEASURES[name].unit} per rad",
+                f"gait sensitivity norm of {MEASURES[name].long_name}",
+            )
+            for name in measure_names
+        },
+        "Gait sensitivity norms",
     )
 
 
-def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | None) -> list[int]:
-    """Return the indices of at most `n_points` points of a branch, evenly spaced.
+def _measure_along_branch(
+    branch: Branch,
+    model: AbstractWheel,
+    options: StepOptions,
+    n_points: int | None,
+    measure_gait: Callable[[StableGait], Any],
+    describe_variables: Callable[[], dict[str, tuple[str, str]]],
+    title: str,
+    has_unstable_gaits: bool = True,
+) -> xr.Dataset:
+    """Return a dataset of variables at points of a branch, with the parameter as coordinate.
 
-    Both ends are included. If `n_points` is None, the result contains all points. Raise TypeError
-    or ValueError if an argument is invalid, if the branch has another model or no point.
+    The points are evenly spaced, and both ends are included. Raise TypeError or ValueError if an
+    argument is invalid, or if the branch has another model or no point.
+
+    - `n_points`: largest number of points, or None for all points;
+    - `measure_gait`: function of a gait that returns all variables;
+    - `describe_variables`: function that returns unit and meaning of each variable;
+    - `has_unstable_gaits`: whether unstable gaits are measured too. Otherwise they have NaN.
     """
     check_type("branch", branch, Branch, "give the result of vrw.continue_branch")
     branch_attrs = branch.dataset.attrs
@@ -409,34 +412,27 @@ def _select_branch_points(branch: Branch, model: AbstractWheel, n_points: int | 
     if n_points is not None:
         n_points = min(check_int("n_points", n_points), n_branch_points)
     spaced_points = np.linspace(0, n_branch_points - 1, n_points or n_branch_points)
-    return np.unique(spaced_points.round().astype(int)).tolist()
-
-
-def _make_point_dataset(
-    branch: Branch,
-    point_indices: list[int],
-    point_values: list[Any],
-    variable_attrs: dict[str, tuple[str, str]],
-    title: str,
-) -> xr.Dataset:
-    """Return a dataset of variables at points of a branch, with the parameter as coordinate.
-
-    - `point_indices`: indices of the points of the branch;
-    - `point_values`: values of all variables at each point;
-    - `variable_attrs`: unit and meaning of each variable.
-    """
-    point_variables = {
-        variable_name: xr.Variable("point", values, {"units": unit, "long_name": meaning})
-        for (variable_name, (unit, meaning)), values in zip(
-            variable_attrs.items(), np.array(point_values, float).T, strict=True
+    indices = np.unique(spaced_points.round().astype(int)).tolist()
+    rows = [
+        measure_gait(_load_branch_gait(branch, i, model, options))
+        if has_unstable_gaits or branch.stable[i]
+        else [np.nan] * len(describe_variables())
+        for i in indices
+    ]
+    variables = {
+        name: xr.Variable("point", values, {"units": unit, "long_name": meaning})
+        for (name, (unit, meaning)), values in zip(
+            describe_variables().items(), np.array(rows, float).T, strict=True
         )
     }
-    branch_coordinates = {
-        branch.parameter: xr.Variable(
-            "point", branch.values[point_indices], make_measure_attributes(branch.parameter)
-        )
-    }
-    return xr.Dataset(point_variables, branch_coordinates, branch.dataset.attrs | {"title": title})
+    parameter = xr.Variable(
+        "point", branch.values[indices], make_measure_attributes(branch.parameter)
+    )
+    return xr.Dataset(
+        variables,
+        {branch.parameter: parameter},
+        branch_attrs | {"title": f"{title} along {branch.parameter}"},
+    )
 
 
 def _load_branch_gait(

@@ -7,13 +7,13 @@ indices from the result with `scipy.stats.sobol_indices` (Saltelli et al. 2010).
 
 from __future__ import annotations
 
-import abc
 import hashlib
 import json
 import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -60,11 +60,16 @@ SALTELLI_DESIGN_KIND = "saltelli"
 """Kind of the designs from which Sobol' indices are computed."""
 
 
-class AbstractSampleDesign(abc.ABC):
-    """Samples of the wheel's parameters, arranged on one or more sample axes."""
+@dataclass(frozen=True, repr=False)
+class SampleDesign:
+    """Samples of the wheel's parameters, arranged on one or more sample axes.
 
-    design_kind: str
+    A grid contains every combination of the parameters' values and has one axis per parameter. In
+    any other design, all parameters may vary together along the axis `sample`.
+    """
+
     values_by_parameter: Mapping[str, np.ndarray]
+    design_kind: str
 
     def __repr__(self) -> str:
         printed_columns = (
@@ -72,6 +77,11 @@ class AbstractSampleDesign(abc.ABC):
             for parameter_name, parameter_values in self.values_by_parameter.items()
         )
         return f"{self.design_kind} of {self.size:,}: {', '.join(printed_columns)}"
+
+    @property
+    def is_grid(self) -> bool:
+        """Return whether each parameter has its own axis."""
+        return self.design_kind == "grid"
 
     @property
     def swept_parameters(self) -> tuple[str, ...]:
@@ -84,16 +94,15 @@ class AbstractSampleDesign(abc.ABC):
         return math.prod(self.shape)
 
     @property
-    @abc.abstractmethod
     def dims(self) -> tuple[str, ...]:
         """Return the names of the sample axes of the labeled result."""
+        return self.swept_parameters if self.is_grid else ("sample",)
 
     @property
-    @abc.abstractmethod
     def shape(self) -> tuple[int, ...]:
         """Return the lengths of the sample axes of the labeled result."""
+        return tuple(map(len, self.values_by_parameter.values()))[: len(self.dims)]
 
-    @abc.abstractmethod
     def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
         """Return the values of each swept parameter in a rectangular region of samples, by
         parameter.
@@ -102,16 +111,23 @@ class AbstractSampleDesign(abc.ABC):
 
         - `region_of_samples`: one slice for each axis of the design.
         """
+        columns: Any = self.values_by_parameter.values()
+        if self.is_grid:
+            axes = (x[region] for x, region in zip(columns, region_of_samples, strict=True))
+            columns = map(np.ravel, np.meshgrid(*axes, indexing="ij"))
+        else:
+            columns = (x[region_of_samples[0]] for x in columns)
+        return dict(zip(self.swept_parameters, columns, strict=True))
 
     def make_result_coordinates(self) -> dict[str, xr.Variable]:
         """Return the coordinates of the labeled result by their names."""
-        return {
-            parameter_name: xr.Variable(
-                (parameter_name,) if parameter_name in self.dims else self.dims,
-                parameter_values,
-            )
-            for parameter_name, parameter_values in self.values_by_parameter.items()
+        coordinates = {
+            name: xr.Variable((name,) if self.is_grid else self.dims, values)
+            for name, values in self.values_by_parameter.items()
         }
+        if self.is_grid:
+            return coordinates
+        return {"sample": xr.Variable(self.dims, np.arange(self.size))} | coordinates
 
     def describe_design(self) -> dict[str, object]:
         """Return the settings that identify the design.
@@ -130,63 +146,6 @@ class AbstractSampleDesign(abc.ABC):
             "shape": list(self.shape),
             "digest": sample_digest.hexdigest(),
         }
-
-
-@dataclass(frozen=True, repr=False)
-class GridDesign(AbstractSampleDesign):
-    """Design that contains every combination of the parameters' values, with one axis per
-    parameter.
-    """
-
-    values_by_parameter: Mapping[str, np.ndarray]
-    design_kind: str = "grid"
-
-    @property
-    def dims(self) -> tuple[str, ...]:
-        return self.swept_parameters
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(map(len, self.values_by_parameter.values()))
-
-    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
-        selected_axis_values = [
-            parameter_values[axis_slice]
-            for parameter_values, axis_slice in zip(
-                self.values_by_parameter.values(), region_of_samples, strict=True
-            )
-        ]
-        grid_columns = np.meshgrid(*selected_axis_values, indexing="ij")
-        return dict(zip(self.swept_parameters, map(np.ravel, grid_columns), strict=True))
-
-
-@dataclass(frozen=True, repr=False)
-class SampleListDesign(AbstractSampleDesign):
-    """Design that contains a list of samples, in which all parameters may vary together.
-
-    Its axis is `sample`.
-    """
-
-    values_by_parameter: Mapping[str, np.ndarray]
-    design_kind: str = "samples"
-
-    @property
-    def dims(self) -> tuple[str, ...]:
-        return ("sample",)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return (len(next(iter(self.values_by_parameter.values()))),)
-
-    def select_samples(self, region_of_samples: tuple[slice, ...]) -> ParameterSamples:
-        return {
-            parameter_name: parameter_values[region_of_samples[0]]
-            for parameter_name, parameter_values in self.values_by_parameter.items()
-        }
-
-    def make_result_coordinates(self) -> dict[str, xr.Variable]:
-        sample_coordinate = xr.Variable(self.dims, np.arange(self.size))
-        return {"sample": sample_coordinate} | super().make_result_coordinates()
 
 
 def _merge_mapping_and_keywords(
@@ -221,32 +180,27 @@ def _parse_value_columns(
     Raise an error if that is impossible.
     """
     value_columns = {}
-    for parameter_name, parameter_values in _merge_mapping_and_keywords(
-        function_name, parameter_mapping, parameter_keywords
-    ).items():
-        require_untraced_arguments("a design", "use jax.vmap", parameter_values)
-        require_no_masked_entries(parameter_name, parameter_values)
+    given = _merge_mapping_and_keywords(function_name, parameter_mapping, parameter_keywords)
+    for name, values in given.items():
+        require_untraced_arguments("a design", "use jax.vmap", values)
+        require_no_masked_entries(name, values)
         try:
-            value_column = np.atleast_1d(np.asarray(parameter_values))
+            column = np.atleast_1d(np.asarray(values))
         # Lists may differ in length, and the conversion of a foreign object may raise any error.
         except Exception:
-            value_column = np.array([None])
-        if value_column.dtype.kind not in "fiu" and value_column.size:
+            column = np.array([None])
+        if column.dtype.kind not in "fiu" and column.size:
             raise TypeError(
-                f"{parameter_name} is {format_value(parameter_values)}, but it must be a list of "
-                "numbers: write [100.0]."
+                f"{name} is {format_value(values)}, but it must be a list of numbers: write "
+                "[100.0]."
             )
-        value_column = value_column.astype(float)
-        if value_column.ndim != 1:
+        if column.ndim != 1:
             raise ValueError(
-                f"{parameter_name} has shape {value_column.shape}, but it must be a list of "
-                "numbers: give one axis."
+                f"{name} has shape {column.shape}, but it must be a list of numbers: give one axis."
             )
-        if not len(value_column):
-            raise ValueError(
-                f"{parameter_name} has no values, but a scan needs at least one: add some."
-            )
-        value_columns[parameter_name] = value_column
+        if not len(column):
+            raise ValueError(f"{name} has no values, but a scan needs at least one: add some.")
+        value_columns[name] = column.astype(float)
     return value_columns
 
 
@@ -254,7 +208,7 @@ def grid(
     values: Mapping[str, ParameterValues] | None = None,
     /,
     **parameters: ParameterValues,
-) -> GridDesign:
+) -> SampleDesign:
     """Return the design that contains every combination of parameter values.
 
     Args:
@@ -279,14 +233,14 @@ def grid(
                 f"{parameter_name} holds a value twice, but each value of a grid's axis names "
                 "one place: give every value once."
             )
-    return GridDesign(values_by_swept_parameter)
+    return SampleDesign(values_by_swept_parameter, "grid")
 
 
 def samples(
     values: Mapping[str, ParameterValues] | None = None,
     /,
     **parameters: ParameterValues,
-) -> SampleListDesign:
+) -> SampleDesign:
     """Return the design that contains a list of samples, such as `samples({"damping": [100],
     "slope": [0.29]})`.
 
@@ -316,7 +270,7 @@ def samples(
             f"the columns have lengths {column_lengths}, but a sample takes one value from each: "
             "give columns of one length."
         )
-    return SampleListDesign(values_by_swept_parameter)
+    return SampleDesign(values_by_swept_parameter, "samples")
 
 
 def sobol(
@@ -324,7 +278,7 @@ def sobol(
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
-) -> SampleListDesign:
+) -> SampleDesign:
     """Return a design of `n` samples from a scrambled Sobol' sequence.
 
     The samples cover the box between the bounds most evenly if `n` is a power of 2.
@@ -345,12 +299,7 @@ def sobol(
         >>> vrw.sobol({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    from scipy.stats import qmc  # This import is slow.
-
-    ranges, n = _parse_sampling_box("sobol", ranges, parameters, n)
-    sobol_sequence = qmc.Sobol(len(ranges), rng=_make_random_generator(seed))
-    unit_cube_points = sobol_sequence.random_base2((n - 1).bit_length())[:n]
-    return _scale_unit_points_to_box(ranges, unit_cube_points, "sobol")
+    return _draw_box_samples("sobol", ranges, parameters, n, seed)
 
 
 def uniform(
@@ -358,7 +307,7 @@ def uniform(
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
-) -> SampleListDesign:
+) -> SampleDesign:
     """Return a design of `n` independent samples, uniformly distributed between the bounds.
 
     Args:
@@ -377,9 +326,7 @@ def uniform(
         >>> vrw.uniform({"damping": (100.0, 200.0), "slope": (0.28, 0.32)}, 8).shape
         (8,)
     """
-    ranges, n = _parse_sampling_box("uniform", ranges, parameters, n)
-    unit_cube_points = _make_random_generator(seed).random((n, len(ranges)))
-    return _scale_unit_points_to_box(ranges, unit_cube_points, "uniform")
+    return _draw_box_samples("uniform", ranges, parameters, n, seed)
 
 
 def saltelli(
@@ -387,7 +334,7 @@ def saltelli(
     n: int | None = None,
     seed: int = 0,
     **parameters: ParameterRange,
-) -> SampleListDesign:
+) -> SampleDesign:
     """Return the design that `sobol_indices` requires: `n` groups ("rows") of 2 + d samples for d
     parameters.
 
@@ -411,68 +358,50 @@ def saltelli(
         >>> vrw.saltelli({"damping": (100.0, 180.0), "slope": (0.27, 0.29)}, 8).shape
         (32,)
     """
+    return _draw_box_samples(SALTELLI_DESIGN_KIND, ranges, parameters, n, seed)
+
+
+def draw_unit_points(kind: str, n: int, n_dimensions: int, seed: int) -> np.ndarray:
+    """Return `n` points of the unit cube, of a scrambled Sobol' sequence or else independent."""
+    random = np.random.default_rng(check_int("seed", seed, 0))
+    if kind != "sobol":
+        return random.random((n, n_dimensions))
     from scipy.stats import qmc  # This import is slow.
 
-    ranges, n = _parse_sampling_box("saltelli", ranges, parameters, n)
-    if n & (n - 1):
-        raise ValueError(
-            f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
-            f"give n = {1 << n.bit_length()}, say."
-        )
-    sobol_sequence = qmc.Sobol(2 * len(ranges), rng=_make_random_generator(seed))
-    points_a, points_b = np.hsplit(sobol_sequence.random_base2(n.bit_length() - 1), 2)
-    points_with_swapped_coordinate = [
-        np.where(is_swapped, points_b, points_a) for is_swapped in np.eye(len(ranges), dtype=bool)
-    ]
-    unit_cube_points = np.concatenate([points_a, points_b, *points_with_swapped_coordinate])
-    return _scale_unit_points_to_box(ranges, unit_cube_points, SALTELLI_DESIGN_KIND)
+    return qmc.Sobol(n_dimensions, rng=random).random_base2((n - 1).bit_length())[:n]
 
 
-def _scale_unit_points_to_box(
-    ranges: ParameterRanges, unit_cube_points: np.ndarray, design_kind: str
-) -> SampleListDesign:
-    """Return the design whose samples are points of the unit cube, scaled to the box between the
-    bounds.
-
-    - `unit_cube_points`: points of the unit cube, shape (samples, parameters).
-    """
-    lower_bounds, upper_bounds = np.transpose(list(ranges.values()))
-    box_points = lower_bounds + (upper_bounds - lower_bounds) * unit_cube_points
-    return SampleListDesign(
-        dict(zip(ranges, np.ascontiguousarray(box_points.T), strict=True)), design_kind
-    )
-
-
-def _make_random_generator(seed: int) -> np.random.Generator:
-    return np.random.default_rng(check_int("seed", seed, 0))
-
-
-def _parse_sampling_box(
-    function_name: str,
-    ranges: ParameterRanges | None,
-    parameter_keywords: ParameterRanges,
-    n: int | None,
-) -> tuple[dict[str, ParameterRange], int]:
-    """Return the range of each parameter, by name, and the number of samples, all checked.
+def _draw_box_samples(
+    kind: str, ranges: ParameterRanges | None, keywords: ParameterRanges, n: int | None, seed: int
+) -> SampleDesign:
+    """Return the design of a kind, whose `n` samples or rows are points between the bounds.
 
     The number of samples has no default. The ranges are a mapping or keywords.
     """
     if n is None:
-        raise TypeError(
-            f"n is None, but {function_name} needs a number of samples: give n=1024, say."
-        )
-    ranges = _merge_mapping_and_keywords(function_name, ranges, parameter_keywords)
+        raise TypeError(f"n is None, but {kind} needs a number of samples: give n=1024, say.")
+    ranges = _merge_mapping_and_keywords(kind, ranges, keywords)
     n = check_int("n", n)
     if n > MAX_LISTED_SAMPLES:
         raise ValueError(
             f"n is {n:,}, but a list takes {MAX_LISTED_SAMPLES:,} samples at most: give fewer, or "
             "a grid."
         )
-    checked_ranges = {
-        parameter_name: check_range(f"the range of {parameter_name}", bound_pair)
-        for parameter_name, bound_pair in ranges.items()
-    }
-    return checked_ranges, n
+    bounds = [check_range(f"the range of {name}", pair) for name, pair in ranges.items()]
+    if kind == SALTELLI_DESIGN_KIND:
+        if n & (n - 1):
+            raise ValueError(
+                f"n is {n}, but the rows of a Sobol' sequence are balanced for powers of two: "
+                f"give n = {1 << n.bit_length()}, say."
+            )
+        points_a, points_b = np.hsplit(draw_unit_points("sobol", n, 2 * len(bounds), seed), 2)
+        swapped = [np.where(is_b, points_b, points_a) for is_b in np.eye(len(bounds), dtype=bool)]
+        points = np.concatenate([points_a, points_b, *swapped])
+    else:
+        points = draw_unit_points(kind, n, len(bounds), seed)
+    lower, upper = np.transpose(bounds)
+    columns = np.ascontiguousarray((lower + (upper - lower) * points).T)
+    return SampleDesign(dict(zip(ranges, columns, strict=True)), kind)
 
 
 MIN_SALTELLI_ROWS = 64
@@ -601,32 +530,26 @@ def sobol_indices(
             "0.",
             stacklevel=2,
         )
-    sobol_index_variables: dict[str, tuple] = {}
-    for index_position, index_name in enumerate(("first_order", "total")):
-        index_label = index_name.replace("_", "-")
-        sobol_index_attributes = {"units": "1", "long_name": f"{index_label} Sobol' index"}
-        for name_suffix, index_values in (
-            ("", sobol_index_estimates),
-            ("_lower", lower_bounds),
-            ("_upper", upper_bounds),
-        ):
-            sobol_index_variables[index_name + name_suffix] = (
-                ("measure", "parameter"),
-                index_values[index_position],
-                sobol_index_attributes,
-            )
-    sobol_index_variables["is_constant_measure"] = (
+    variables: dict[str, tuple] = {
+        f"{name}{suffix}": (
+            ("measure", "parameter"),
+            values[i],
+            {"units": "1", "long_name": f"{name.replace('_', '-')} Sobol' index"},
+        )
+        for i, name in enumerate(("first_order", "total"))
+        for suffix, values in (
+            ("", sobol_index_estimates), ("_lower", lower_bounds), ("_upper", upper_bounds),
+        )
+    }  # fmt: skip
+    variables["is_constant_measure"] = (
         "measure",
         is_constant_measure,
         {"long_name": "varies by round-off alone"},
     )
     return xr.Dataset(
-        sobol_index_variables,
-        coords={"measure": measure_names, "parameter": swept_parameters},
-        attrs={
-            "rows": n_saltelli_rows,
-            "left_out": 1.0 - len(complete_rows) / len(is_complete_row),
-        },
+        variables,
+        {"measure": measure_names, "parameter": swept_parameters},
+        {"rows": n_saltelli_rows, "left_out": 1.0 - len(complete_rows) / len(is_complete_row)},
     )
 
 

@@ -56,8 +56,8 @@ from vrw_jax.studies.fidelity import ModelIndex
 from vrw_jax.studies.first_passage import first_passage
 from vrw_jax.studies.measure_catalog import (
     DIFFERENTIABLE_MEASURES,
+    ERROR_VARIABLE_SUFFIX,
     ValuesByVariable,
-    make_error_variable_name,
     parse_derivative,
 )
 from vrw_jax.studies.scan_design import ParameterSamples
@@ -551,7 +551,7 @@ def evaluate_to_tolerance(
         friction=sample_friction,
         stoppers=evaluation_request.wheel_model.stoppers,
     )
-    error_names = map(make_error_variable_name, measure_names)
+    error_names = (name + ERROR_VARIABLE_SUFFIX for name in measure_names)
     sample_results = dict(zip(measure_names, measure_result.values.T, strict=True))
     sample_results |= dict(zip(error_names, measure_result.errors.T, strict=True))
     model_codes = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)

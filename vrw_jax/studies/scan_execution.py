@@ -38,7 +38,7 @@ from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.registry import describe_accepted_models
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
-from vrw_jax.studies.scan_design import AbstractSampleDesign, ParameterSamples
+from vrw_jax.studies.scan_design import ParameterSamples, SampleDesign
 from vrw_jax.studies.scan_planning import (
     ChunkExecutor,
     ChunkResult,
@@ -49,8 +49,8 @@ from vrw_jax.studies.scan_planning import (
 )
 from vrw_jax.studies.scan_store import (
     PROVENANCE_ATTRIBUTE,
-    AbstractResultStore,
     MemoryResultStore,
+    ResultStore,
     ZarrResultStore,
     create_empty_store,
     read_stored_manifest,
@@ -75,7 +75,7 @@ class ScanProgress:
 @with_default_jax_settings
 @announce_wait("batches of gaits and gait steps", "15 s")
 def scan(
-    design: AbstractSampleDesign,
+    design: SampleDesign,
     measures: Iterable[str | Measure] | Measure | None = None,
     *,
     base: Any = None,
@@ -178,7 +178,7 @@ def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[Chun
 @with_default_jax_settings
 def run_scan(
     scan_plan: ScanPlan,
-    store: str | Path | AbstractResultStore | None,
+    store: str | Path | ResultStore | None,
     *,
     on_progress: ProgressCallback | None = None,
     chunk_executor: ChunkExecutor | None = None,
@@ -188,7 +188,7 @@ def run_scan(
     - `store`: store or folder to which the results are written; with None they stay in memory;
     - `chunk_executor`: function that computes the chunks; by default this process computes them.
     """
-    if isinstance(store, AbstractResultStore):
+    if isinstance(store, ResultStore):
         result_store = store
     elif store is None:
         result_store = MemoryResultStore(scan_plan.result_layout, scan_plan.store_attributes)
@@ -204,7 +204,7 @@ def run_scan(
 
 def _compute_and_write_chunks(
     scan_plan: ScanPlan,
-    result_store: AbstractResultStore,
+    result_store: ResultStore,
     on_progress: ProgressCallback | None,
     chunk_executor: ChunkExecutor | None,
 ) -> None:
@@ -395,9 +395,7 @@ def forecast_scan(scan_plan: ScanPlan, store_path: Path) -> dict[str, str]:
     }
 
 
-def _select_spread_samples(
-    design: AbstractSampleDesign, n_selected_samples: int
-) -> ParameterSamples:
+def _select_spread_samples(design: SampleDesign, n_selected_samples: int) -> ParameterSamples:
     flat_sample_indices = np.linspace(0, design.size - 1, n_selected_samples).round().astype(int)
     axis_indices = np.unravel_index(flat_sample_indices, design.shape)
     indices_by_axis = dict(zip(design.dims, axis_indices, strict=True))
@@ -466,7 +464,7 @@ class SpecialPointMap(NamedTuple):
 
 @announce_wait("gaits and the second derivatives of special points", "120 s")
 def map_special_points(
-    design: AbstractSampleDesign,
+    design: SampleDesign,
     measures: str | Iterable[str] = ("dls_fraction",),
     *,
     base: WheelParams | None = None,
@@ -509,7 +507,7 @@ def map_special_points(
         ...     special_points.scan, "speed", special_points.curves
         ... )  # doctest: +SKIP
     """
-    check_type("design", design, AbstractSampleDesign, "give vrw.grid(damping=[...], slope=[...])")
+    check_type("design", design, SampleDesign, "give vrw.grid(damping=[...], slope=[...])")
     require_map_grid(design)
     if on_stage is not None:
         check_callable("on_stage", on_stage, "that takes a sentence")
@@ -553,7 +551,7 @@ def follow_special_points(
     )
 
 
-def require_map_grid(design: AbstractSampleDesign) -> None:
+def require_map_grid(design: SampleDesign) -> None:
     """Raise a ValueError if the design is not a grid over two parameters with ascending values."""
     if len(design.shape) != 2:
         raise ValueError(

@@ -42,16 +42,16 @@ from vrw_jax.models.stepping import (
 )
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.studies.measure_catalog import (
+    ERROR_VARIABLE_SUFFIX,
     MeasureCatalog,
     ValuesByVariable,
     canonicalize_variable_name,
     check_measure_names,
     get_variable_attributes,
-    make_error_variable_name,
     parse_derivative,
     select_measure_catalog,
 )
-from vrw_jax.studies.scan_design import AbstractSampleDesign, ParameterSamples
+from vrw_jax.studies.scan_design import ParameterSamples, SampleDesign
 from vrw_jax.studies.scan_engines import EvaluationRequest, SampleEvaluator, make_scan_engine
 from vrw_jax.studies.scan_store import (
     PROVENANCE_ATTRIBUTE,
@@ -120,7 +120,7 @@ chunk in any order.
 class ScanPlan:
     """Checked arguments of a scan, and the layout of its result."""
 
-    design: AbstractSampleDesign
+    design: SampleDesign
     evaluation_request: EvaluationRequest
     measure_catalog: MeasureCatalog
     result_layout: ResultLayout
@@ -184,7 +184,7 @@ class ScanPlan:
 
 
 def plan_scan(
-    design: AbstractSampleDesign,
+    design: SampleDesign,
     measures: Iterable[str | Measure] | Measure | None = None,
     *,
     base: Any = None,
@@ -200,7 +200,7 @@ def plan_scan(
 
     The arguments are those of `scan`. `config_text` is the text of the configuration file, if any.
     """
-    if not isinstance(design, AbstractSampleDesign):
+    if not isinstance(design, SampleDesign):
         raise TypeError(
             f"design is a {type(design).__name__}, but it must say which samples: write "
             "vrw.grid(damping=[...]), vrw.samples({...}), vrw.sobol({...}, n) or vrw.uniform."
@@ -304,7 +304,7 @@ def plan_scan(
     for requested_measure in requested_measures:
         variable_names.append(canonicalize_variable_name(requested_measure))
         if tol is not None:
-            variable_names.append(make_error_variable_name(requested_measure))
+            variable_names.append(requested_measure + ERROR_VARIABLE_SUFFIX)
     variable_names += measure_catalog.always_included_variables
     cycle_options = getattr(gait_finder, "cycle_options", cycle_options or CycleOptions())
     evaluation_request = EvaluationRequest(
@@ -389,7 +389,7 @@ def describe_settings_difference(
 
 
 def _make_result_layout(
-    design: AbstractSampleDesign,
+    design: SampleDesign,
     variable_names: Iterable[str],
     base_wheel: Any,
     gait_finder: Any,

@@ -9,7 +9,6 @@ either marked and complete, or it is computed again.
 
 from __future__ import annotations
 
-import abc
 import contextlib
 import hashlib
 import json
@@ -40,7 +39,6 @@ from vrw_jax.studies.store_integrity import (
     StoredMetadata,
     add_attribute_seal,
     compute_hex_digest,
-    describe_store_damage,
     digest_coordinate_values,
     lock_store,
     read_scan_manifest,
@@ -119,37 +117,10 @@ def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) ->
     return tuple(chunk_shape)
 
 
-class AbstractResultStore(abc.ABC):
-    """Storage that accepts the results of chunks, lists missing chunks and returns the labeled
-    result.
-    """
+class MemoryResultStore:
+    """Storage of a scan's results in memory, with the methods of `ZarrResultStore`."""
 
-    store_location: str = "memory"
-    damage_description: str = ""
-    """Description of the damage of the store; an empty string if the store is intact."""
-
-    @abc.abstractmethod
-    def find_missing_chunks(self) -> list[int]:
-        """Return the indices of the chunks whose results are missing, in ascending order."""
-
-    @abc.abstractmethod
-    def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
-        """Write the results of a chunk and mark the chunk as written."""
-
-    @abc.abstractmethod
-    def load_dataset(self) -> xr.Dataset:
-        """Return the labeled dataset of all results."""
-
-    @abc.abstractmethod
-    def open_for_writing(self) -> contextlib.AbstractContextManager[None]:
-        """Return the context in which chunks are written.
-
-        The context removes unfinished files and locks the store against other writers.
-        """
-
-
-class MemoryResultStore(AbstractResultStore):
-    """Storage of a scan's results in memory."""
+    store_location, damage_description = "memory", ""
 
     def __init__(self, result_layout: ResultLayout, store_attributes: JsonObject) -> None:
         self._result_layout = result_layout
@@ -186,7 +157,7 @@ class MemoryResultStore(AbstractResultStore):
         return _arrange_requested_variables(self._dataset)
 
 
-class ZarrResultStore(AbstractResultStore):
+class ZarrResultStore:
     """Storage of a scan's results in a folder, as a Zarr store, with a mark for each chunk.
 
     The mark of a chunk is a digest of its files, so that it reveals files that have changed since.
@@ -199,9 +170,17 @@ class ZarrResultStore(AbstractResultStore):
         self._path, self._layout, self._verifies_files = path, layout, verifies_files
         self.store_location = str(path)
         self._open_arrays()
-        self.damage_description = describe_store_damage(
-            path, self.damaged_chunks, self._damaged_coordinates, self.damaged_metadata
-        )
+        damages = []
+        if chunks := self.damaged_chunks:
+            numbers = ", ".join([*map(str, chunks[:10]), *["..."] * (len(chunks) > 10)])
+            plural = "s" * (len(chunks) > 1)
+            damages.append(f"{len(chunks)} damaged chunk{plural} (number {numbers})")
+        for kind, names in (
+            ("coordinates", self._damaged_coordinates),
+            ("metadata", self.damaged_metadata),
+        ):
+            damages += [f"damaged {kind} ({', '.join(names)})"] if names else []
+        self.damage_description = f"{path} has {' and '.join(damages)}" if damages else ""
 
     def _open_arrays(self) -> None:
         """Open the arrays and find damage. Arrays with damaged metadata are not opened."""
@@ -267,6 +246,7 @@ class ZarrResultStore(AbstractResultStore):
         return np.frombuffer(digest.digest(), np.uint8)
 
     def find_missing_chunks(self) -> list[int]:
+        """Return the indices of the chunks whose results are missing, in ascending order."""
         if self.group is None:
             assert self._layout is not None
             return list(range(self._layout.n_chunks))
@@ -275,6 +255,7 @@ class ZarrResultStore(AbstractResultStore):
         return np.flatnonzero(~is_written).tolist()
 
     def write_chunk(self, chunk_index: int, chunk_results: ValuesByVariable) -> None:
+        """Write the results of a chunk and mark the chunk as written."""
         assert self._layout is not None
         region = self._layout.compute_chunk_region(chunk_index)
         for name in self._layout.empty_variables:
@@ -283,10 +264,15 @@ class ZarrResultStore(AbstractResultStore):
         self.damaged_chunks = [i for i in self.damaged_chunks if i != chunk_index]
 
     def load_dataset(self) -> xr.Dataset:
+        """Return the labeled dataset of all results."""
         return open_scan(self._path, verify=False)
 
     @contextlib.contextmanager
     def open_for_writing(self) -> Iterator[None]:
+        """Return the context in which chunks are written.
+
+        It removes unfinished files and locks the store against other writers.
+        """
         layout = self._layout
         assert layout is not None
         with lock_store(self._path):
@@ -305,6 +291,9 @@ class ZarrResultStore(AbstractResultStore):
                 _select_zarr_array(self.group, name)[:] = values
             self._damaged_coordinates = []
             yield
+
+
+ResultStore = MemoryResultStore | ZarrResultStore
 
 
 def _has_digest(group: zarr.Group, name: str, digest: str) -> bool:

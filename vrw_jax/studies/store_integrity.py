@@ -229,29 +229,6 @@ ZARR_READ_ERRORS = (OSError, ValueError, RuntimeError)
 """Exceptions that zarr and its codecs raise for a file that they cannot decode."""
 
 
-def describe_store_damage(
-    store_location: object,
-    damaged_chunks: list[int],
-    damaged_coordinates: list[str],
-    damaged_metadata: list[str],
-) -> str:
-    """Return a sentence that describes the damage of a store, or "" if the store is intact."""
-    damage_texts = []
-    if damaged_chunks:
-        chunks_text = ", ".join(map(str, damaged_chunks[:10])) + (
-            ", ..." if len(damaged_chunks) > 10 else ""
-        )
-        damage_texts.append(
-            f"{len(damaged_chunks)} damaged chunk{'s' * (len(damaged_chunks) > 1)} (number "
-            f"{chunks_text})"
-        )
-    if damaged_coordinates:
-        damage_texts.append(f"damaged coordinates ({', '.join(damaged_coordinates)})")
-    if damaged_metadata:
-        damage_texts.append(f"damaged metadata ({', '.join(damaged_metadata)})")
-    return f"{store_location} has {' and '.join(damage_texts)}" if damage_texts else ""
-
-
 @contextlib.contextmanager
 def lock_store(store_path: Path) -> Iterator[None]:
     """Return a context that locks a store against other writers.
