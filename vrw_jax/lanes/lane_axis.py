@@ -135,12 +135,14 @@ def _evaluate_with_lanes(
         return _evaluate(n_lanes, decomposed(*(x.aval for x in equation.invars)), operands)
     if name in CALLED_JAXPR_PARAMETERS:
         return _call(n_lanes, equation, operands)
-    arrays = [_with_lanes(n_lanes, x) for x in operands]
     if name in ELEMENTWISE_RULES:
         shape = equation.outvars[0].aval.shape
-        return _bind(equation, [_with_lanes(n_lanes, x, shape) for x in operands], True)
-    if name in PRIMITIVES_WITH_LEADING_AXES:
+        # Numbers that lanes share need no axes, except in a selection.
+        is_number = lambda x: not x.has_lanes and jnp.ndim(x.array) == 0 and name != "select_n"
+        arrays = [x.array if is_number(x) else _with_lanes(n_lanes, x, shape) for x in operands]
         return _bind(equation, arrays, True)
+    if name in PRIMITIVES_WITH_LEADING_AXES:
+        return _bind(equation, [_with_lanes(n_lanes, x) for x in operands], True)
     raise NotImplementedError(f"{name} has no rule for lanes")
 
 
