@@ -286,12 +286,10 @@ def _summarize_forces(xp: Any, fore: _ForceExtrema, total: _ForceExtrema) -> dic
 
 def _summarize_force(extrema: _ForceExtrema, xp: Any) -> dict[str, Any]:
     """Return the measures of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name."""
-    find_largest = lambda values, **axes: xp.max(values, initial=-xp.inf, **axes)
+    find_largest = lambda values: xp.max(values, initial=-xp.inf)
     peak_forces = xp.where(extrema.is_peak, extrema.forces, -xp.inf)
-    indices = xp.arange(len(peak_forces))
-    find_highest_peak = lambda mask: find_largest(xp.where(mask, peak_forces, -xp.inf), axis=1)
     lower_neighbor_peak = xp.minimum(
-        find_highest_peak(indices < indices[:, None]), find_highest_peak(indices > indices[:, None])
+        _find_highest_before(peak_forces, xp), _find_highest_before(peak_forces, xp, True)
     )
     is_trough = extrema.is_trough & xp.isfinite(lower_neighbor_peak)
     trough_depths = xp.where(
@@ -309,6 +307,19 @@ def _summarize_force(extrema: _ForceExtrema, xp: Any) -> dict[str, Any]:
         "force_trough_depth": xp.max(trough_depths, initial=0.0),
         "second_peak_rate": xp.where(xp.any(is_later_rate_maximum), largest_rate, xp.nan),
     }
+
+
+def _find_highest_before(forces: Any, xp: Any, is_reversed: bool = False) -> Any:
+    """Return the largest force before each one, or after it, and -inf if there is none.
+
+    JAX computes it in a loop, because comparisons of all pairs would double the compiled code.
+    """
+    if xp is np:
+        order = slice(None, None, -1 if is_reversed else 1)
+        return np.maximum.accumulate(np.append(-np.inf, forces[order])[:-1])[order]
+    start = jnp.asarray(-jnp.inf, forces.dtype)
+    keep_highest = lambda highest, force: (jnp.maximum(highest, force), highest)
+    return lax.scan(keep_highest, start, forces, reverse=is_reversed)[1]
 
 
 SPLINE_DEGREE = 7
