@@ -21,7 +21,7 @@ DISTURBANCE_BATCH_SIZES = (64, 1024)
 """Numbers of disturbed steps that one call computes: one disturbance size at each instant, or
 many.
 """
-GAIT_BATCH_SIZES = (8, 64, 512, 4096)
+GAIT_BATCH_SIZES = (1, 8, 64, 512, 4096)
 """Numbers of limit cycles of the paper's model that one Newton iteration computes together."""
 CONTACT_GAIT_BATCH_SIZES = (1, 8, 64, 512)
 """Numbers of limit cycles with unilateral contact that are computed together. Their search needs
