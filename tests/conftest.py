@@ -48,6 +48,9 @@ def pytest_configure(config: pytest.Config) -> None:
     if distributes_tests and not config.getoption("collectonly"):
         return
     os.environ["VRW_PROGRESS"] = "0"  # Tests compare standard error, also of other processes.
+    # Tests compile thousands of single operations, each for 20 ms. JAX reads the setting when it
+    # is imported, and `start_jax` keeps it.
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     if config.getoption("markexpr") == "not slow":
         # XLA compiles in two thirds of the time, as in JAX's own tests. The slow tests run the
         # code that users run, and the library's machine code is the same in both.

@@ -277,7 +277,8 @@ def test_a_function_without_a_key_is_traced_at_each_call_and_never_saved(tmp_pat
             np.testing.assert_array_equal(result, np.full(3, gravity))
             np.testing.assert_array_equal(lanes.jit(read_by_name).batch(np.ones(3)), result)
         assert spy.n_traces == 4
-        assert not list(tmp_path.iterdir())
+        # JAX keeps its own operations there.
+        assert not [*tmp_path.glob("lanes_*"), *tmp_path.glob("vrw_*")]
 
 
 def test_keys_are_the_same_in_every_process():

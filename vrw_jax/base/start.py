@@ -59,7 +59,8 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
             raise PermissionError(f"{distrust_reason}.")
         with contextlib.suppress(OSError):  # Without the folder nothing is cached.
             store.create_cache_folder(Path(cache_folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    min_seconds = jax.config.jax_persistent_cache_min_compile_time_secs  # type: ignore[attr-defined]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", min(min_seconds, 0.2))
     xla_flags = os.environ.get("XLA_FLAGS", "")
     # XLA reads the flags when the first array is created.
     if accepts_fusion_emitters_flag() and FUSION_EMITTERS_FLAG not in xla_flags:
