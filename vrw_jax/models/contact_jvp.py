@@ -6,7 +6,7 @@ the right-hand side. Only that residual is differentiated.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -50,6 +50,7 @@ class ContactConfiguration(NamedTuple):
     slot_modes: Array  # `ContactMode` of the foot in each contact slot
     is_stopper_holding: Array  # whether the leg in each contact slot is on its stopper
     is_airborne_leg_locked: Array  # whether a leg is in the air on its stopper
+    known_solution: Any = None  # forces and motion, if only their derivatives are computed
 
     @property
     def is_leg_length_fixed(self) -> Array:
@@ -62,7 +63,7 @@ class ContactConfiguration(NamedTuple):
 def find_slot_contacts(
     friction: Friction | float, contact_modes: Array, is_leg_locked: Array
 ) -> tuple[SlotArray, ContactSlots, Array, Array, Array]:
-    """Return the last five fields of `ContactConfiguration` for the contacts of all legs.
+    """Return the fields of `ContactConfiguration` after the motion for the contacts of all legs.
 
     - `friction`: friction coefficient for all feet, or a pair for the foot that landed last and for
       all other feet;
@@ -88,7 +89,6 @@ class WheelForceSolution(NamedTuple):
     tangential_forces: SlotArray
     normal_forces: SlotArray
     stopper_forces: SlotArray
-    leg_pull_forces: SlotArray
     hub_motion: HubVector
     painleve_determinant: Array
     length_motion: LegArray  # accelerations of the legs' lengths, or rates after an impact
@@ -153,7 +153,7 @@ def solve_contact_configuration(
     - `inverse_inertia`: inverse inertia for the posture of the configuration;
     - `free_motion`: accelerations without contact forces, or velocities without impulses.
     """
-    s, _, friction, contact_slots, slot_modes, is_stopper_holding, _ = contact_configuration
+    s, _, friction, contact_slots, slot_modes, is_stopper_holding, *_ = contact_configuration
     slot_solution = solve_combination(
         s, inverse_inertia, free_motion, slot_modes, is_stopper_holding, friction
     )
@@ -167,14 +167,21 @@ def solve_contact_configuration(
         0.0,
         outward_leg_motion - contact_slots.scatter_to_legs(slot_solution.leg_pull_forces) / s.m,
     )
-    return WheelForceSolution(*slot_solution[:5], slot_solution.painleve_determinant, length_motion)
+    return WheelForceSolution(
+        *slot_solution[:3],
+        slot_solution.hub_motion,
+        slot_solution.painleve_determinant,
+        length_motion,
+    )
 
 
 def _solve_with_free_motion(
     free_motion_fn: Callable[..., FreeMotion], contact_configuration: ContactConfiguration
 ) -> tuple[ContactInverseInertia, FreeMotion, WheelForceSolution]:
     """Return inverse inertia, free motion, and forces or impulses for a contact configuration."""
-    s, motion, _, contact_slots, _, _, is_airborne_leg_locked = contact_configuration
+    s, motion, _, contact_slots, _, _, is_airborne_leg_locked, known_solution = (
+        contact_configuration
+    )
     opaque_one = make_opaque_one(motion.theta)
     inverse_inertia = prevent_fusion(
         make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked), opaque_one
@@ -182,7 +189,7 @@ def _solve_with_free_motion(
     free_motion = prevent_fusion(
         free_motion_fn(s, motion, contact_slots, inverse_inertia), opaque_one
     )
-    force_solution = solve_contact_configuration(
+    force_solution = known_solution or solve_contact_configuration(
         contact_configuration, inverse_inertia, free_motion
     )
     return inverse_inertia, free_motion, prevent_fusion(force_solution, opaque_one)
@@ -217,16 +224,14 @@ def _solve_with_jvp_rule(
         inverse_inertia, free_motion, force_solution = _solve_with_free_motion(
             free_motion_fn, contact_configuration
         )
-        free_motion_tangent, friction_force_tangents, leg_pull_tangents = (
-            _compute_free_motion_tangent(
-                contact_configuration,
-                configuration_tangent,
-                inverse_inertia,
-                force_solution,
-                *equation_tangent_fn(
-                    contact_configuration, configuration_tangent, inverse_inertia, force_solution
-                ),
-            )
+        free_motion_tangent, friction_force_tangents = _compute_free_motion_tangent(
+            contact_configuration,
+            configuration_tangent,
+            inverse_inertia,
+            force_solution,
+            *equation_tangent_fn(
+                contact_configuration, configuration_tangent, inverse_inertia, force_solution
+            ),
         )
         _, solution_tangent = jax.jvp(
             lambda free_motion: solve_contact_configuration(
@@ -236,8 +241,7 @@ def _solve_with_jvp_rule(
             (free_motion_tangent,),
         )
         return force_solution, solution_tangent._replace(
-            tangential_forces=solution_tangent.tangential_forces + friction_force_tangents,
-            leg_pull_forces=solution_tangent.leg_pull_forces + leg_pull_tangents,
+            tangential_forces=solution_tangent.tangential_forces + friction_force_tangents
         )
 
     return solve_from_arrays(float_leaves, nonfloat_arrays)
@@ -250,11 +254,11 @@ def _compute_free_motion_tangent(
     force_solution: WheelForceSolution,
     constant_motion_terms: _ConstantMotionTerms,
     equation_tangents: _EquationTangents,
-) -> tuple[FreeMotion, SlotArray, SlotArray]:
+) -> tuple[FreeMotion, SlotArray]:
     """Return the tangent of the free motion that is equivalent to the tangent of the residual.
 
     The residual is that of the contact equations. The result is (free motion, friction forces by
-    their coefficient, pull forces of the legs in contact by friction and rotation).
+    their coefficient).
 
     - `configuration_tangent`: tangent of the configuration;
     - `constant_motion_terms`: accelerations or velocity jumps that are treated as constants;
@@ -355,7 +359,7 @@ def _compute_free_motion_tangent(
         + equation_tangents.foot_transverse_motion,
         equation_tangents.foot_radial_motion - slot_length_tangents,
     )
-    return free_motion_tangent, friction_force_tangents, leg_pull_tangents
+    return free_motion_tangent, friction_force_tangents
 
 
 def _compute_motion_equation_tangents(

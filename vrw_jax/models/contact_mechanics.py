@@ -149,8 +149,7 @@ class ContactSlots(NamedTuple):
 
         The result for an empty slot is 0.
         """
-        zero_leg_values = jnp.zeros_like(leg_quantities)
-        return jnp.sum(jnp.where(self.slot_masks, leg_quantities, zero_leg_values), axis=1)
+        return jnp.sum(self.slot_masks.astype(leg_quantities.dtype) * leg_quantities, axis=1)
 
     def gather_flags_from_legs(self, leg_flags: Array) -> Bool[Array, "2 ..."]:
         """Return the flags of the legs in both contact slots; False for an empty slot."""
@@ -161,7 +160,8 @@ class ContactSlots(NamedTuple):
 
         Other legs have the entry 0. The function is the inverse of `gather_from_legs`.
         """
-        return jnp.sum(jnp.where(self.slot_masks, slot_quantities[:, None], 0.0), axis=0)
+        slot_weights = self.slot_masks.astype(jnp.result_type(slot_quantities, 0.0))
+        return jnp.sum(slot_weights * slot_quantities[:, None], axis=0)
 
 
 def find_contact_slots(is_foot_touching: Bool[Array, "n_legs ..."]) -> ContactSlots:

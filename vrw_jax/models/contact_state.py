@@ -120,6 +120,7 @@ class ContactModeDynamics(NamedTuple):
     contact_state: ContactState
     has_accumulators: bool  # whether a batch integrates the accumulators
     ground_ahead: GroundAhead | None = None  # None on flat ground
+    known_solution: WheelForceSolution | None = None  # see `ContactConfiguration`
 
     @property
     def measures_force_peaks(self) -> bool:
@@ -141,6 +142,7 @@ class ContactModeDynamics(NamedTuple):
             self.slot_modes,
             self.is_stopper_holding,
             self.is_airborne_leg_locked,
+            self.known_solution,
         )
 
 
@@ -442,6 +444,18 @@ class ContactQuantities(NamedTuple):
             for count, end in zip(row_counts, ends, strict=True)
         )
         return cls(*blocks)
+
+    @property
+    def force_solution(self) -> WheelForceSolution:
+        """Return the forces, and the motion that results from them."""
+        return WheelForceSolution(
+            self.tangential_forces,
+            self.normal_forces,
+            self.stopper_forces,
+            tuple(self.accelerations[:3]),  # type: ignore[arg-type]
+            self.painleve_determinant[0],
+            self.accelerations[3:],
+        )
 
 
 def compute_contact_quantities(

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from vrw_jax.base.elementwise import run_if_any_element_active
 from vrw_jax.flow.integrate import compute_phase_end_jvp
 from vrw_jax.flow.tableaus import ButcherTableau, StageState
-from vrw_jax.flow.tangents import BatchPhase, MakeBatchPhase
+from vrw_jax.flow.tangents import BatchPhase
 from vrw_jax.models.contact_integrator import compute_stage_coordinates, make_contact_phase
 from vrw_jax.models.contact_kernel import (
     N_HEIGHT_COLUMNS,
@@ -29,6 +29,7 @@ from vrw_jax.models.contact_kernel import (
     init_lane_states,
     make_walk_result,
 )
+from vrw_jax.models.contact_state import ContactModeDynamics, ContactQuantities
 
 
 class TangentBatch(NamedTuple):
@@ -104,17 +105,32 @@ def _unpack_tree_from_rows(tangent_rows: Array, tangent_template: Any) -> Any:
 class IntervalTangents(NamedTuple):
     """Tangents of an interval between two events, with the methods of `flow.PhaseTangents`."""
 
-    make_phase: MakeBatchPhase
-    phase_constants: Array  # input columns
+    make_phase: Callable[[Any, Array], BatchPhase]  # for constants and rows of quantities
+    phase_constants: Any  # floating-point arrays of the dynamics
+    push_to_constants: Callable[[Array], Any]  # from tangents of columns to those of the constants
     tangents: TangentBatch
     start_tangents: Array  # tangents of coordinates, rates and losses, (tangents, rows, batch)
     held_constants: tuple = ()
 
-    def linearize(self, function: Callable[[BatchPhase, StageState], Array], q: Any, v: Any) -> Any:
-        """Return the linear map from tangents of (columns, q, v) to those of a function's value."""
+    @property
+    def zero_constants_tangent(self) -> Any:
+        """Return the tangent of constants that do not vary."""
+        return jax.tree.map(jnp.zeros_like, self.phase_constants)
 
-        def evaluate(columns: Array, q: Array, v: Array) -> Array:
-            phase = self.make_phase(columns, ())
+    def get_constants_tangent(self, k: Array) -> Any:
+        """Return the tangent of the constants with index `k`."""
+        return self.push_to_constants(self.tangents.get_input_tangent(k))
+
+    def linearize(
+        self, function: Callable[[BatchPhase, StageState], Array], q: Any, v: Any, rows: Array
+    ) -> Any:
+        """Return the linear map from tangents of (constants, q, v) to those of a function's value.
+
+        - `rows`: rows of `ContactQuantities` at the state, which are not computed again.
+        """
+
+        def evaluate(phase_constants: Any, q: Array, v: Array) -> Array:
+            phase = self.make_phase(phase_constants, rows)
             return function(phase, phase.make_state(q, v))
 
         return jax.linearize(evaluate, self.phase_constants, q, v)[1]
@@ -130,18 +146,18 @@ class IntervalTangents(NamedTuple):
         """Return the tangents at the end of a solver step of length `h`, s, if it is accepted."""
         q, v, _ = stage_states[0]
         n, n_rates, tangents = len(q), len(v), self.tangents
-        stage_rates = jnp.stack(
-            [state.acceleration.acceleration[:n_rates] for state in stage_states[:-1]]
-        )
+        stage_rows = jnp.stack([state.acceleration.acceleration for state in stage_states[:-1]])
         evaluate_rates = lambda _, state: state.acceleration.acceleration[:n_rates]
 
         def push_stage(loop_state: tuple[Array, Array]) -> tuple[Array, Array]:
             i, rate_tangents = loop_state
-            stage = compute_stage_coordinates(tableau, i, q, v, stage_rates, h)
-            push = self.linearize(evaluate_rates, *stage)
+            stage = compute_stage_coordinates(tableau, i, q, v, stage_rows, h)
+            rows = lax.dynamic_index_in_dim(stage_rows, i, 0, False)
+            push = self.linearize(evaluate_rates, *stage, rows)
             # A second linearization removes the terms of inputs, which most tangents keep constant.
-            zero_input_tangent = jnp.zeros_like(self.phase_constants)
-            _, push_coordinates = jax.linearize(lambda q, v: push(zero_input_tangent, q, v), *stage)
+            _, push_coordinates = jax.linearize(
+                lambda q, v: push(self.zero_constants_tangent, q, v), *stage
+            )
 
             def push_tangent(k: Array, previous_rates: Array) -> Array:
                 coordinate_tangents = _propagate_to_stage(
@@ -160,7 +176,7 @@ class IntervalTangents(NamedTuple):
                 )
                 return run_if_any_element_active(
                     has_input_tangent,
-                    lambda _: push(tangents.get_input_tangent(k), *coordinate_tangents),
+                    lambda _: push(self.get_constants_tangent(k), *coordinate_tangents),
                     rate_tangent,
                 )
 
@@ -192,13 +208,12 @@ class IntervalTangents(NamedTuple):
     ) -> tuple[Array, Array]:
         """Return time derivative and tangents of a number, for tangents of a state."""
         q, v, (_, _, rows) = state
-        push = self.linearize(evaluate_function, q, v)
-        rate = push(jnp.zeros_like(self.phase_constants), v[: len(q)], rows[: len(v)])
+        push = self.linearize(evaluate_function, q, v, rows)
+        rate = push(self.zero_constants_tangent, v[: len(q)], rows[: len(v)])
 
         def push_direction(k: Array, _: Array) -> Array:
             direction = lax.dynamic_index_in_dim(directions, k, 0, False)
-            columns = self.tangents.get_input_tangent(k)
-            return push(columns, direction[: len(q)], direction[len(q) :])
+            return push(self.get_constants_tangent(k), direction[: len(q)], direction[len(q) :])
 
         tangents = self.tangents.map_tangents_sequentially(
             push_direction, self.tangents.allocate_tangent_rows(1)
@@ -340,16 +355,28 @@ def _integrate_with_tangents(
     tableau = walk_settings.tableau
     assert tableau is not None  # diffrax differentiates in another way.
 
-    def make_phase(columns: Array, _: tuple) -> BatchPhase:
-        # The time of a force extremum is constant for derivatives.
-        contact_state = lane_state.contact_state._replace(force_rate_signs=None)
-        dynamics = walk_settings.make_lane_contact_dynamics(columns, contact_state)
+    # The time of a force extremum is constant for derivatives.
+    contact_state = lane_state.contact_state._replace(force_rate_signs=None)
+    constants, push_to_constants, others = jax.linearize(
+        lambda columns: eqx.partition(
+            walk_settings.make_lane_contact_dynamics(columns, contact_state), eqx.is_inexact_array
+        ),
+        input_columns,
+        has_aux=True,
+    )
+
+    def make_phase(constants: Any, rows: Array) -> BatchPhase:
+        dynamics: ContactModeDynamics = eqx.combine(constants, others)
+        quantities = ContactQuantities.unpack_rows(dynamics, rows)
+        dynamics = dynamics._replace(known_solution=quantities.force_solution)
         return make_contact_phase(
             dynamics, tableau, walk_settings.step_options, is_differentiated=True
         )
 
     n_rows = len(lane_state.q) + len(lane_state.v)
-    phase_tangents = IntervalTangents(make_phase, input_columns, tangents, tangent_rows[:, :n_rows])
+    phase_tangents = IntervalTangents(
+        make_phase, constants, push_to_constants, tangents, tangent_rows[:, :n_rows]
+    )
     lane_state, phase_end, search_end = walk_settings.integrate(
         input_columns, lane_state, phase_tangents
     )
