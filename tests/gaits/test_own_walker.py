@@ -133,6 +133,50 @@ def test_a_walk_that_enters_a_mode_beyond_a_guard_says_so():
     assert place in gait.why
 
 
+ABOVE = lambda y, p: y[0] - p["rise"]
+STUMBLING_BALL = vrw.HybridSystem(
+    modes={
+        "rise": Mode(
+            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
+            {
+                "apex": Guard(lambda y, p: y[1], target_mode="fall", armed=ABOVE),
+                "stumble": Guard(
+                    lambda y, p: y[1], armed=lambda y, p: -ABOVE(y, p), ends_walk=True
+                ),
+            },
+        ),
+        "fall": Mode(
+            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
+            {"impact": Guard(ABOVE, lambda y, p: jnp.stack([0.0 * y[0], -0.5 * y[1]]), "rise")},
+        ),
+    },
+    section="impact",
+    state=("height", "velocity"),
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
+    ground={"height": "rise"},
+)
+
+
+def test_a_guard_that_ends_walks_does_so_at_the_apex():
+    """Bounces of half the velocity rise to a quarter of the height."""
+    top = 2.0**2 / 2 / GRAVITY
+    heights = np.array([[0.0, 0.0, 0.24 * top, 0.24 * top], [0.0, 0.0, 0.26 * top, 0.26 * top]])
+    walks = vrw.step_batch(
+        {"rise": 0.0}, np.full((2, 1), 2.0), 3, model=STUMBLING_BALL, heights=heights
+    )
+    assert walks.n_stepped.tolist() == [3, 1]
+    assert walks.outcome.tolist() == [vrw.Outcome.STEPPED, vrw.Outcome.ENDED_BY_GUARD]
+    step = STUMBLING_BALL.step({"rise": 1.01 * top}, [2.0])
+    assert "guard 'stumble' of mode 'rise'" in step.ending
+    np.testing.assert_allclose(step.duration, 2.0 / GRAVITY, rtol=1e-12)
+    motion = STUMBLING_BALL.simulate({"rise": 1.01 * top}, [0.0, 2.0], events=9)
+    np.testing.assert_allclose(motion.state, [top, 0.0], atol=1e-12)
+    assert int(motion.n_events) == 1
+    with pytest.raises(ValueError, match="has ends_walk, but it is the section"):
+        dataclasses.replace(STUMBLING_BALL, section="stumble")
+
+
 def test_section_coordinates_of_another_length_are_refused():
     with pytest.raises(ValueError, match="x has 2 entries, but project returns"):
         BALL_SYSTEM.step(BALL_PARAMS, [2.0, 1.0])
@@ -162,6 +206,8 @@ def test_parameters_outside_their_domain_have_a_code():
     gait = vrw.limit_cycle(Mass(kick=-1.0), model=BALL_SYSTEM)
     assert gait.outcome == vrw.Outcome.BAD_INPUT
     assert "outside its domain" in gait.why
+    walk = vrw.walk(Mass(kick=-1.0), [2.0], 2, model=BALL_SYSTEM)
+    assert walk.steps.outcome.tolist() == [vrw.Outcome.BAD_INPUT] * 2
 
 
 def test_figures_show_the_results_of_any_walker():

@@ -141,6 +141,7 @@ OUTCOME_LABELS_AND_COLORS: dict[int, tuple[str, str]] = {
     Outcome.PAINLEVE_PARADOX: ("friction paradox", "#862DB8"),
     Outcome.CAME_TO_REST: ("came to rest", "#8C6D31"),
     Outcome.GUARD_VIOLATED: ("guard violated", "#AA66FF"),
+    Outcome.ENDED_BY_GUARD: ("ended by a guard", "#DDFF99"),
     UNSTABLE_CYCLE_CODE: ("unstable limit cycle", OKABE_ITO_YELLOW),
     NOT_COMPUTED_CODE: ("not computed", "#FFFFFF"),
 }

@@ -57,6 +57,7 @@ class Outcome(StatusCode):
     GUARD_VIOLATED = (
         18, "One of the guards was negative when its mode began, for example after a fall."
     )  # fmt: skip
+    ENDED_BY_GUARD = 19, "A guard that ends walks has fallen to zero, for example at a fall."
 
 
 def describe_outcomes(outcomes: Any, section: str = "") -> Any:

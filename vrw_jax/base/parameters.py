@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from vrw_jax.base.checks import check_real, require_known_name
 
@@ -135,6 +136,14 @@ def list_tree_parameters(params: Any) -> list[ModuleParameter]:
         domain = domain._replace(symbol=domain.symbol or names[-1])
         parameters.append(ModuleParameter(".".join(names), value, domain, 1.0))
     return parameters
+
+
+def is_tree_in_domain(params: Any) -> Any:
+    """Return whether all parameters in a tree are finite and within their domains."""
+    is_inside: Any = jnp.asarray(True)
+    for parameter in list_tree_parameters(params):
+        is_inside &= jnp.all(parameter.domain.contains_parameter_value(parameter.value))
+    return is_inside
 
 
 def find_tree_parameter(params: Any, name: str) -> int:

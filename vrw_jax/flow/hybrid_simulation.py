@@ -51,13 +51,15 @@ class Guard(NamedTuple):
     to zero. Then `reset` is applied to the state, and the mode `target_mode` begins. A guard with a
     function `armed` counts only while `armed` is positive, for example so that a foot that swings
     through the ground at mid-stance does not land there. The mode also ends if `value` is negative
-    when `armed` becomes positive.
+    when `armed` becomes positive. A guard with `ends_walk`, such as that of a fall, ends the
+    simulation at its event.
     """
 
     value: Callable[..., Scalar]
     reset: Callable[..., StateArray] = lambda y, *_: y
     target_mode: Any = None  # index or name of the next mode; None stands for the same mode
     armed: Callable[..., Scalar] | None = None
+    ends_walk: bool = False
 
     def evaluate(self, *state_and_parameters: Any) -> Any:
         """Return the value that ends the mode when it falls to zero."""
@@ -98,6 +100,7 @@ class Termination(StatusCode):
         "The steps are too short, or an event is not located: a singular field or a noisy guard.",
     )
     SECTION_REACHED = 6, "The step is complete: it has reached the section."
+    ENDED_BY_GUARD = 7, "A guard that ends the walk has fallen to zero."
 
 
 STATUS_RUNNING_CODE = -1
@@ -341,7 +344,7 @@ def _simulate_one_event(
     """Integrate one phase in a mode, and apply the reset at its end.
 
     Return the end of the phase, the index of the guard that is violated at its start, or -1, the
-    next state and the next mode.
+    next state and the next mode, which is -1 if the guard ends the walk.
     """
     mode = modes[mode_index]
     compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
@@ -372,7 +375,10 @@ def _simulate_one_event(
     phase_end = integrate_phase(mode.field, guards_and_margins, state, violated_guard < 0, options)
     guard_index = jnp.maximum(phase_end.end_guard_index, 0)
     next_state = lax.switch(guard_index, [g.reset for g in mode.guards], phase_end.state)
-    next_modes = [mode_index if g.target_mode is None else g.target_mode for g in mode.guards]
+    next_modes = [
+        -1 if g.ends_walk else mode_index if g.target_mode is None else g.target_mode
+        for g in mode.guards
+    ]
     next_mode = select_entry_by_mask(guard_index, jnp.asarray(next_modes, jnp.int32))
     return phase_end, violated_guard.astype(jnp.int32), next_state, next_mode.astype(jnp.int32)
 
@@ -387,7 +393,7 @@ class EventRun(NamedTuple):
     n_events: Int[Array, ""]
     n_events_without_progress: Int[Array, ""]
     solver_steps: Int[Array, ""]
-    violated_guard: Int[Array, ""]  # index of the guard below zero when the mode began, or -1
+    last_guard: Int[Array, ""]  # guard that ends the walk, or was below zero at first, or -1
     termination: Int[Array, ""]  # a Termination
     log: Any
 
@@ -438,6 +444,7 @@ def run_events(
         )
         is_guard_violated = violated_guard >= 0
         has_event = ~is_guard_violated & (phase_end.end_guard_index >= 0)
+        ends_walk = has_event & (next_mode < 0)
         # D. E. Knuth's two-sum returns the rounded sum of two times and its rounding error.
         duration = phase_end.duration + run.time_remainder
         time = run.time + duration
@@ -452,6 +459,7 @@ def run_events(
         termination = jnp.select(
             [
                 has_event & (n_without_progress > max_simultaneous_events),
+                ends_walk,
                 has_event & is_last_event(event),
                 has_event & (run.n_events + 1 >= max_events),
                 has_event,
@@ -462,6 +470,7 @@ def run_events(
             ],
             [
                 Termination.ZENO,
+                Termination.ENDED_BY_GUARD,
                 Termination.SECTION_REACHED,
                 Termination.MAX_EVENTS_REACHED,
                 STATUS_RUNNING_CODE,
@@ -475,11 +484,11 @@ def run_events(
             time=time,
             time_remainder=time_remainder,
             state=jnp.where(has_event, next_state, phase_end.state),
-            mode=jnp.where(has_event, next_mode, run.mode).astype(jnp.int32),
+            mode=jnp.where(has_event & ~ends_walk, next_mode, run.mode).astype(jnp.int32),
             n_events=run.n_events + has_event,
             n_events_without_progress=n_without_progress.astype(jnp.int32),
             solver_steps=run.solver_steps + phase_end.solver_steps,
-            violated_guard=violated_guard,
+            last_guard=jnp.where(ends_walk, phase_end.end_guard_index, violated_guard),
             termination=termination.astype(jnp.int32),
             log=update_log(run.log, run.n_events, has_event, event),
         )

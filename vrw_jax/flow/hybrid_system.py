@@ -29,6 +29,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import is_tree_in_domain
 from vrw_jax.base.printing import (
     format_each_batch_element,
     format_heading_and_rows,
@@ -72,6 +73,7 @@ OUTCOME_BY_TERMINATION = np.array(
         Outcome.SOLVER_FAILED,
         Outcome.SOLVER_FAILED,
         Outcome.STEPPED,
+        Outcome.ENDED_BY_GUARD,
     ],
     np.int32,
 )
@@ -89,8 +91,8 @@ class HybridStep(eqx.Module):
       the last event;
     - `n_events`, `solver_steps`: numbers of events and of solver steps;
     - `termination`: a `Termination`; a complete step has `Termination.SECTION_REACHED`;
-    - `last_mode`, `violated_guard`: numbers of the mode in which the simulation ended, and of its
-      guard that was negative when the mode began, or -1;
+    - `last_mode`, `last_guard`: numbers of the mode in which the simulation ended, and of its guard
+      that was negative when the mode began, or that ended the walk; otherwise -1;
     - `guard_names`: names of the guards by the name of each mode.
     """
 
@@ -102,7 +104,7 @@ class HybridStep(eqx.Module):
     solver_steps: Int[Array, ""]
     termination: Int[Array, ""]
     last_mode: Int[Array, ""]
-    violated_guard: Int[Array, ""]
+    last_guard: Int[Array, ""]
     guard_names: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True)
 
     @property
@@ -133,7 +135,7 @@ class HybridStep(eqx.Module):
             return f"{ending.meaning} This is {place} {mode_name!r}."
 
         return format_each_batch_element(
-            describe, self.termination, self.last_mode, self.violated_guard
+            describe, self.termination, self.last_mode, self.last_guard
         )
 
     def __repr__(self) -> str:
@@ -240,6 +242,16 @@ class HybridSystem(AbstractWalker):
         for measure in self.measures:
             check_type("a measure", measure, Measure, "decorate its function with vrw.measure")
             self.find_modes(measure)
+        if any(
+            guard.ends_walk
+            for mode in self.modes.values()
+            for name, guard in mode.guards.items()
+            if name == self.section
+        ):
+            raise ValueError(
+                f"the guard {self.section!r} has ends_walk, but it is the section, from which the "
+                "next step begins: give the guard of a fall another name."
+            )
         if len(self._start_modes) > 1:
             raise ValueError(
                 f"{self.section!r} leads to the modes {sorted(self._start_modes)}, but each step "
@@ -317,6 +329,7 @@ class HybridSystem(AbstractWalker):
                         bind(guard.evaluate),
                         bind(guard.reset),
                         None if guard.target_mode is None else self._find_mode(guard.target_mode),
+                        ends_walk=guard.ends_walk,
                     )
                     for guard in mode.guards.values()
                 ),
@@ -392,7 +405,7 @@ class HybridSystem(AbstractWalker):
             run.solver_steps,
             run.termination,
             run.mode,
-            run.violated_guard,
+            run.last_guard,
             tuple((name, tuple(mode.guards)) for name, mode in self.modes.items()),
         )
 
@@ -486,9 +499,8 @@ class HybridSystem(AbstractWalker):
     def advance(self, params: Any, x: Array, options: StepOptions) -> AdvanceResult:
         """Return the end of one step of one element."""
         step = compile_step(self)(params, x, options)
-        return AdvanceResult(
-            step.section_state, step.mode_durations, step.outcome, step.solver_steps
-        )
+        outcome = jnp.where(is_tree_in_domain(params), step.outcome, Outcome.BAD_INPUT)
+        return AdvanceResult(step.section_state, step.mode_durations, outcome, step.solver_steps)
 
     def simulate(
         self,
@@ -600,6 +612,7 @@ def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> Hy
             lambda y, params: guard.evaluate(y[:n], params),
             lambda y, params: jnp.concatenate([guard.reset(y[:n], params), y[n:]]),
             guard.target_mode,
+            ends_walk=guard.ends_walk,
         )
 
     return HybridSystem(

@@ -21,6 +21,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import (
     ParameterDomain,
     find_tree_parameter,
+    is_tree_in_domain,
     list_tree_parameters,
     replace_tree_parameter,
 )
@@ -335,9 +336,7 @@ def _search_from_guess(
     )
     x, period, values = fixed_point.x, jnp.zeros((), fixed_point.x.dtype), []
     numbers = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((params, guess))])
-    is_valid = jnp.all(jnp.isfinite(numbers))
-    for parameter in list_tree_parameters(params):
-        is_valid &= jnp.all(parameter.domain.contains_parameter_value(parameter.value))
+    is_valid = jnp.all(jnp.isfinite(numbers)) & is_tree_in_domain(params)
     outcome = jnp.where(is_valid, Outcome.STEPPED, Outcome.BAD_INPUT)
     last_step: Any = None
     for _ in range(period_n):
