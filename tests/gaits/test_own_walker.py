@@ -22,6 +22,7 @@ from support.walkers import (
     Henon,
     JuggledBall,
     SlowReturn,
+    flight_height,
 )
 
 import vrw_jax as vrw
@@ -95,6 +96,7 @@ def test_sensitivities_are_the_derivatives_of_the_closed_form(walker):
     assert table.measure.values.tolist() == ["period", "velocity", "height"]
     assert table.parameter.values.tolist() == ["ball.restitution", "kick"]
     assert table.measure_unit.values.tolist() == ["s", "m/s", "m"]
+    assert not table.attrs
     dv = np.array([4.0, 2.0])
     expected = [2.0 / GRAVITY * dv, dv, 2.0 / GRAVITY * dv]
     np.testing.assert_allclose(table.derivative, expected, rtol=1e-9)
@@ -131,6 +133,7 @@ def test_a_walk_that_enters_a_mode_beyond_a_guard_says_so():
     gait = vrw.limit_cycle(BALL_PARAMS, model=buried, guess=[1.0])
     assert gait.outcome == vrw.Outcome.GUARD_VIOLATED
     assert place in gait.why
+    assert str(gait) == f"HybridGait\n  search: {gait.why}"
 
 
 ABOVE = lambda y, p: y[0] - p["rise"]
@@ -378,6 +381,15 @@ def test_each_function_of_the_table_takes_a_walker():
         assert call() is not None
 
 
+class Kick(eqx.Module):
+    kick: float = 1.0
+
+
+class AimedBall(JuggledBall):
+    def advance(self, params, x, options):
+        return super().advance(params, x + params.aim, options)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -414,11 +426,56 @@ def test_each_function_of_the_table_takes_a_walker():
         ),
         (lambda: vrw.walk({"kick": 1.0}, [2.0], 2, model=JuggledBall()), "contains kick: add it"),
         (lambda: vrw.limit_cycle(BALL_PARAMS, model=BALL_SYSTEM).measure("x"), "height"),
+        (lambda: BALL_SYSTEM.step_batch(KICKS, np.ones((7, 1))), "2 entries of kick, 7.*of x"),
+        (lambda: BALL_SYSTEM.step_batch(BALL_PARAMS, [1.0]), "has no arrays, but.* and x have"),
+        (
+            lambda: BALL_SYSTEM.simulate_batch(KICKS, np.ones((7, 2)), events=1),
+            "2 entries of kick, 7 entries of start",
+        ),
+        (
+            lambda: vrw.step_batch(KICKS, np.ones((7, 1)), model=BALL_SYSTEM),
+            "2 entries of kick, 7 entries of states",
+        ),
+        (
+            lambda: vrw.step(BALL_PARAMS, [1.0], model=AimedBall()),
+            "the attribute 'aim' of a dict, but params is a dict, which contains ball.restitution",
+        ),
+        (lambda: vrw.step({"leg": Kick()}, [1.0], model=AimedBall()), "'aim' of a dict"),
+        (lambda: vrw.step(Kick(), [1.0], model=AimedBall()), "'aim' of a Kick.*contains kick: add"),
+        (lambda: vrw.step(Kick(), [1.0], model=JuggledBall()), "an entry of a Kick in brackets"),
+        (lambda: vrw.step(Kick, [1.0], model=JuggledBall()), r"give an instance, Kick\(\)"),
+        (
+            lambda: vrw.scan(
+                vrw.grid(kick=[1.0]), ["heights"], base=BALL_PARAMS, model=BALL_SYSTEM
+            ),
+            "'height'.*such as 'd period / d ball.restitution'",
+        ),
     ],
 )
 def test_what_is_missing_is_said_in_one_sentence(call, message):
     with pytest.raises((TypeError, ValueError), match=message):
         call()
+
+
+def test_an_attribute_that_another_object_lacks_is_no_missing_parameter():
+    class BallOfTable(JuggledBall):
+        def advance(self, params, x, options):
+            return super().advance(params, x + {"table": 1.0}.aim, options)
+
+    with pytest.raises(AttributeError, match="'dict' object has no attribute 'aim'"):
+        vrw.step(BALL_PARAMS, [1.0], model=BallOfTable())
+
+
+def test_a_simulation_and_a_measure_print_what_they_are():
+    solution = BALL_SYSTEM.simulate(BALL_PARAMS, [0.0, 2.0], events=3)
+    rows = ["events: 3", f"time: {solution.time:.6g} s", f"ending: {solution.ending}"]
+    assert str(solution).splitlines() == ["HybridSolution", *(f"  {row}" for row in rows)]
+    batch = BALL_SYSTEM.simulate_batch(BALL_PARAMS, np.ones((4, 2)), events=3)
+    assert "4 MAX_EVENTS_REACHED" in str(batch)
+    jax.jit(lambda x: str(BALL_SYSTEM.simulate(BALL_PARAMS, x, events=3)) and x)(np.ones(2))
+    assert str(flight_height) == "Measure(height [m])"
+    peak = vrw.measure("peak", unit="m", phase="flight", reduction="max")(lambda y, p: y[0])
+    assert str(peak) == "Measure(peak [m], max over flight)"
 
 
 def test_random_kicks_end_a_walk_after_the_mean_number_of_steps_of_an_integral_equation():

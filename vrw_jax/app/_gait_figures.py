@@ -603,7 +603,7 @@ def tornado_figure(
             )
         axes.axvline(0.0, color="black", linewidth=0.6)
         labels = list(map(str, bars.parameter.values))
-        if table.attrs.get("rung") != "own_walker":  # The library's symbols are those of wheels.
+        if "rung" in table.attrs:  # The library's symbols are those of wheels.
             labels = [f"${MEASURES[name].mathtext}$" for name in labels]
         axes.set_yticks(range(bars.size), labels)
         axes.set_ylim(bars.size - 0.5, -0.5)

@@ -10,7 +10,7 @@ from vrw_jax.base.checks import check_callable, check_choice, check_names, requi
 from vrw_jax.base.printing import format_mathtext
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Measure:
     """Measured quantity with its name, unit, symbol and description.
 
@@ -46,6 +46,10 @@ class Measure:
         """Return the value of the function that `vrw.measure` decorates."""
         assert self.function is not None
         return self.function(*arguments)
+
+    def __repr__(self) -> str:
+        place = f", {self.reduction} over {', '.join(self.phases)}" * bool(self.phases)
+        return f"Measure({self.name} [{self.unit}]{place})"
 
     @property
     def mathtext(self) -> str:

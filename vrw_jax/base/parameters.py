@@ -133,7 +133,7 @@ def list_tree_parameters(params: Any) -> list[ModuleParameter]:
                 owner = getattr(owner, name)
             else:
                 owner, domain = owner[name], _UNDECLARED_DOMAIN
-        domain = domain._replace(symbol=domain.symbol or names[-1])
+        domain = domain._replace(symbol=domain.symbol or "".join(names[-1:]))
         parameters.append(ModuleParameter(".".join(names), value, domain, 1.0))
     return parameters
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, TypeGuard
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax import lanes
@@ -184,7 +185,12 @@ def is_own_walker(model: Any) -> TypeGuard[AbstractWalker]:
 
 def check_parameters(params: Any) -> Any:
     """Return a tree of parameters as arrays, or raise an error."""
-    return jax.tree.map(lambda leaf: check_reals("a parameter", leaf), params)
+
+    def check(leaf: Any) -> Array:
+        remedy = (f"give an instance, {leaf.__name__}()",) if isinstance(leaf, type) else ()
+        return check_reals("a parameter", leaf, *remedy)
+
+    return jax.tree.map(check, params)
 
 
 @contextlib.contextmanager
@@ -192,15 +198,47 @@ def name_missing_parameters(params: Any) -> Iterator[None]:
     """Return a context in which a parameter that a walker lacks raises an error with its name."""
     try:
         yield
-    except KeyError as error:
+    except (KeyError, AttributeError, TypeError) as error:
         names = [parameter.name for parameter in list_tree_parameters(params)]
-        name = error.args[0] if error.args else None
-        if not isinstance(name, str) or name in names:
+        name, kind = error.args[0] if error.args else None, type(params).__name__
+        if isinstance(error, AttributeError) and _is_node(error.obj, jax.tree.structure(params)):
+            missing = f"the attribute {error.name!r} of a {type(error.obj).__name__}"
+        elif isinstance(error, KeyError) and isinstance(name, str) and name not in names:
+            missing = repr(name)
+        elif name == f"{kind!r} object is not subscriptable":
+            missing = f"an entry of a {kind} in brackets"
+        else:
             raise
         raise ValueError(
-            f"a function of the walker reads {name!r}, but params contains {', '.join(names)}: "
-            "add it to params, or correct the function."
+            f"a function of the walker reads {missing}, but params is a {kind}, which contains "
+            f"{', '.join(names)}: add it to params, or correct the function."
         ) from error
+
+
+def _is_node(tree: Any, structure: Any) -> bool:
+    """Return whether a tree, of more than a number, has the structure of a node of another one."""
+    if structure.num_leaves == 0 or structure.num_nodes == 1:
+        return False
+    return jax.tree.structure(tree) == structure or any(
+        _is_node(tree, child) for child in structure.children()
+    )
+
+
+def find_batch_length(params: Any, x: Any, name: str = "x", row_axes: int = 1) -> int:
+    """Return the length of a batch, or raise an error with the length of each array.
+
+    - `row_axes`: number of axes of `x` for one element.
+    """
+    arrays = [(entry.name, entry.value) for entry in list_tree_parameters(params)]
+    lengths = {key: len(array) for key, array in arrays if np.ndim(array)}
+    lengths |= {name: len(x)} if x.ndim > row_axes else {}
+    if len({*lengths.values()}) != 1:
+        entries = ", ".join(f"{n} entries of {key or 'params'}" for key, n in lengths.items())
+        raise ValueError(
+            f"the batch has {entries or 'no arrays'}, but parameters that are arrays and {name} "
+            "have one common length: give arrays of one length, and numbers for all elements."
+        )
+    return next(iter(lengths.values()))
 
 
 def check_arguments(
@@ -221,6 +259,8 @@ def check_arguments(
     if not 1 <= x.ndim <= max_axes:
         shapes = "(n,)" if max_axes == 1 else "(n,) or (batch, n)"
         raise ValueError(f"{name} has shape {x.shape}, but its shape must be {shapes}.")
+    if max_axes == 2:
+        find_batch_length(params, x, name)
     leaves, structure = jax.tree.flatten(params)
     leaf_shapes = tuple((leaf.shape[max_axes - 1 :], leaf.dtype) for leaf in leaves)
     with name_missing_parameters(params):

@@ -23,7 +23,13 @@ from vrw_jax.base.checks import check_callable, check_int, check_reals, check_ty
 from vrw_jax.base.elementwise import make_opaque_loop_condition, select_entry_by_mask
 from vrw_jax.base.forward_only import forbid_reverse_mode
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.printing import StatusCode, describe_step_ending
+from vrw_jax.base.printing import (
+    StatusCode,
+    describe_step_ending,
+    format_heading_and_rows,
+    format_outcome_counts,
+    format_quantity,
+)
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.integrate import PhaseEnd
@@ -72,8 +78,8 @@ class Guard(NamedTuple):
 class Mode(NamedTuple):
     """Autonomous vector field, from shape (dim,) to (dim,), and the guards that end the mode.
 
-    A single guard may be passed without a tuple. If the field depends on time, time is one of the
-    coordinates of the state.
+    `simulate_hybrid` accepts a single guard without a tuple. If the field depends on time, time is
+    one of the coordinates of the state.
     """
 
     field: VectorField
@@ -92,7 +98,7 @@ class Termination(StatusCode):
     ZENO = 2, "Events follow each other so fast that the time does not advance (Zeno)."
     GUARD_VIOLATED_AT_ENTRY = (
         3,
-        "A mode begins with a guard below zero: start where the guard is zero or positive.",
+        "A mode begins with a guard below zero: check its sign, the start or reset, and `armed`.",
     )
     MAX_STEPS_REACHED = 4, "The solver steps are exhausted: raise StepOptions.max_solver_steps."
     STEP_SIZE_UNDERFLOW = (
@@ -133,6 +139,18 @@ class HybridSolution(NamedTuple):
     def ending(self) -> Any:
         """Return a sentence on how the simulation ended; for a batch, an array of sentences."""
         return describe_step_ending(self.termination, Termination)
+
+    def __repr__(self) -> str:
+        if isinstance(self.termination, jax.core.Tracer):
+            return f"HybridSolution{tuple(self)}"
+        if np.ndim(self.termination):
+            return f"HybridSolution ({format_outcome_counts(self.termination, Termination)})"
+        rows = [
+            ("events", str(self.n_events)),
+            ("time", format_quantity(self.time, "s")),
+            ("ending", self.ending),
+        ]
+        return format_heading_and_rows("HybridSolution", rows)
 
     def find_phases(self, start: StateArray) -> tuple[Array, Array]:
         """Return the state at the start and the duration, s, of the phase before each event.

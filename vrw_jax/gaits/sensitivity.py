@@ -140,5 +140,5 @@ def sensitivities(
             "parameter_value": ("parameter", np.asarray(parameter_values)),
         },
         coords={"measure": list(measure_names), "parameter": list(parameter_names)},
-        attrs={"rung": gait_finder.model.model_name},
+        attrs={"rung": gait_finder.model.model_name} if gait_finder.model.is_wheel else {},
     )

@@ -38,6 +38,7 @@ from vrw_jax.base.walker import (
     check_arguments,
     check_parameters,
     compile_step,
+    find_batch_length,
     make_return_map,
     name_coordinates,
     name_missing_parameters,
@@ -171,6 +172,8 @@ class HybridGait(NamedTuple):
         ]
         if np.ndim(self.period):
             rows = [("gaits", format_outcome_counts(self.outcome, Outcome))]
+        elif not self.converged:
+            rows = rows[-1:]
         return format_heading_and_rows("HybridGait", rows)
 
 
@@ -202,14 +205,7 @@ def find_walker_gaits(
         rows, starts = collect_walk_ends(walker, one_params, one_guess, outcome, options, period_n)
         found = find_gaits(params, starts[0]) if len(rows) else gait
         return found if found.converged else gait
-    lengths = {len(leaf) for leaf in jax.tree.leaves(params) if leaf.ndim}
-    lengths |= {len(guesses)} if guesses.ndim == 3 else set()
-    if len(lengths) != 1:
-        raise ValueError(
-            f"the batch has the lengths {sorted(lengths)}, but parameters that are arrays and "
-            "guesses have one common length: give arrays of one length."
-        )
-    (n,) = lengths
+    n = find_batch_length(params, guesses, "guess", row_axes=2)
     arrays: Any = jnp if has_traced_leaf(params, guesses) else np
     params = jax.tree.map(lambda leaf: arrays.broadcast_to(leaf, (n,)), params)
     guesses = arrays.broadcast_to(guesses, (n, *guesses.shape[-2:]))

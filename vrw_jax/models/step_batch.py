@@ -35,6 +35,7 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     AbstractWalker,
     check_parameters,
+    find_batch_length,
     is_own_walker,
     name_section,
     step_batch_of_walker,
@@ -223,15 +224,7 @@ def _step_batch_of_own_walker(
     walker: Any, params: Any, states: Any, n_steps: int, options: StepOptions
 ) -> StepBatchResult:
     params, states = jax.tree.map(np.asarray, (check_parameters(params), check_reals("x", states)))
-    lengths = {len(leaf) for leaf in jax.tree.leaves(params) if leaf.ndim} | {
-        len(x) for x in [states] if x.ndim == 2
-    }
-    if len(lengths) != 1:
-        raise ValueError(
-            f"the batch has the lengths {sorted(lengths)}, but states and parameters that are "
-            "arrays have one common length: give states of shape (batch, n)."
-        )
-    (n_elements,) = lengths
+    n_elements = find_batch_length(params, states, "states")
     for leaf in jax.tree.leaves(params):
         if leaf.ndim > 1 and leaf.shape[1:] != (n_steps,):
             raise ValueError(

@@ -213,11 +213,19 @@ def check_measure_names(
                     "deviation is missing: give slope_sd, in rad, and no tol."
                 )
             if measure_name not in known_variable_names:
+                derivatives = [
+                    f", or a derivative such as 'd {measure} / d {parameter}'"
+                    for measure, parameter in zip(
+                        measure_catalog.differentiable_measures,
+                        measure_catalog.differentiation_parameters,
+                        strict=False,
+                    )
+                ]
                 raise ValueError(
                     f"{measure_name!r} is no measure of a "
-                    f"scan{format_name_suggestion(measure_name, known_variable_names)}: "
-                    f"choose from {', '.join(measure_catalog.requestable_measures)}, or a "
-                    "derivative such as 'd dls_fraction / d damping'."
+                    f"scan{format_name_suggestion(measure_name, known_variable_names)}: choose "
+                    f"from {', '.join(measure_catalog.requestable_measures)}"
+                    f"{''.join(derivatives[:1])}."
                 )
             if measure_name not in measure_catalog.always_included_variables:
                 checked_variable_names[measure_name] = None
