@@ -205,6 +205,9 @@ def test_an_oscillator_touches_its_stop_at_the_amplitude_of_the_linear_equation(
     assert abs(touch.value - amplitude) < 1e-12
     distance = branch.dataset["distance to the stop"].values
     np.testing.assert_allclose(distance, 1.0 - branch.values / amplitude, atol=1e-9)
+    _, _, _, margin = vrw.plot.branch_figure(branch).axes
+    assert margin.get_ylabel() == "distance to the stop"
+    np.testing.assert_array_equal(margin.lines[0].get_ydata(), distance)
 
 
 def test_the_curve_on_which_an_oscillator_touches_its_stop_is_that_of_the_linear_equation():

@@ -213,19 +213,75 @@ def test_parameters_outside_their_domain_have_a_code():
     assert walk.steps.outcome.tolist() == [vrw.Outcome.BAD_INPUT] * 2
 
 
+class DampedBall(JuggledBall):
+    """Juggled ball whose names have other meanings and units than those of the wheel."""
+
+    class Params(eqx.Module):
+        damping: float = vrw.parameter(0.5, unit="N s/m^2")
+        stiffness: float = vrw.parameter(1.0, unit="m/s")
+        slope: float = vrw.parameter(0.0)
+
+    coordinates = {"theta": "m/s"}  # noqa: RUF012
+
+    def advance(self, params, x, options):
+        kick = params.stiffness + params.slope
+        ball = {"ball": {"restitution": params.damping}, "kick": kick}
+        return super().advance(ball, x, options)
+
+
 def test_figures_show_the_results_of_any_walker():
-    walker = JuggledBall()
-    design = vrw.grid({"kick": [0.5, 1.0], "ball.restitution": [0.4, 0.5]})
-    scan = vrw.scan(design, ["period", "height"], base=BALL_PARAMS, model=walker)
+    walker, params = DampedBall(), DampedBall.Params()
+    damping_label, stiffness_label = "damping [N·s/m²]", "stiffness [m/s]"
+    design = vrw.grid({"stiffness": [0.5, 1.0], "damping": [0.4, 0.5]})
+    names = ["period", "height", "theta", "d height / d damping"]
+    scan = vrw.scan(design, names, base=params, model=walker)
     (figure,) = vrw.plot.scan_figures(scan).values()
-    assert figure.axes[-1].get_ylabel() or len(figure.axes) > 3
+    assert figure.axes[4].get_xlabel() == stiffness_label
+    assert figure.axes[4].get_ylabel() == damping_label
+    labels = [axes.get_ylabel().replace("\n", " ") for axes in figure.axes[5:]]
+    assert labels[:3] == ["step period [s]", "height [m]", "theta [m/s]"]
+    assert labels[3] == "d height / d damping [m/(N·s/m²)]"
+    more = scan.assign({f"more{i}": scan.height for i in range(3)})
+    more.attrs["scan"] = scan.attrs["scan"].replace('"height"', '"height", "more1", "more2"', 1)
+    with pytest.warns(UserWarning, match="first 6 measures, without more2: leave"):
+        vrw.plot.scan_figures(more)
     map_axes = vrw.plot.map_figure(scan, "height", []).axes
-    assert map_axes[0].get_xlabel()
+    assert map_axes[0].get_xlabel() == stiffness_label
     assert map_axes[-1].get_ylabel() == "height [m]"
-    tornado = vrw.plot.tornado_figure(vrw.sensitivities(BALL_PARAMS, model=walker))
-    assert [axes.get_title() for axes in tornado.axes][1:] == ["velocity", "height"]
-    tuned = vrw.tune(BALL_PARAMS, {"height": 1.0}, ["kick"], {"kick": (0.5, 1.5)}, model=walker)
-    assert vrw.plot.tuning_figure(tuned).axes
+    table = vrw.sensitivities(params, model=walker)
+    tornado = vrw.plot.tornado_figure(table)
+    assert [axes.get_title() for axes in tornado.axes][1:] == ["theta", "height"]
+    rows = [label.get_text() for label in tornado.axes[0].get_yticklabels()]
+    assert rows == ["damping", "stiffness"]  # not the slope of 0
+    changes = vrw.plot.tornado_figure(table, "theta", spreads={"slope": 0.1})
+    assert changes.axes[0].get_xlabel() == "change of theta [m/s]"
+    bounds, limits = {"stiffness": (0.5, 1.5)}, {"theta": (None, 2.5)}
+    tuned = vrw.tune(params, "height", ["stiffness"], bounds, limits, model=walker)
+    objective, slack, paths = vrw.plot.tuning_figure(tuned).axes
+    assert objective.get_ylabel() == "height [m]"
+    assert paths.get_legend_handles_labels()[1] == [r"$\mathrm{stiffness}$"]
+    (limit,) = slack.get_yticklabels()
+    assert (limit.get_text(), limit.get_fontweight()) == ("theta (upper bound)", "bold")
+    assert slack.get_legend_handles_labels()[1] == ["active", "at the start", "tuned"]
+    basin = vrw.basin(params, {"theta": [0.5, 1.0]}, model=walker).expand_dims(y=2).transpose()
+    assert vrw.plot.basin_figure([basin], [""]).axes[0].get_ylabel() == "theta [m/s]"
+
+
+def test_the_figure_of_a_branch_shows_the_limit_of_stability_and_measures():
+    walker, params = DampedBall(), DampedBall.Params()
+    branch = vrw.continue_branch(
+        params, "damping", (-6.0, 0.9), model=walker, cycle=vrw.limit_cycle(params, model=walker),
+        measures=["height"],
+    )  # fmt: skip
+    theta, multipliers, period, height = vrw.plot.branch_figure(branch).axes
+    assert multipliers.get_ylim() == (0.0, 3.0)
+    assert multipliers.get_ylabel().endswith("(up to 6)")
+    assert [1.0, 1.0] in [list(line.get_ydata()) for line in multipliers.lines]
+    labels = [axes.get_ylabel() for axes in (theta, period, height)]
+    assert labels == ["theta [m/s]", "period [s]", "height [m]"]
+    assert height.get_xlabel() == "damping [N·s/m²]"
+    texts = [text.get_text() for text in height.figure.legends[0].get_texts()]
+    assert texts[0] == "1  damping = -1 N·s/m²: period doubling"
 
 
 def test_a_simulation_shows_the_flights_of_a_ball():

@@ -303,6 +303,13 @@ def test_measures_of_gaits_of_any_walker_are_fitted(walker):
     kicks, loss = np.array([1.0, 1.5]), 1.0 - result["ball.restitution"]
     slopes = [2.0 * kicks / loss**2 / GRAVITY, kicks**2 / loss**3 / GRAVITY]
     np.testing.assert_allclose(result.jacobian[..., 0].T, slopes, rtol=1e-8)  # error of a gait
+    unknowns = {"names": ("damping", "stiffness"), "units": ("N s/m^2", "1")}
+    numbers = {"values": np.ones(2), "standard_errors": np.ones(2), "covariance": np.eye(2)}
+    figure = vrw.plot.fit_figure(dataclasses.replace(result, **unknowns, **numbers))
+    period, height, _, ellipse = figure.axes
+    assert [period.get_ylabel(), height.get_ylabel()] == ["period [s]", "height [m]"]
+    # Names of parameters of the wheel do not have its symbols and units here.
+    assert [ellipse.get_xlabel(), ellipse.get_ylabel()] == ["damping [N·s/m²]", "stiffness"]
 
 
 def test_gaits_far_from_the_starts_of_a_walker_are_fitted():

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -16,11 +17,13 @@ from vrw_jax.app.figure_style import (
     PAGE_FIGURE_WIDTH_INCHES,
     FigureWidth,
     StyledFigure,
+    declare_own_units,
     figure_style,
     find_width_inches,
     format_axis_label,
 )
 from vrw_jax.base.checks import check_real, check_type
+from vrw_jax.base.walker import is_own_walker
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.studies.fit_result import FitResult
 
@@ -65,6 +68,7 @@ def fit_figure(result: FitResult, *, level: float = 0.95, width: FigureWidth = N
         itertools.combinations(range(len(result.names)), 2), key=lambda pair: -correlation[pair]
     )[:MAX_DRAWN_PAIRS]
     columns = [] if is_batch else list(result.data.names)
+    own_units = _find_own_units(result)
     n_panels = len(columns) + (not is_batch) + len(pairs)
     n_columns = min(3, max(n_panels, 1))
     n_rows = -(-n_panels // n_columns)
@@ -94,8 +98,8 @@ def fit_figure(result: FitResult, *, level: float = 0.95, width: FigureWidth = N
             color=OKABE_ITO_BLUE,
             label="fitted",
         )
-        label = format_axis_label(name, "{symbol}") if name in MEASURES else name
-        axes.set(xlabel=position_label, ylabel=label)
+        ylabel = format_axis_label(name, "{symbol}", own_units)
+        axes.set(xlabel=position_label, ylabel=ylabel)
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=position_name != "time"))
     if columns:
         axes.legend(fontsize=7.0)
@@ -106,13 +110,29 @@ def fit_figure(result: FitResult, *, level: float = 0.95, width: FigureWidth = N
         axes.set(xlabel=position_label, ylabel="residual [standard errors]")
         axes.legend(fontsize=7.0)
     for i, j in pairs:
-        _draw_ellipse(next(panels), result, i, j, level)
+        _draw_ellipse(next(panels), result, i, j, level, own_units)
     for axes in panels:
         axes.remove()
     return figure
 
 
-def _draw_ellipse(axes: Axes, result: FitResult, i: int, j: int, level: float) -> None:
+def _find_own_units(result: FitResult) -> xr.Dataset:
+    """Return the units of all quantities of a walker of the user, or of the unknowns of a wheel
+    that the library does not have.
+    """
+    units = dict(zip(result.names, result.units, strict=True))
+    if not is_own_walker(result.model):
+        own_names = [name for name in result.names if name not in MEASURES]
+        return declare_own_units(own_names, [units[name] for name in own_names])
+    measures = {measure.name: measure.unit for measure in result.problem.finder.described_measures}
+    units = getattr(result.model, "state_units", {}) | measures | units
+    units = dict.fromkeys(result.data.names, "1") | units
+    return declare_own_units(units, units.values())
+
+
+def _draw_ellipse(
+    axes: Axes, result: FitResult, i: int, j: int, level: float, own_units: xr.Dataset
+) -> None:
     """Draw two estimates with their ellipse, or those of all data sets."""
     values = result.values.reshape(-1, len(result.names))
     if len(values) > 1:
@@ -127,12 +147,7 @@ def _draw_ellipse(axes: Axes, result: FitResult, i: int, j: int, level: float) -
         ellipse = values[0, [i, j], None] + radius * half_axes @ [np.cos(angles), np.sin(angles)]
         axes.plot(*ellipse, color=OKABE_ITO_BLUE)
         axes.plot(values[0, i], values[0, j], "+", color=OKABE_ITO_ORANGE)
-    for name, unit, set_label in (
-        (result.names[i], result.units[i], axes.set_xlabel),
-        (result.names[j], result.units[j], axes.set_ylabel),
-    ):
-        set_label(
-            format_axis_label(name, "{symbol}")
-            if name in MEASURES
-            else f"{name} [{unit}]".removesuffix(" [1]")
-        )
+    axes.set(
+        xlabel=format_axis_label(result.names[i], "{symbol}", own_units),
+        ylabel=format_axis_label(result.names[j], "{symbol}", own_units),
+    )

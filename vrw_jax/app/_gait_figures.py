@@ -27,7 +27,10 @@ from vrw_jax.app.figure_style import (
     StyledFigure,
     add_figure_legend,
     add_side_legend,
+    add_wrapped_legend,
     count_panel_columns,
+    declare_own_units,
+    describe_quantity,
     draw_markers,
     draw_outcome_cells,
     draw_panel_letter,
@@ -47,6 +50,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import Branch, SpecialPoint
 from vrw_jax.models.measures import MEASURES, describe_violation
 from vrw_jax.studies.tune_maximization import ACTIVE_BOUND_TOLERANCE, TrialKind
+from vrw_jax.studies.tune_objective import UPPER_BOUND_PREFIX, restore_sign_of_bound
 from vrw_jax.studies.tune_result import TuneResult
 from vrw_jax.wheel.params import check_parameter_name
 
@@ -84,6 +88,15 @@ OTHER_MODEL_BRANCH_PANELS = (
 """Panels of the figure of a branch that was computed with a model without the paper's
 indicators.
 """
+STABILITY_MEASURES = ("spectral_radius", "spectral_margin")
+MAX_FURTHER_BRANCH_PANELS = 6
+"""Largest number of panels of period, margins and measures of a walker of the user, chosen because
+four rows of panels fill a page.
+"""
+MULTIPLIER_AXIS_ENDS = (1.2, 3.0)
+"""Smallest and largest upper end of the axis of multipliers of a map. They are chosen because the
+limit of stability, 1, then lies well inside the panel.
+"""
 COMPONENT_COLORS = (
     LEG_1_COLOR, LEG_2_COLOR, OKABE_ITO_SKY_BLUE, OKABE_ITO_AMBER, DARK_GRAY_COLOR, "black",
 )  # fmt: skip
@@ -95,9 +108,12 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
     """Return a figure of a branch and its special points.
 
     The panels show the DLS fraction, the moduli of multipliers, indicators and clearance. For
-    models other than the paper's, speed and period replace indicators and clearance. For maps, the
-    panels show the fixed points and the moduli of multipliers. Curves are solid where gaits are
-    stable, and dashed where gaits are unstable. Special points are numbered from left to right.
+    models of the wheel other than the paper's, speed and period replace indicators and clearance.
+    Measures of your own on a branch of wheels are not drawn. For maps and walkers of your own, the
+    panels show the fixed points and the moduli of multipliers, and then the period, margins and
+    measures, of these the first six. A label states the largest multiplier if it lies beyond the
+    axis. Curves are solid where gaits are stable, and dashed where gaits are unstable. Special
+    points are numbered from left to right.
 
     Args:
         branch: result of `vrw.continue_branch` or `vrw.continue_map`.
@@ -134,6 +150,11 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
             {label: ("point", values.values) for label, values in components.items()}
         )
         component_colors = dict(zip(components, itertools.cycle(COMPONENT_COLORS), strict=False))
+        further_names = [
+            str(name)
+            for name in branch.dataset.data_vars
+            if branch.dataset[name].dims == ("point",) and name not in STABILITY_MEASURES
+        ]
         drawn_panels = (
             (
                 next(iter(components))
@@ -144,6 +165,10 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
                 component_colors,
             ),
             MULTIPLIER_PANEL,
+            *(
+                (format_axis_label(name, "{symbol}", branch_dataset), {name: "black"})
+                for name in further_names[:MAX_FURTHER_BRANCH_PANELS]
+            ),
         )
     legend_height = 0.32 + 0.16 * -(-len(special_points) // 2)
     figure, panel_axes = make_panel_grid(
@@ -163,7 +188,7 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
         )
     ]
     for axes, (panel_label, panel_measure_names), panel_letter in zip(
-        panel_axes, drawn_panels, "abcd", strict=False
+        panel_axes, drawn_panels, "abcdefgh", strict=False
     ):
         draw_panel_letter(axes, panel_letter)
         for measure_name, line_color in panel_measure_names.items():
@@ -186,6 +211,11 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
         axes.set_ylabel(panel_label)
     panel_axes[1].axhline(1.0, color=DARK_GRAY_COLOR, linewidth=0.5)
     panel_axes[1].set_ylim(0.0, None)
+    if "x" in branch_dataset:
+        _limit_multiplier_axis(panel_axes[1], float(np.nanmax(np.abs(branch.multipliers))))
+        for axes, name in zip(panel_axes[2:], further_names, strict=False):
+            if np.ptp(np.sign(branch_dataset[name].values)) > 1.0:  # margins, for example
+                axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.5)
     if has_dls_indicators:
         force_axes, clearance_axes = panel_axes[2:]
         for axes in panel_axes[2:]:
@@ -202,11 +232,19 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
         for component_name, line_color in component_colors.items():
             panel_axes[0].plot([], [], color=line_color, label=component_name)
         panel_axes[0].legend()
-    for axes in panel_axes:
-        if axes.get_subplotspec().is_last_row():
-            axes.set_xlabel(format_axis_label(branch.parameter, dataset=branch_dataset))
-    _add_branch_legend(figure, special_points, branch.parameter)
+    for axes in panel_axes[-panel_axes[0].get_gridspec().ncols :]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(format_axis_label(branch.parameter, dataset=branch_dataset))
+    _add_branch_legend(figure, special_points, branch)
     return figure
+
+
+def _limit_multiplier_axis(axes: Axes, largest_modulus: float) -> None:
+    """Limit the axis of multipliers so that the limit of stability, 1, is well visible."""
+    highest_modulus = float(np.clip(1.05 * largest_modulus, *MULTIPLIER_AXIS_ENDS))
+    axes.set_ylim(0.0, highest_modulus)
+    if largest_modulus > highest_modulus:
+        axes.set_ylabel(f"{MULTIPLIER_PANEL[0]}\n(up to {largest_modulus:.3g})")
 
 
 def _label_component(values: xr.DataArray, number: int) -> str:
@@ -253,10 +291,10 @@ def _draw_special_points(
             )
 
 
-def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], parameter: str) -> None:
+def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], branch: Branch) -> None:
     legend_handles = []
     for special_point_number, special_point in enumerate(special_points, 1):
-        value_text = format_value_label(parameter, special_point.value, 6)
+        value_text = format_value_label(branch.parameter, special_point.value, 6, branch.dataset)
         violation_text = typeset_greek_symbols(describe_violation(special_point.name))
         ending_text = " (ends here)" if special_point.ends_branch else ""
         legend_handles.append(
@@ -394,7 +432,15 @@ def tuning_figure(tuned: TuneResult, *, width: FigureWidth = None) -> Figure:
             [["objective"], ["parameters"], ["slack"]], height_ratios=panel_heights
         )
     panel_axes["objective"].sharex(panel_axes["parameters"])
-    _draw_objective_path(panel_axes["objective"], path_dataset)
+    own_units = None
+    if not tuned.model.is_wheel:
+        names = [str(x).removeprefix(UPPER_BOUND_PREFIX) for x in path_dataset.constraint.values]
+        objective_unit = path_dataset.objective.attrs.get("units", "1")
+        own_units = declare_own_units(
+            [*names, tuned.objective], [*path_dataset.constraint_unit.values, objective_unit]
+        )
+    legend_width_inches = (0.4 if has_two_columns else 0.65) * width_inches
+    _draw_objective_path(panel_axes["objective"], path_dataset, own_units, legend_width_inches)
     parameter_axes = panel_axes["parameters"]
     # The parameters are scaled so that their bounds are 0 and 1.
     for parameter_name, lower_bound, upper_bound in zip(
@@ -408,17 +454,21 @@ def tuning_figure(tuned: TuneResult, *, width: FigureWidth = None) -> Figure:
             (path_dataset[parameter_name].values - lower_bound) / (upper_bound - lower_bound),
             marker=".",
             markersize=4.0,
-            label=f"${MEASURES[parameter_name].mathtext}$",
+            label=f"${describe_quantity(parameter_name, path_dataset).mathtext}$",
         )
     parameter_axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
     parameter_axes.set(xlabel="gaits evaluated", ylim=(-0.05, 1.05))
     parameter_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     add_side_legend(parameter_axes)
-    _draw_constraint_slacks(panel_axes["slack"], tuned, " " if has_two_columns else "\n")
+    label_break = " " if has_two_columns else "\n"
+    slack_axes = panel_axes["slack"]
+    _draw_constraint_slacks(slack_axes, tuned, own_units, label_break, legend_width_inches)
     return figure
 
 
-def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
+def _draw_objective_path(
+    axes: Axes, path_dataset: xr.Dataset, own_units: xr.Dataset | None, legend_width_inches: float
+) -> None:
     evaluation_numbers = path_dataset.evaluation.values
     objective_values = path_dataset.objective.values
     is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
@@ -455,12 +505,22 @@ def _draw_objective_path(axes: Axes, path_dataset: xr.Dataset) -> None:
             label=legend_text,
         )
         legend_text = None  # One line is in the legend.
-    axes.set_ylabel(format_axis_label(path_dataset.objective.attrs["long_name"], "{name}"))
-    axes.legend(loc="best", fontsize=7.0)
+    objective_name = path_dataset.objective.attrs["long_name"]
+    axes.set_ylabel(format_axis_label(objective_name, "{name}", own_units))
+    legend_settings = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 7.0}
+    add_wrapped_legend(axes, 3, legend_width_inches, **legend_settings)
 
 
-def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult, label_break: str) -> None:
+def _draw_constraint_slacks(
+    axes: Axes,
+    tune_result: TuneResult,
+    own_units: xr.Dataset | None,
+    label_break: str,
+    legend_width_inches: float,
+) -> None:
     """Draw bars for the slack of each constraint at the start and at the tuned gait.
+
+    Active constraints, whose bars have no length, have a marker.
 
     - `label_break`: space or line break in the label of the horizontal axis.
     """
@@ -477,7 +537,16 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult, label_break: st
     with np.errstate(invalid="ignore"):
         slack_units = np.maximum(np.nanmax(np.abs(slacks), axis=0), 1e-12)
     bar_positions = np.arange(len(constraint_names))[::-1]
-    active_constraint_names = {active_constraint.name for active_constraint in tune_result.active}
+    # The result names the measure of an upper bound, without the prefix of the constraint.
+    active_limits = {(limit.name, limit.limit) for limit in tune_result.active}
+    is_active = np.array(
+        [
+            (name.removeprefix(UPPER_BOUND_PREFIX), restore_sign_of_bound(name, least_value))
+            in active_limits
+            for name, least_value in zip(constraint_names, path_dataset.margin.values, strict=True)
+        ],
+        bool,
+    )
     for evaluation_index, vertical_offset, bar_color, legend_text in (
         (0, 0.19, LIGHT_GRAY_COLOR, "at the start"),
         (tuned_evaluation_index, -0.19, OKABE_ITO_BLUE, "tuned"),
@@ -492,23 +561,37 @@ def _draw_constraint_slacks(axes: Axes, tune_result: TuneResult, label_break: st
             linewidth=0.3,
         )
     axes.axvline(0.0, color="black", linewidth=0.6)
+    draw_markers(
+        axes,
+        (slacks[tuned_evaluation_index] / slack_units)[is_active],
+        bar_positions[is_active] - 0.19,
+        "D",
+        OKABE_ITO_BLUE,
+        OKABE_ITO_ORANGE,
+        markersize=4.5,
+        label="active" if is_active.any() else None,
+    )
     constraint_labels = []
     for constraint_name in constraint_names:
         measure_name, _, leg_suffix = constraint_name.partition("[")
+        is_upper_bound = measure_name.startswith(UPPER_BOUND_PREFIX)
+        measure = describe_quantity(measure_name.removeprefix(UPPER_BOUND_PREFIX), own_units)
         constraint_labels.append(
-            typeset_greek_symbols(MEASURES[measure_name].long_name)
+            typeset_greek_symbols(measure.long_name)
             + (f", {leg_suffix[:-1]}" if leg_suffix else "")
+            + (" (upper bound)" if is_upper_bound else "")
         )
     axes.set_yticks(bar_positions, constraint_labels, fontsize=7.0)
-    for tick_label, constraint_name in zip(axes.get_yticklabels(), constraint_names, strict=True):
-        if constraint_name in active_constraint_names:
+    for tick_label, is_label_bold in zip(axes.get_yticklabels(), is_active, strict=True):
+        if is_label_bold:
             tick_label.set_color(OKABE_ITO_ORANGE)
             tick_label.set_fontweight("bold")
     axes.set(
         xlabel=f"slack, share of the{label_break}largest on the path\n(active in bold)",
         xlim=(min(-0.05, axes.get_xlim()[0]), 1.05),
     )
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    legend_settings = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+    add_wrapped_legend(axes, 3, legend_width_inches, **legend_settings)
 
 
 MAX_DEFAULT_DRAWN_MEASURES = 6
@@ -536,7 +619,7 @@ def tornado_figure(
     Changes are first-order estimates, computed from the derivatives of the gait. By default they
     are in per cent of the measure, for a change of each parameter by 1 %. If `spreads` is given,
     they are in the unit of the measure, for the changes of the parameters in `spreads`. Undefined
-    changes, such as for 1 % of a slope of 0, are omitted.
+    changes, such as for 1 % of a slope of 0 or of a measure that is 0, are omitted.
 
     Args:
         table: dataset that `vrw.sensitivities` returns.
@@ -567,7 +650,8 @@ def tornado_figure(
         require_known_name(measure_name, known_measure_names, "measure of this table")
     if not measure_names:
         raise ValueError('measures is empty, but something is to be drawn: give "speed", say.')
-    measure_changes = table.elasticity  # changes in per cent for 1 %
+    # changes in per cent for 1 %
+    measure_changes = table.elasticity.where(table.parameter_value != 0.0)
     if spreads is not None:
         known_parameter_names = tuple(map(str, table.parameter.values))
         for parameter_name in spreads:
@@ -584,7 +668,10 @@ def tornado_figure(
     panel_height = PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8
     width_fraction = 0.6 if len(measure_names) == 1 else 1.0
     width_inches = find_width_inches(width, width_fraction * PAGE_FIGURE_WIDTH_INCHES)
-    figure, panel_axes = make_bar_panels(width_inches, measure_names, panel_height, 0.3)
+    own_units = None
+    if "rung" not in table.attrs:  # The library's symbols are those of wheels.
+        own_units = declare_own_units(table.measure.values, table.measure_unit.values)
+    figure, panel_axes = make_bar_panels(width_inches, measure_names, panel_height, 0.3, own_units)
     parameter_change_text = "1 %" if spreads is None else "by its spread"
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         bars = measure_changes.sel(measure=measure_name)
@@ -603,11 +690,13 @@ def tornado_figure(
             )
         axes.axvline(0.0, color="black", linewidth=0.6)
         labels = list(map(str, bars.parameter.values))
-        if "rung" in table.attrs:  # The library's symbols are those of wheels.
+        if own_units is None:
             labels = [f"${MEASURES[name].mathtext}$" for name in labels]
         axes.set_yticks(range(bars.size), labels)
-        axes.set_ylim(bars.size - 0.5, -0.5)
-        change_label = format_axis_label(measure_name, "change of {symbol}")
+        axes.set_ylim(max(bars.size, 1) - 0.5, -0.5)
+        if not bars.size:
+            axes.text(0.5, 0.5, "undefined", ha="center", va="center", transform=axes.transAxes)
+        change_label = format_axis_label(measure_name, "change of {symbol}", own_units)
         axes.set_xlabel("change [%]" if spreads is None else change_label)
     add_figure_legend(figure, panel_axes[0].get_legend_handles_labels()[0], 2)
     return figure

@@ -3,6 +3,7 @@
 """
 
 import textwrap
+import warnings
 from base64 import b64encode
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any
@@ -28,6 +29,7 @@ from vrw_jax.app.figure_style import (
     FigureWidth,
     StyledFigure,
     add_figure_legend,
+    describe_quantity,
     draw_outcome_cells,
     figure_style,
     find_width_inches,
@@ -43,7 +45,7 @@ from vrw_jax.app.figure_style import (
 )
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import SpecialPointCurve
-from vrw_jax.models.measures import LAW_PREFIXES, MARGIN_MEASURES, MEASURES, describe_violation
+from vrw_jax.models.measures import LAW_PREFIXES, MARGIN_MEASURES, describe_violation
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
 from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS, sobol_indices
 from vrw_jax.studies.store_integrity import read_scan_manifest
@@ -56,14 +58,22 @@ and the panel columns.
 """
 
 
+def _is_of_own_walker(scan: xr.Dataset) -> bool:
+    return "walker" in read_scan_manifest(scan.attrs).get("model", {})
+
+
 def _list_swept_parameters(
-    names: Iterable[Hashable], parameter_order: Iterable[str] = PARAMETER_AXIS_ORDER
+    scan: xr.Dataset,
+    names: Iterable[Hashable],
+    parameter_order: Iterable[str] = PARAMETER_AXIS_ORDER,
 ) -> list[str]:
     """Return the parameters among the names in an order, and then those of leg forces.
 
-    The parameters of a walker of yours are all names.
+    The parameters of a walker of yours are all names, in the order of the names.
     """
     texts = list(map(str, names))
+    if _is_of_own_walker(scan):
+        return [name for name in texts if name != "sample"]
     law_names = [name for name in texts if name.startswith(LAW_PREFIXES)]
     wheel_names = [name for name in parameter_order if name in texts] + law_names
     return wheel_names or [name for name in texts if name != "sample"]
@@ -78,6 +88,11 @@ DRAWN_MARGIN_NAMES = (
 
 SHOWN_MEASURE_NAMES = ("mean_steps", "dls_fraction", "speed")
 """Names of the measures that figures show if the scan contains them."""
+
+MAX_SHOWN_OWN_MEASURES = 6
+"""Largest number of measures of a walker of the user in a figure, chosen because six rows of panels
+fit a page.
+"""
 
 LOGARITHMIC_MEASURE_NAMES = ("mean_steps",)
 """Names of the measures that are shown on a logarithmic scale, chosen because these measures vary
@@ -114,7 +129,9 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
     """Return the figures of a scan, by name.
 
     A grid with one or two axes leads to one figure. Further axes add one figure each. Narrow
-    figures show fewer slices of a grid and fewer pairs of parameters.
+    figures show fewer slices of a grid and fewer pairs of parameters. For a walker of your own, the
+    figures show the first six measures that were asked for, and a warning names the others. A
+    figure of pairs of parameters shows one measure.
 
     Args:
         scan: dataset that `vrw.scan` returns for a grid or for samples.
@@ -129,7 +146,8 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
         ['scan']
     """
     require_dataset_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
-    swept_parameters = _list_swept_parameters(scan.coords)
+    _warn_of_omitted_measures(scan)
+    swept_parameters = _list_swept_parameters(scan, scan.coords)
     varied_parameters = [
         parameter_name
         for parameter_name in swept_parameters
@@ -142,11 +160,13 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
             scan_pairs=draw_parameter_pairs(scan, varied_parameters, width)
         )
         if read_scan_manifest(scan.attrs).get("design", {}).get("kind") == SALTELLI_DESIGN_KIND:
-            measure_names = [
-                measure_name for measure_name in DIFFERENTIABLE_MEASURES if measure_name in scan
-            ]
+            measure_names = (
+                _list_shown_measures(scan)
+                if _is_of_own_walker(scan)
+                else [name for name in DIFFERENTIABLE_MEASURES if name in scan]
+            )
             figures_by_name["sobol_indices"] = draw_sobol_indices(
-                sobol_indices(scan, measure_names), width
+                sobol_indices(scan, measure_names), scan, width
             )
         return figures_by_name
     if len(varied_parameters) == 1:
@@ -158,6 +178,19 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
         (f"scan_over_{parameter_name}", draw_scan_slices(scan, x, y, parameter_name, width))
         for parameter_name in further_parameters
     )
+
+
+def _warn_of_omitted_measures(scan: xr.Dataset) -> None:
+    """Warn if a walker of the user has more measures than figures show."""
+    asked_names = read_scan_manifest(scan.attrs).get("measures", ())
+    shown_names = _list_shown_measures(scan)
+    omitted_names = [name for name in asked_names if name in scan and name not in shown_names]
+    if _is_of_own_walker(scan) and omitted_names:
+        warnings.warn(
+            f"scan_figures draws the first {len(shown_names)} measures, without "
+            f"{', '.join(omitted_names)}: leave others out with scan.drop_vars([...]).",
+            stacklevel=4,
+        )
 
 
 def draw_scan_slices(
@@ -172,7 +205,7 @@ def draw_scan_slices(
     """
     slice_indices = {
         parameter_name: scan.sizes[parameter_name] // 2
-        for parameter_name in _list_swept_parameters(scan.dims)
+        for parameter_name in _list_swept_parameters(scan, scan.dims)
         if parameter_name not in (x, y, panel_column_parameter)
     }
     panel_column_datasets = [scan.isel(slice_indices).transpose(y, x, ...)]
@@ -226,7 +259,9 @@ def draw_scan_slices(
             legend_lines |= _draw_margin_zero_lines(axes, dataset, x, y)
         if panel_column_parameter is not None:
             panel_value = dataset[panel_column_parameter].item()
-            axes_of_column[0].set_title(format_value_label(panel_column_parameter, panel_value))
+            axes_of_column[0].set_title(
+                format_value_label(panel_column_parameter, panel_value, dataset=scan)
+            )
         axes_of_column[-1].set_xlabel(
             format_axis_label(
                 x, "{name} {symbol}" if width_inches > 2.5 * n_panel_columns else "{symbol}", scan
@@ -237,7 +272,9 @@ def draw_scan_slices(
     _add_scan_legend(figure, outcome_codes, legend_lines, n_panel_columns)
     if slice_indices:
         fixed_values_text = ", ".join(
-            format_value_label(parameter_name, scan[parameter_name].values[slice_index])
+            format_value_label(
+                parameter_name, scan[parameter_name].values[slice_index], dataset=scan
+            )
             for parameter_name, slice_index in slice_indices.items()
         )
         figure.suptitle(f"at {fixed_values_text}", fontsize=9.0)
@@ -253,7 +290,9 @@ def draw_scan_samples(
     marker_size = float(np.clip(3000.0 / max(scan.sizes["sample"], 1), 1.0, 12.0))
     n_panels = len(measure_names) + 1
     width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
-    figure, panel_axes = make_panel_grid(width_inches, n_panels, 2.4, 0.5, n_panels, sharey=True)
+    figure, panel_axes = make_panel_grid(
+        width_inches, n_panels, 2.4, 0.5, min(n_panels, MAX_PANEL_COLUMNS), sharey=True
+    )
     for axes, measure_name in zip(panel_axes, measure_names, strict=False):
         point_collection = _draw_measure_samples(axes, scan, x, y, measure_name, marker_size)
         _add_color_bar(
@@ -271,7 +310,9 @@ def draw_scan_samples(
     )
     for axes in panel_axes:
         axes.set_xlabel(format_axis_label(x, "{symbol}", scan))
-    panel_axes[0].set_ylabel("sample" if y == "sample" else format_axis_label(y, "{symbol}", scan))
+        if axes.get_subplotspec().is_first_col():
+            is_sample = y == "sample"
+            axes.set_ylabel(y if is_sample else format_axis_label(y, "{symbol}", scan))
     _add_scan_legend(figure, np.unique(outcome_codes), {}, 3)
     return figure
 
@@ -369,8 +410,8 @@ def _draw_outcome_samples(
     axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
 
 
-def draw_sobol_indices(indices: xr.Dataset, width: FigureWidth) -> Figure:
-    """Return a figure of the Sobol' indices of each measure, with their confidence intervals."""
+def draw_sobol_indices(indices: xr.Dataset, scan: xr.Dataset, width: FigureWidth) -> Figure:
+    """Return a figure of the Sobol' indices of a scan, with their confidence intervals."""
     measure_names = list(map(str, indices.measure.values))
     bar_positions = np.arange(indices.sizes["parameter"])
     figure, panel_axes = make_bar_panels(
@@ -378,6 +419,7 @@ def draw_sobol_indices(indices: xr.Dataset, width: FigureWidth) -> Figure:
         measure_names,
         0.26 * len(bar_positions) + 0.5,
         0.6,
+        scan,
         sharex=True,
         sharey=True,
     )
@@ -405,7 +447,10 @@ def draw_sobol_indices(indices: xr.Dataset, width: FigureWidth) -> Figure:
         if sobol_indices_of_measure.is_constant_measure:
             axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
         parameter_names = indices.parameter.values
-        axes.set_yticks(bar_positions, [f"${MEASURES[name].mathtext}$" for name in parameter_names])
+        axes.set_yticks(
+            bar_positions,
+            [f"${describe_quantity(name, scan).mathtext}$" for name in parameter_names],
+        )
         axes.set_xlim(0.0, 1.05)
     panel_axes[0].invert_yaxis()
     for axes in panel_axes[-panel_axes[0].get_gridspec().ncols :]:
@@ -428,7 +473,7 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
     scan = scan.isel(
         {
             parameter_name: 0
-            for parameter_name in _list_swept_parameters(scan.dims)
+            for parameter_name in _list_swept_parameters(scan, scan.dims)
             if parameter_name != x
         }
     ).sortby(x)
@@ -452,6 +497,10 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
 def _list_shown_measures(scan: xr.Dataset) -> list[str]:
     """Return the names of the measures to be shown: of a walker of yours, the first ones."""
     first_names = [str(name) for name in scan.data_vars if scan[name].dtype.kind == "f"]
+    if _is_of_own_walker(scan):
+        asked_names = read_scan_manifest(scan.attrs).get("measures", ())
+        own_names = [x for x in first_names if x != "spectral_radius" or x in asked_names]
+        return own_names[:MAX_SHOWN_OWN_MEASURES]
     shown_names = [name for name in SHOWN_MEASURE_NAMES if name in scan]
     return shown_names or first_names[: len(SHOWN_MEASURE_NAMES)]
 
@@ -596,7 +645,9 @@ def map_figure(
         "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
     )
     x, y = (
-        curves[0].parameters if curves else _list_swept_parameters(scan.dims, SWEEPABLE_PARAMETERS)
+        curves[0].parameters
+        if curves
+        else _list_swept_parameters(scan, scan.dims, SWEEPABLE_PARAMETERS)
     )
     width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
     figure = StyledFigure(figsize=(width_inches, 0.62 * width_inches))

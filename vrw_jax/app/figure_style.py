@@ -8,7 +8,7 @@ import io
 import math
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from vrw_jax.base.checks import check_path, check_real, check_type
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import format_mathtext
 from vrw_jax.models.measures import MEASURES
@@ -319,9 +320,32 @@ def typeset_greek_symbols(symbol_text: str) -> str:
     )
 
 
-def _format_figure_unit(quantity_name: str) -> str:
-    """Return the unit of a quantity in the form that figures use, such as "N·s/m"."""
-    return MEASURES[quantity_name].display_unit.replace(" ", "·").replace("^2", "²")
+def describe_quantity(quantity_name: str, dataset: xr.Dataset | None = None) -> Measure:
+    """Return the measure with a name, which a variable of `dataset` may be.
+
+    A walker of the user may give another meaning to a name of the library. Its variables then have
+    units, but not the unit and symbol of the library.
+    """
+    measure = MEASURES[quantity_name]
+    if dataset is None or quantity_name not in dataset.variables:
+        return measure
+    attributes = dataset[quantity_name].attrs
+    unit_and_symbol = attributes.get("units"), attributes.get("symbol")
+    if unit_and_symbol in ((None, None), (measure.unit, measure.symbol)):
+        return measure
+    own_symbol = quantity_name.rpartition(".")[2]
+    return Measure(quantity_name, unit_and_symbol[0] or "1", own_symbol, quantity_name, "")
+
+
+def declare_own_units(quantity_names: Iterable[Hashable], units: Iterable[Hashable]) -> xr.Dataset:
+    """Return a dataset from which labels of quantities of a walker of the user get their units."""
+    named_units = zip(map(str, quantity_names), map(str, units), strict=True)
+    return xr.Dataset({name: ((), np.nan, {"units": unit}) for name, unit in named_units})
+
+
+def _format_figure_unit(unit: str) -> str:
+    """Return a unit in the form that figures use, such as "N·s/m"."""
+    return unit.replace(" ", "·").replace("^2", "²").replace("^3", "³")
 
 
 def format_axis_label(
@@ -329,28 +353,30 @@ def format_axis_label(
 ) -> str:
     """Return an axis label for a quantity, with its unit, formatted with `label_format`.
 
-    The unit of a quantity of the user is that of its variable in `dataset`.
+    A quantity of the user has its name in place of a symbol, and the unit of its variable in
+    `dataset`.
     """
-    if quantity_name not in MEASURES:
-        unit = "1" if dataset is None else dataset[quantity_name].attrs.get("units", "1")
-        return typeset_greek_symbols(quantity_name) + f" [{unit}]" * (unit not in ("", "1"))
-    measure_description = MEASURES[quantity_name]
-    label_text = label_format.format(
-        name=typeset_greek_symbols(measure_description.long_name),
-        symbol=f"${measure_description.mathtext}$",
-    )
-    unit_text = _format_figure_unit(quantity_name)
+    measure = describe_quantity(quantity_name, dataset)
+    name_text, symbol_text = typeset_greek_symbols(measure.long_name), f"${measure.mathtext}$"
+    if measure is not MEASURES.get(quantity_name):
+        symbol_text = "" if "{name}" in label_format else name_text
+    label_text = label_format.format(name=name_text, symbol=symbol_text).strip()
+    unit_text = _format_figure_unit(measure.display_unit)
     return f"{label_text} [{unit_text}]" if unit_text else label_text
 
 
 def format_value_label(
-    quantity_name: str, quantity_value: float, n_significant_digits: int = 4
+    quantity_name: str,
+    quantity_value: float,
+    n_significant_digits: int = 4,
+    dataset: xr.Dataset | None = None,
 ) -> str:
     """Return the symbol of a quantity with its value and unit, as in "c = 50 N·s/m"."""
-    if quantity_name not in MEASURES:
-        return f"{quantity_name} = {quantity_value:.{n_significant_digits}g}"
-    symbol_text, unit_text = MEASURES[quantity_name].mathtext, _format_figure_unit(quantity_name)
-    return f"${symbol_text}$ = {quantity_value:.{n_significant_digits}g} {unit_text}".rstrip()
+    measure = describe_quantity(quantity_name, dataset)
+    is_in_library = measure is MEASURES.get(quantity_name)
+    symbol_text = f"${measure.mathtext}$" if is_in_library else quantity_name
+    unit_text = _format_figure_unit(measure.display_unit)
+    return f"{symbol_text} = {quantity_value:.{n_significant_digits}g} {unit_text}".rstrip()
 
 
 def make_panel_grid(
@@ -381,9 +407,13 @@ def make_bar_panels(
     measure_names: Sequence[str],
     panel_height: float,
     legend_height: float,
+    dataset: xr.Dataset | None = None,
     **subplot_settings: Any,
 ) -> tuple[Figure, np.ndarray]:
-    """Return a figure with one panel of bars per measure, and the axes of its panels."""
+    """Return a figure with one panel of bars per measure, and the axes of its panels.
+
+    - `dataset`: variables that describe measures of the user.
+    """
     figure, panel_axes = make_panel_grid(
         width_inches,
         len(measure_names),
@@ -397,7 +427,7 @@ def make_bar_panels(
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         # An inch contains 18 letters.
         title = textwrap.fill(
-            MEASURES[measure_name].long_name, int(18.0 * width_inches / n_columns)
+            describe_quantity(measure_name, dataset).long_name, int(18.0 * width_inches / n_columns)
         )
         axes.set_title(typeset_greek_symbols(title))
     return figure, panel_axes

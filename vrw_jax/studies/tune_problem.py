@@ -567,6 +567,9 @@ class TuneProblem:
             trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND for trial in trials
         ]
         domains = self.gait_finder.model.parameter_domains
+        objective_attributes = {"long_name": self.objective_label}
+        if self.objective_label in self.gait_finder.differentiable_measures:
+            objective_attributes["units"] = self.gait_finder.get_measure(self.objective_label).unit
         path_dataset_variables: dict[str, Any] = {
             name: (
                 "evaluation",
@@ -579,7 +582,7 @@ class TuneProblem:
             "objective": (
                 "evaluation",
                 [trial.objective for trial in trials],
-                {"long_name": self.objective_label},
+                objective_attributes,
             ),
             "constraint_value": (
                 ("evaluation", "constraint"),
