@@ -200,7 +200,7 @@ def find_earliest_guard_minimum_fraction(
 
     The location is a fraction of the solver step, or 1 if no guard has such a minimum.
     `guard_values` are the guards at the start, at the stages `guard_stage_indices`, and at the end,
-    each (guards, batch). `is_counted` tells which guards may have a minimum. The computation is
+    each (guards, batch). `is_counted` marks the guards that may have a minimum. The computation is
     skipped if no batch element may have one.
     """
     lowest_coefficients = functools.reduce(

@@ -32,7 +32,7 @@ MAX_CALLS = 8
 MISSING_GAIT_RESIDUAL = 1e6
 """Residual of each number if the walker has no gait, or falls. It is larger than that of any useful
 wheel, so that the fit rejects this trial and shortens its next change."""
-TOLERANCE = 1e-7
+FIT_TOLERANCE = 1e-7
 """Relative and absolute tolerance of the scaled unknowns and residuals: a thousandth of a standard
 error for data of 0.01 %, and above the errors of gaits, which are 1e-9."""
 NEGLIGIBLE_REDUCTION = 1e-6
@@ -518,8 +518,8 @@ def _make_solver() -> Any:
     import optimistix  # imported here, because its import takes long
 
     class LevenbergMarquardt(optimistix.AbstractGaussNewton):
-        rtol: float = TOLERANCE
-        atol: float = TOLERANCE
+        rtol: float = FIT_TOLERANCE
+        atol: float = FIT_TOLERANCE
         norm: Callable = optimistix.max_norm
         descent: Any = optimistix.DampedNewtonDescent()
         search: Any = optimistix.ClassicalTrustRegion()

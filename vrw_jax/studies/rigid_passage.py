@@ -125,7 +125,8 @@ N_DEVIATION_NODES = 80
 The value is chosen because the normal density over 20 standard deviations is then integrated to
 round-off.
 """
-MAX_SLOPE_DEVIATION, MAX_HEIGHT_DEVIATION = 10.0, 8.0
+MAX_SLOPE_DEVIATION = 10.0
+MAX_HEIGHT_DEVIATION = 8.0
 """Largest deviations of a slope and of a height from their means, in standard deviations.
 
 The limits bound the states. The values are chosen because larger slopes have a probability of
