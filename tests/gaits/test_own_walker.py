@@ -136,11 +136,12 @@ def test_a_walk_that_enters_a_mode_beyond_a_guard_says_so():
     assert str(gait) == f"HybridGait\n  search: {gait.why}"
 
 
+FALL_FREELY = BALL_SYSTEM.modes["flight"].field
 ABOVE = lambda y, p: y[0] - p["rise"]
 STUMBLING_BALL = vrw.HybridSystem(
     modes={
         "rise": Mode(
-            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
+            FALL_FREELY,
             {
                 "apex": Guard(lambda y, p: y[1], target_mode="fall", armed=ABOVE),
                 "stumble": Guard(
@@ -149,7 +150,7 @@ STUMBLING_BALL = vrw.HybridSystem(
             },
         ),
         "fall": Mode(
-            lambda y, p: jnp.stack([y[1], -GRAVITY + 0.0 * y[1]]),
+            FALL_FREELY,
             {"impact": Guard(ABOVE, lambda y, p: jnp.stack([0.0 * y[0], -0.5 * y[1]]), "rise")},
         ),
     },
