@@ -329,3 +329,8 @@ def test_an_empty_batch_traces_a_function_once(has_machine_code, capsys, monkeyp
         compiled = lanes.compile_batch_function(double)
         assert compiled.run(np.ones((2, 0), np.float32)).dtype == np.float32
     assert capsys.readouterr().out.count("traced") == 1
+
+
+def test_arguments_may_contain_none():
+    add = lanes.jit(lambda tree, y: tree["a"] + y.sum())
+    np.testing.assert_allclose(add.batch({"a": X[:, 0], "b": None}, X), X[:, 0] + X.sum(1))

@@ -346,15 +346,13 @@ class LaneFunction:
             *arguments: arguments of the function, as arrays with the batch on their first axis.
             in_axes: 0 for arguments with a batch axis and None for others, as in `jax.vmap`.
         """
-        axes = jax.tree.leaves(
-            jax.tree.map(
-                lambda axis, tree: jax.tree.map(lambda _: axis, tree),
-                tuple(in_axes)
-                if isinstance(in_axes, list | tuple)
-                else (in_axes,) * len(arguments),
-                tuple(arguments),
-                is_leaf=lambda axis: axis is None,
-            ),
+        if not isinstance(in_axes, list | tuple):
+            in_axes = (in_axes,) * len(arguments)
+        axes: list[int | None] = []
+        jax.tree.map(
+            lambda axis, tree: axes.extend([axis] * len(jax.tree.leaves(tree))),
+            tuple(in_axes),
+            arguments,
             is_leaf=lambda axis: axis is None,
         )
         return self._evaluate(arguments, lambda variant, arrays: variant.run_batch(arrays, axes))
