@@ -308,7 +308,11 @@ class WheelParams(AbstractPrintable):
         The product of any four parameters must also be finite in their floating-point type.
         """
         is_in_all_domains = self.leg_com < self.locked_length
-        value_by_parameter = self._parameters
+        # A division of Python's numbers by zero raises an error.
+        value_by_parameter = {
+            name: np.float64(value) if isinstance(value, float | int) else value
+            for name, value in self._parameters.items()
+        }
         for parameter_name, parameter_value in value_by_parameter.items():
             max_value_of_dtype = float(jnp.finfo(jnp.result_type(parameter_value)).max) ** 0.25
             parameter_domain = PARAMETER_DOMAINS[parameter_name]
@@ -316,7 +320,8 @@ class WheelParams(AbstractPrintable):
             is_in_all_domains &= parameter_domain._replace(
                 upper_bound=upper_bound
             ).contains_parameter_value(parameter_value)
-        relative_values = _square_relative_parameters(value_by_parameter, self.n_legs)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative_values = _square_relative_parameters(value_by_parameter, self.n_legs)
         for squared_relative_value in relative_values.values():
             is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
         for law_parameter in list_law_parameters(self.laws):
