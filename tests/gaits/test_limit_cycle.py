@@ -2,7 +2,11 @@
 
 import functools
 import math
+import os
 import re
+import subprocess
+import sys
+import textwrap
 
 import jax
 import jax.numpy as jnp
@@ -246,6 +250,53 @@ def test_vmap_agrees_with_single_wheels():
         np.testing.assert_allclose(
             single.section_state, batch.section_state[index], rtol=1e-12, atol=1e-13
         )
+
+
+def test_a_gait_that_only_walks_reach_is_found_inside_jit_and_vmap_too():
+    """The first wheel has a gait on a gentle slope, and the second wheel has none."""
+    options = vrw.CycleOptions(mesh_intervals=(40, 32, 16))
+    wheels = vrw.WheelParams(
+        damping=np.array([120.0, 400.0]), stiffness=np.array([1800.0, 1e3]), slope=0.08
+    )
+    expected = vrw.limit_cycles(wheels, options=options)
+    assert expected.found.tolist() == [True, False]
+    find = lambda damping, stiffness: vrw.limit_cycle(
+        vrw.WheelParams(damping=damping, stiffness=stiffness, slope=0.08), options=options
+    )
+    gaits = jax.jit(jax.vmap(find))(wheels.damping, wheels.stiffness)
+    assert gaits.outcome.tolist() == expected.outcome.tolist()
+    np.testing.assert_allclose(gaits.section_state, expected.section_state, rtol=1e-12)
+    period = lambda damping: find(damping, 1800.0).period
+    derivative = jax.jit(jax.grad(period))(120.0)
+    np.testing.assert_allclose(derivative, jax.grad(period)(120.0), rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="sets the number of cores")
+def test_a_search_inside_jit_does_not_wait_for_its_own_threads():
+    """On one core, where a walk would wait for ever, there is none."""
+    code = """
+    import os, sys
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:int(sys.argv[1])])
+    import jax, numpy as np, vrw_jax as vrw
+    vrw.start_jax()
+    draw = np.random.default_rng(7).uniform
+    wheels = [draw(*ends, 60) for ends in ((20, 300), (800, 3000), (0.05, 0.3))]
+    options = vrw.CycleOptions(mesh_intervals=(40, 32, 16))
+    wheel = lambda c, k, slope: vrw.WheelParams(damping=c, stiffness=k, slope=slope)
+    find = lambda *values: vrw.limit_cycle(wheel(*values), options=options).found
+    print(jax.jit(jax.vmap(find))(*wheels).sum())
+    """
+    counts = [
+        int(
+            subprocess.run(
+                [sys.executable, "-c", textwrap.dedent(code), n_cores],
+                capture_output=True, text=True, timeout=400, check=True,
+            ).stdout
+        )
+        for n_cores in "12"
+    ]  # fmt: skip
+    assert 0 < counts[0] < counts[1]
 
 
 def test_a_missing_cycle_is_an_outcome_with_zeros_and_leaves_the_batch_unchanged():

@@ -72,8 +72,10 @@ def test_the_first_start_that_leads_to_a_gait_is_taken():
 
 def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
     walker, c = SlowReturn(), np.linspace(1.0, 19.0, 5)
-    in_jit = jax.jit(lambda p: vrw.limit_cycle(p, model=walker).outcome)({"c": 1.0})
-    assert in_jit == vrw.Outcome.NO_CYCLE_FOUND
+    find = lambda c: vrw.limit_cycle({"c": c}, model=walker).section_state[0]
+    for transform in (jax.vmap, lambda f: jax.jit(jax.vmap(f))):
+        np.testing.assert_allclose(transform(find)(c), c, rtol=1e-9)
+        np.testing.assert_allclose(transform(jax.grad(find))(c), 1.0, rtol=1e-9)
     gait = vrw.limit_cycle({"c": 1.0}, model=walker)
     assert gait.section_state[0] == pytest.approx(1.0, rel=1e-9)
     gaits = vrw.limit_cycles({"c": np.append(c, np.nan)}, model=walker)

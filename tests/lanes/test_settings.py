@@ -11,6 +11,8 @@ from support.slow_variants import make_params_with_slow_marks
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
 from vrw_jax.lanes import with_default_jax_settings
+from vrw_jax.lanes.program import count_available_cores
+from vrw_jax.lanes.python_calls import call_python, can_programs_call_jax
 
 STRICT_SETTINGS = (
     ("jax_disable_jit", True),
@@ -116,3 +118,18 @@ def test_default_settings_hold_inside_a_function_and_in_each_thread():
     finally:
         jax.config.update("jax_numpy_rank_promotion", "allow")
     assert seen_settings == [(False, "allow"), (False, "allow"), (False, "raise")]
+
+
+@pytest.mark.skipif(not can_programs_call_jax(), reason="XLA has one thread")
+def test_python_functions_that_would_hold_all_threads_are_refused():
+    """Each of these functions runs a program that calls the next function."""
+
+    def nest(x, depth):
+        run_next = lambda y: np.asarray(jax.jit(nest, static_argnums=1)(y, depth - 1))
+        return call_python(run_next, jax.typeof(x), x) if depth else x + 1.0
+
+    run = jax.jit(nest, static_argnums=1)
+    assert run(1.0, 1) == 2.0
+    with pytest.raises(jax.errors.JaxRuntimeError, match="run these programs one after another"):
+        run(1.0, count_available_cores())
+    assert run(1.0, 1) == 2.0

@@ -10,7 +10,11 @@ import jax
 
 from vrw_jax.base.checks import check_bool, check_path
 from vrw_jax.lanes import disk_cache as store
-from vrw_jax.lanes.settings import FUSION_EMITTERS_FLAG, accepts_fusion_emitters_flag
+from vrw_jax.lanes.python_calls import dispatch_cpu_programs_synchronously
+from vrw_jax.lanes.settings import (
+    FUSION_EMITTERS_FLAG,
+    accepts_fusion_emitters_flag,
+)
 
 
 def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) -> None:
@@ -19,7 +23,9 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
     Call this function before the first array is created. The library also works without this call,
     but processes then take much longer to start. By default, `cache` is the folder that JAX already
     uses, set by JAX_COMPILATION_CACHE_DIR or by an earlier call. If JAX uses none, it is a folder
-    in the user's cache folder.
+    in the user's cache folder. A call on a CPU returns when its results are computed, since
+    `jax_cpu_enable_async_dispatch` is switched off. Searches for gaits inside `jax.jit` can then
+    walk.
 
     Args:
         cache: folder for compiled code; `~` means the user's home folder.
@@ -48,6 +54,7 @@ def start_jax(cache: str | Path | None = None, *, trust_shared: bool = False) ->
             "1"  # The setting also holds for child processes.
         )
     jax.config.update("jax_enable_x64", True)
+    dispatch_cpu_programs_synchronously()
     if cache is not None or not jax.config.jax_compilation_cache_dir:  # type: ignore[attr-defined]
         jax_cache_folder = store.find_user_cache_folder() / "vrw_jax" if cache is None else cache
         jax.config.update("jax_compilation_cache_dir", str(jax_cache_folder))

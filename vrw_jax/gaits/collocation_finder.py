@@ -20,7 +20,7 @@ from vrw_jax.gaits.collocation_search import (
     predict_start_from_gait_surface,
 )
 from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
-from vrw_jax.gaits.derivatives import attach_derivatives
+from vrw_jax.gaits.derivatives import SearchMissingCycles, attach_derivatives
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
     Gait,
@@ -119,7 +119,11 @@ class CollocationFinder(AbstractGaitFinder):
         return measure_value
 
     def find_cycle(
-        self, params: WheelParams, cycle_guess: Any = None, starts_only_from_guess: bool = False
+        self,
+        params: WheelParams,
+        cycle_guess: Any = None,
+        starts_only_from_guess: bool = False,
+        search_missing_cycles: SearchMissingCycles | None = None,
     ) -> LimitCycle:
         params = self.model.attach_laws(params)
         if isinstance(cycle_guess, LimitCycle) and cycle_guess.system == self.collocation_system:
@@ -129,16 +133,20 @@ class CollocationFinder(AbstractGaitFinder):
             params, section_state, _, _ = convert_step_arguments(params, section_state, None, None)
             cycle_guess = self.guess_cycle_from_state(*lax.stop_gradient((params, section_state)))
         return dataclasses.replace(
-            solve_limit_cycle(params, self.collocation_system, cycle_guess, starts_only_from_guess),
+            solve_limit_cycle(
+                params,
+                self.collocation_system,
+                cycle_guess,
+                starts_only_from_guess,
+                search_missing_cycles,
+            ),
             model=self.model.with_laws(params.laws),
         )
 
     def find_cycles(
-        self, params: WheelParams, cycle_guess: Any = None, starts_only_from_guess: bool = False
+        self, params: WheelParams, cycle_guess: Any = None, **search_options: Any
     ) -> Any:
-        find_cycle = functools.partial(
-            self.find_cycle, starts_only_from_guess=starts_only_from_guess
-        )
+        find_cycle: Any = functools.partial(self.find_cycle, **search_options)
         return jax.vmap(find_cycle)(params, cycle_guess)
 
     def guess_cycle_from_state(

@@ -34,6 +34,7 @@ from vrw_jax.lanes.autodiff import (
 )
 from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
 from vrw_jax.lanes.lane_function import compile_batch_function
+from vrw_jax.lanes.python_calls import call_python
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models import unit_scaling as scales
 from vrw_jax.wheel.params import (
@@ -264,25 +265,49 @@ def _search_in_scaled_units(
     )
 
 
+SearchMissingCycles = Callable[..., CycleSearchResult]
+"""Function of a collocation system, parameters, a search result and optionally a guess, as NumPy
+arrays, which returns the result with further cycles.
+"""
+
+
 def solve_cycle_with_derivatives(
     collocation_system: CollocationSystem,
     parameters: Array,
     search_guess: CollocationState | None,
     starts_only_from_guess: bool = False,
+    search_missing_cycles: SearchMissingCycles | None = None,
 ) -> tuple[CollocationState, tuple]:
     """Return the collocation state for the cycle of one wheel, and diagnostics of the search.
 
     The state is differentiable with respect to the parameters. The guess has no derivatives.
+
+    - `search_missing_cycles`: Python function that searches again for cycles that were not found.
     """
     batched_search = compile_batch_function(
         functools.partial(run_search_attempts, collocation_system),
         collocation_system.cycle_options.batch_size,
     )
-    search_one_wheel = unbatch(
-        functools.partial(
-            _search_in_scaled_units, collocation_system, batched_search, starts_only_from_guess
+
+    def search_lanes(parameters: LaneParameters, *guess: CollocationState) -> CycleSearchResult:
+        search_result = _search_in_scaled_units(
+            collocation_system, batched_search, starts_only_from_guess, parameters, *guess
         )
-    )
+        if search_missing_cycles is None:
+            return search_result
+        return lax.cond(
+            jnp.all(search_result.collocation_state.has_cycle > 0.5),
+            lambda: search_result,
+            lambda: call_python(
+                functools.partial(search_missing_cycles, collocation_system),
+                jax.tree.map(jax.typeof, search_result),
+                parameters,
+                search_result,
+                *guess,
+            ),
+        )
+
+    search_one_wheel = unbatch(search_lanes)
     compute_tangents = make_tangent_function(collocation_system)
 
     @jax.custom_jvp

@@ -4,7 +4,7 @@ The search in `collocation_search` starts from predicted gaits for the paper's p
 a mesh that suits these gaits. If it fails, batches of walks (`models.step_batch`) begin at starts
 that scale with the wheel. The end of a walk that settles is the start of another search. If the
 mesh is too coarse, it is refined. These fallbacks depend on concrete values. Under a caller's `jit`
-or `vmap`, only the search runs.
+or `vmap`, a Python function runs them, on one mesh.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Array
 
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import (
@@ -30,11 +31,16 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
 from vrw_jax.gaits.collocation_finder import CollocationFinder
-from vrw_jax.gaits.collocation_search import CollocationState
+from vrw_jax.gaits.collocation_search import (
+    CollocationState,
+    CollocationSystem,
+    CycleSearchResult,
+)
 from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES
 from vrw_jax.gaits.finder_selection import (
     UserCycleGuess,
     check_cycle_guess,
+    make_finder,
     resolve_finder,
 )
 from vrw_jax.gaits.further_search import (
@@ -49,11 +55,14 @@ from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
 from vrw_jax.lanes.batching import (
+    is_inside_jit,
     map_in_batches,
     replace_rows,
     select_rows_on_device,
     select_tree_rows,
+    unbatch,
 )
+from vrw_jax.lanes.python_calls import call_python, can_programs_call_jax
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
@@ -127,8 +136,8 @@ def limit_cycle(
     made as fine as these errors require. With `options` the mesh is fixed, and `mesh_error`
     estimates its error. The cycle is differentiable in every mode and to every order.
 
-    If the search fails, walks and finer meshes are used. Under `jax.jit` and `jax.vmap` this is not
-    possible. Only the search then runs, on the mesh of the options. See `limit_cycles`.
+    If the search fails, walks and finer meshes are used. Under `jax.jit` and `jax.vmap` the mesh is
+    that of the options, and walks require `start_jax` and a CPU with several cores.
 
     If no gait is found, `outcome` and `why` contain the reason, and numbers and derivatives are
     zero. With `on_failure="nan"` they are NaN, so that an optimization loop does not stop
@@ -145,8 +154,8 @@ def limit_cycle(
 
     For a `HybridSystem` or another walker of yours, `params` are its parameters. Newton's method
     starts at the `guess`, section coordinates near the gait, or at the walker's `starts`. If it
-    fails, a walk begins at the same start, and the method starts again at its end. JAX transforms
-    skip this walk. The result is a `HybridGait`.
+    fails, a walk begins at the same start, and the method starts again at its end. The result is a
+    `HybridGait`.
 
     Args:
         params: the wheel.
@@ -374,11 +383,18 @@ def _search_with_fallbacks(
             if are_params_concrete
             else _search_without_fallbacks(gait_finder, params, cycle.section_state)
         )
-    cycle = _search_without_fallbacks(gait_finder, params, cycle_guess)
     # Differentiated arrays also have concrete values.
-    params_and_cycle: tuple[WheelParams, Any] = lax.stop_gradient((params, cycle))
-    if not gait_finder.supports_cold_start or has_traced_leaf(params_and_cycle):
+    is_traced = is_inside_jit() or has_traced_leaf(params_without_tangents, cycle_guess)
+    search_options: dict[str, Any] = {}
+    if is_traced and can_programs_call_jax():
+        if gait_finder.supports_cold_start:
+            search_options = {"search_missing_cycles": _search_missing_cycles}
+        elif gait_finder.is_multistable and cycle_guess is None:
+            cycle_guess = _choose_gait_inside_jit(gait_finder, params_without_tangents, gait_choice)
+    cycle = _search_without_fallbacks(gait_finder, params, cycle_guess, **search_options)
+    if is_traced or not gait_finder.supports_cold_start:
         return cycle
+    params_and_cycle: tuple[WheelParams, Any] = lax.stop_gradient((params, cycle))
     params_and_cycle = add_batch_axis(params_and_cycle)
     section_state = None
     if cycle_guess is not None:
@@ -506,13 +522,85 @@ def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) 
 
 
 def _search_without_fallbacks(
-    gait_finder: Any, params: WheelParams, cycle_guess: Any, **search_options: bool
+    gait_finder: Any, params: WheelParams, cycle_guess: Any, **search_options: Any
 ) -> Any:
     if not params.damping.ndim:
         return gait_finder.find_cycle(params, cycle_guess, **search_options)
     if cycle_guess is not None or has_traced_leaf(params):
         return gait_finder.find_cycles(params, cycle_guess, **search_options)
     return map_in_batches(gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
+
+
+def _search_missing_cycles(
+    collocation_system: CollocationSystem,
+    parameters: Any,
+    search_result: CycleSearchResult,
+    *guess: CollocationState,
+) -> CycleSearchResult:
+    """Return the result of a search with the cycles that all fallbacks find on the same mesh.
+
+    JAX programs call this function. The last axis of the arrays is that of the wheels.
+    """
+    parameters, search_result, guess = jax.tree.map(np.array, (parameters, search_result, guess))
+    missing = np.flatnonzero(search_result.collocation_state.has_cycle < 0.5)
+    params = collocation_system.make_wheel(jax.device_put(parameters[:, missing]))
+    model: Any = convert_model_argument(None).with_laws(params.laws)
+    gait_finder = make_finder(
+        dataclasses.replace(model, stop_at_lift_off=collocation_system.stop_at_lift_off),
+        collocation_system.n_legs,
+        period_n=collocation_system.period_n,
+        cycle_options=collocation_system.cycle_options,
+    )
+    search = functools.partial(
+        _search_with_fallbacks, gait_finder, can_refine_mesh=False, gait_choice="slowest"
+    )
+    if guess:
+        guesses = jax.tree.map(lambda x: np.moveaxis(x[..., missing], -1, 0), guess[0])
+        rows = [select_tree_rows((params, guesses), i) for i in range(len(missing))]
+        cycles = [search(*jax.device_put(row)) for row in rows]
+        cycle = jax.tree.map(lambda *x: np.stack(x), *cycles)
+    else:
+        cycle = search(params, None)
+    for result, found in zip(
+        jax.tree.leaves(search_result),
+        jax.tree.leaves(
+            (
+                cycle.collocation_state,
+                cycle.monodromy_value,
+                cycle.residual,
+                cycle.n_newton_iterations,
+            )
+        ),
+        strict=True,
+    ):
+        result[..., missing] = np.moveaxis(np.asarray(found), 0, -1)
+    return search_result
+
+
+def _choose_gait_inside_jit(
+    gait_finder: Any, params: WheelParams, gait_choice: GaitChoice
+) -> Array:
+    """Return the section state of the chosen gait, which a Python function finds."""
+    section_state = gait_finder.prepare_search(params, None)[1]
+    # The values of all traced numbers are among those of the parameters.
+    concrete_finder = jax.tree.map(
+        lambda x: np.ones(x.shape, x.dtype) if isinstance(x, jax.core.Tracer) else x, gait_finder
+    )
+
+    def find_section_states(parameter_values: Any) -> np.ndarray:
+        columns = tuple(jax.device_put(list(np.asarray(parameter_values))))
+        model, batch = concrete_finder.model.from_parameter_values(columns, gait_finder.n_legs)
+        finder = dataclasses.replace(concrete_finder, model=model)
+        gaits = _find_chosen_gaits(finder, model.attach_laws(batch), gait_choice)
+        return np.asarray(gaits.section_state, section_state.dtype).T
+
+    @unbatch
+    def find_lanes(parameter_values: Array) -> Array:
+        shape = (*section_state.shape, parameter_values.shape[-1])
+        result_type = jax.ShapeDtypeStruct(shape, section_state.dtype)
+        return call_python(find_section_states, result_type, parameter_values)
+
+    return find_lanes(gait_finder.model.collect_parameter_values(params))
 
 
 def _choose_first_step(

@@ -27,7 +27,11 @@ from vrw_jax.gaits.collocation_search import (
     CollocationSystem,
 )
 from vrw_jax.gaits.cycle import AbstractCycle
-from vrw_jax.gaits.derivatives import attach_monodromy_derivatives, solve_cycle_with_derivatives
+from vrw_jax.gaits.derivatives import (
+    SearchMissingCycles,
+    attach_monodromy_derivatives,
+    solve_cycle_with_derivatives,
+)
 from vrw_jax.gaits.force_peaks import measure_extremum, measure_force_peaks
 from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
@@ -295,6 +299,7 @@ def _solve_limit_cycle(
     collocation_system: CollocationSystem,
     cycle_guess: CollocationState | None,
     starts_only_from_guess: bool = False,
+    search_missing_cycles: SearchMissingCycles | None = None,
 ) -> LimitCycle:
     """Find the cycle of one wheel on the mesh of the collocation system."""
     is_in_domain = params.is_in_domain()
@@ -304,7 +309,11 @@ def _solve_limit_cycle(
     searched_parameters = lax.stop_gradient(parameters)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
         solve_cycle_with_derivatives(
-            collocation_system, parameters, cycle_guess, starts_only_from_guess
+            collocation_system,
+            parameters,
+            cycle_guess,
+            starts_only_from_guess,
+            search_missing_cycles,
         )
     )
     has_cycle = is_in_domain & (collocation_state.has_cycle > 0.5)

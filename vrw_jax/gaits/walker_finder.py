@@ -58,6 +58,7 @@ from vrw_jax.lanes.batching import (
     select_rows_on_device,
     select_tree_rows,
 )
+from vrw_jax.lanes.python_calls import call_python, can_programs_call_jax
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
@@ -200,7 +201,7 @@ def find_walker_gaits(
     if not is_batch:
         gait = find_gaits(params, guesses)
         if has_traced_leaf(params, guesses, gait):
-            return gait
+            return _find_missing_inside_jit(walker, options, period_n, params, guesses, gait)
         one_params, one_guess, outcome = select_tree_rows((params, guesses, gait.outcome), None)
         rows, starts = collect_walk_ends(walker, one_params, one_guess, outcome, options, period_n)
         found = find_gaits(params, starts[0]) if len(rows) else gait
@@ -210,7 +211,10 @@ def find_walker_gaits(
     params = jax.tree.map(lambda leaf: arrays.broadcast_to(leaf, (n,)), params)
     guesses = arrays.broadcast_to(guesses, (n, *guesses.shape[-2:]))
     if arrays is jnp:
-        return find_gaits(params, guesses)
+        gaits = find_gaits(params, guesses)
+        return jax.vmap(lambda *row: _find_missing_inside_jit(walker, options, period_n, *row))(
+            params, guesses, gaits
+        )
     find_each = functools.partial(map_in_batches, find_gaits, batch_sizes.GAIT_BATCH_SIZES)
     gaits = find_each(params, guesses)
     rows, starts = collect_walk_ends(
@@ -254,6 +258,44 @@ def collect_walk_ends(
     is_periodic = ends.period > 0
     starts = np.broadcast_to(ends.orbit_states[:, :1], guesses[rows].shape)
     return rows[is_periodic], starts[is_periodic]
+
+
+def _find_missing_inside_jit(
+    walker: AbstractWalker,
+    options: StepOptions,
+    period_n: int,
+    params: Any,
+    guesses: Array,
+    gait: HybridGait,
+) -> HybridGait:
+    """Return the gait from the end of a walk if Newton's method has not found it from the guesses.
+
+    A Python function walks, while JAX transforms or compiles the calls.
+    """
+    if not can_programs_call_jax() or walker.invariants:
+        return gait
+
+    def walk(params: Any, options: Any, guesses: Any, outcomes: Any) -> np.ndarray:
+        params, options = jax.tree.map(np.ravel, (params, options))
+        options = jax.tree.map(lambda x: x[0], options)
+        starts = np.array(guesses).reshape(-1, *guesses.shape[-2:])
+        rows, ends = collect_walk_ends(
+            walker, params, starts, np.ravel(outcomes), options, period_n
+        )
+        starts[rows] = ends
+        return starts.reshape(guesses.shape)
+
+    def find_from_walk() -> HybridGait:
+        starts = call_python(
+            walk,
+            jax.typeof(guesses),
+            *lax.stop_gradient((params, options, guesses, gait.outcome)),
+            vmap_method="broadcast_all",
+        )
+        found = find_gait_from_guesses((walker, period_n), params, starts, options)
+        return select_trees_by_condition(found.converged, found, gait)
+
+    return lax.cond(gait.converged, lambda: gait, find_from_walk)
 
 
 def _check_search(
