@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 from reference_code import five_coordinates
+from support.leg_laws import BumpStop
 
 import vrw_jax as vrw
 
@@ -178,3 +179,14 @@ def test_what_two_legs_cannot_do_is_refused_in_one_sentence():
         vrw.scan(design, ["period"], model=make_wheel(), slope_sd=0.01)
     with pytest.raises(ValueError, match="n_legs is 7, but legs alternate only if"):
         vrw.step(vrw.WheelParams(n_legs=7), vrw.paper_start(), model=make_wheel())
+
+
+@pytest.mark.slow
+def test_a_branch_of_two_kinked_legs_ends_in_the_gait_found_alone():
+    legs = vrw.AlternatingLegs(BumpStop(100.0), BumpStop(160.0))
+    model = vrw.ViscoelasticWheel(leg_force=legs)
+    wheels = [vrw.WheelParams(damping=damping) for damping in (150.0, 150.5)]
+    branch = vrw.continue_branch(wheels[0], "damping", (150.0, 150.5), model=model, period_n=2)
+    alone = vrw.limit_cycle(wheels[1], model=model, period_n=2)
+    end = branch.dataset.period[-1]
+    assert float(end) == pytest.approx(float(alone.period), rel=1e-9)

@@ -447,8 +447,8 @@ def _advance_period(
 ) -> Array:
     values = jnp.asarray(wheel.values).at[parameter_index].set(p)
     model, params = model.from_parameter_values(values, n_legs)
-    for _ in range(period_n):
-        result = model.advance(params, z, options)
+    for k in range(period_n):
+        result = model.advance(model.select_params(params, k), z, options)
         z = jnp.where(result.outcome == Outcome.STEPPED, result.section_state, jnp.nan)
     return z
 
