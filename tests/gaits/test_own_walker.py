@@ -70,6 +70,17 @@ def test_the_first_start_that_leads_to_a_gait_is_taken():
     assert vrw.limit_cycle(BALL_PARAMS, model=walker).converged
 
 
+def test_a_missing_gait_of_an_own_walker_is_nan_on_request():
+    params, guess = {"slope": -0.05}, [0.3, -0.3]  # No passive gait goes uphill.
+    find = lambda on_failure: vrw.limit_cycle(
+        params, model=SIMPLEST_WALKER, guess=guess, on_failure=on_failure
+    )
+    assert not find("zeros").found
+    assert np.isnan(find("nan").section_state).all()
+    with pytest.raises(ValueError, match="on_failure is 'typo'"):
+        find("typo")
+
+
 def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
     walker, c = SlowReturn(), np.linspace(1.0, 19.0, 5)
     find = lambda c: vrw.limit_cycle({"c": c}, model=walker).section_state[0]

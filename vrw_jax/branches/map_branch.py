@@ -72,8 +72,8 @@ from vrw_jax.gaits.fixed_points import (
     UNIT_MULTIPLIER_ADVICE,
     check_state_units,
     check_vector_map,
+    count_unit_multipliers,
     estimate_state_units,
-    has_unit_multiplier,
 )
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
@@ -386,7 +386,7 @@ def trace_map_branch(
     if branch_data is None:
         empty_dataset = xr.Dataset(coords={name: ("point", np.zeros(0))})
         start_jacobian = jax.jacfwd(function, 1)(constants, x, jnp.asarray(p, float))
-        is_singular = has_unit_multiplier(np.asarray(start_jacobian))
+        is_singular = count_unit_multipliers(np.asarray(start_jacobian)) > 0
         reasons = (UNIT_MULTIPLIER_ADVICE if is_singular else "",) * 2
         return Branch(name, empty_dataset, (), reasons, Outcome.NO_CYCLE_FOUND)
     quantities = branch_data.quantities

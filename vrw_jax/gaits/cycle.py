@@ -113,21 +113,9 @@ class AbstractCycle(AbstractPrintable):
 
         In that case, derivatives with respect to `params` are also NaN.
         """
-        nan_if_no_gait = jnp.where(self.found, 0.0, jnp.nan)
-        # The weight contains the parameters, so that derivatives are also NaN.
-        nan_weight = 1.0 + nan_if_no_gait * sum(jax.tree.leaves(params))
-
-        def apply_nan_weight(x: Array) -> Array:
-            return x * nan_weight.astype(x.dtype) if eqx.is_inexact_array(x) else x
-
-        return dataclasses.replace(
-            self,
-            **{
-                field_name: jax.tree.map(apply_nan_weight, getattr(self, field_name))
-                for field_name in FIELDS_ZERO_WITHOUT_GAIT
-                if field_name in vars(self)
-            },
-        )
+        names = [name for name in FIELDS_ZERO_WITHOUT_GAIT if name in vars(self)]
+        values = replace_by_nan(~self.found, params, [getattr(self, name) for name in names])
+        return dataclasses.replace(self, **dict(zip(names, values, strict=True)))
 
     def _zero_without_gait(self, value_of_gait: Array) -> Array:
         """Return `value_of_gait`, or zero if no gait was found.
@@ -367,6 +355,15 @@ def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str
     if n_unlisted_multipliers:
         multiplier_texts.append(f"{n_unlisted_multipliers} below 5e-6")
     return float(np.abs(floquet_multipliers[0])), ", ".join(multiplier_texts)
+
+
+def replace_by_nan(is_missing: Array, params: Any, tree: Any) -> Any:
+    """Return a tree with NaN as values and derivatives by `params` where a gait is missing."""
+    # The weight contains the parameters, so that derivatives are also NaN.
+    weight = 1.0 + jnp.where(is_missing, jnp.nan, 0.0) * sum(jax.tree.leaves(params))
+    return jax.tree.map(
+        lambda x: x * weight.astype(x.dtype) if eqx.is_inexact_array(x) else x, tree
+    )
 
 
 LAST_GAIT_DESCRIBERS: list[Callable[[Any], str]] = []

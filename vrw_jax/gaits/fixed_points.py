@@ -33,11 +33,11 @@ UNIT_MULTIPLIER_ADVICE = (
 """Advice for a state at which the equations of the fixed point are singular."""
 
 
-def has_unit_multiplier(jacobian: Float[np.ndarray, "... n n"]) -> Bool[np.ndarray, "..."]:
-    """Return whether a multiplier is 1, up to the round-off of two equal multipliers."""
+def count_unit_multipliers(jacobian: Float[np.ndarray, "... n n"]) -> Int[np.ndarray, "..."]:
+    """Return how many multipliers are 1, up to the round-off of two equal multipliers."""
     multipliers = np.linalg.eigvals(np.where(np.isfinite(jacobian), jacobian, 0.0))
     is_unit_multiplier = np.abs(multipliers - 1.0) < UNIT_CIRCLE_DISTANCE
-    return np.asarray(is_unit_multiplier.any(-1))
+    return np.asarray(is_unit_multiplier.sum(-1))
 
 
 class FixedPointResult(NamedTuple):
@@ -49,7 +49,9 @@ class FixedPointResult(NamedTuple):
     - `converged`: whether Newton's method converged;
     - `n_iterations`: number of Newton iterations;
     - `termination`: `Termination` status of the simulation of a `ReturnMap` from `x`; None for any
-      other map.
+      other map;
+    - `n_invariants`: number of conserved quantities that the search kept, each of which has a
+      multiplier of 1.
 
     Examples:
         >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
@@ -65,6 +67,7 @@ class FixedPointResult(NamedTuple):
     converged: Bool[Array, ""]
     n_iterations: Int[Array, ""]
     termination: Int[Array, ""] | None = None
+    n_invariants: Int[Array, ""] | int = 0
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
@@ -95,7 +98,9 @@ class FixedPointResult(NamedTuple):
             describe_convergence,
             self.converged,
             self.n_iterations,
-            has_unit_multiplier(np.asarray(self.jacobian)),
+            np.asarray(
+                count_unit_multipliers(np.asarray(self.jacobian)) > np.asarray(self.n_invariants)
+            ),
         )
 
     def __repr__(self) -> str:
@@ -264,9 +269,11 @@ def _find_fixed_point_of_iterate(
         return jnp.concatenate([next_x, *changes])
 
     closure_converted_map, closed_over_values = jax.closure_convert(evaluate_equations, start)
-    return _run_newton_loop(
+    result = _run_newton_loop(
         closure_converted_map, *loop_configuration, start, tolerance, units, *closed_over_values
     )
+    n_invariants = sum(jax.eval_shape(invariant, start).size for invariant in invariants)
+    return result._replace(n_invariants=jnp.asarray(n_invariants, jnp.int32))
 
 
 ClosureConvertedMap = Callable[..., Array]

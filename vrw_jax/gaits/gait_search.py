@@ -36,7 +36,7 @@ from vrw_jax.gaits.collocation_search import (
     CollocationSystem,
     CycleSearchResult,
 )
-from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES
+from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES, replace_by_nan
 from vrw_jax.gaits.finder_selection import (
     UserCycleGuess,
     check_cycle_guess,
@@ -183,12 +183,13 @@ def limit_cycle(
         0.000115 per N s/m
     """
     parse_gait_choice(which)
+    fills_missing_gait_with_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
     if is_own_walker(model):
-        return find_walker_gaits(model, params, guess, period_n, options)
+        gait = find_walker_gaits(model, params, guess, period_n, options)
+        return replace_by_nan(~gait.found, params, gait) if fills_missing_gait_with_nan else gait
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, period_n)
     params = gait_finder.model.attach_laws(params)
-    fills_missing_gait_with_nan = check_choice("on_failure", on_failure, FAILURE_FILLS) == "nan"
     has_unique_gait = gait_finder.is_multistable or gait_finder.model.leg_period == period_n
     if guess is None and period_n > 1 and not has_unique_gait:
         raise ValueError(
@@ -337,8 +338,10 @@ def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitC
         gait_finder, gait_finder.model.collect_batch_parameter_values(params)
     )
     n_gaits_per_wheel = np.bincount(gait_wheel_indices, minlength=n_wheels)
+    # A wheel without a gait has one row, with the code of the failure.
+    has_gait = np.bincount(gait_wheel_indices, attracting_gaits.found, n_wheels) > 0
     insufficient_gait_counts = n_gaits_per_wheel[
-        (gait_rank >= n_gaits_per_wheel) | (gait_rank < -n_gaits_per_wheel)
+        has_gait & ((gait_rank >= n_gaits_per_wheel) | (gait_rank < -n_gaits_per_wheel))
     ]
     if len(insufficient_gait_counts):
         n_available_gaits = int(insufficient_gait_counts[0])
