@@ -8,7 +8,6 @@ process of its own without a cache on disk, because a trace from a cache runs no
 """
 
 import itertools
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -77,6 +76,7 @@ if __name__ == "__main__":
     parser.add_argument("call", nargs="?", choices=CALLS, help="only this call, in this process")
     call_name = parser.parse_args().call
     if call_name:
+        jax.config.update("jax_enable_x64", True)  # Without `start_jax` there is no cache on disk.
         if call_name == "gradient":
             run_limit_cycle()  # The gradient's count then holds only the files that it adds.
         files, lane_files = list_files(CALLS[call_name])
@@ -84,7 +84,5 @@ if __name__ == "__main__":
         print("  " + "\n  ".join(files))
     else:
         for name in CALLS:
-            # Without `vrw.start_jax` there is no cache on disk.
-            environment = os.environ | {"JAX_ENABLE_X64": "true"}
             command = [sys.executable, "-m", "experiments.shared.count_files", name]
-            subprocess.run(command, check=True, env=environment)
+            subprocess.run(command, check=True)

@@ -613,6 +613,7 @@ def _require_known_keys(
     table_location: str,
     key_kind: str,
 ) -> None:
+    """Raise a ValueError for an unknown key, with a similar name or the name for a symbol."""
     allowed_keys = tuple(allowed_keys)
     for config_key in config_table:
         raise_for_parameter_symbol(config_key, allowed_keys)

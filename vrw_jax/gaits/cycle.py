@@ -228,7 +228,10 @@ class AbstractCycle(AbstractPrintable):
 
     @property
     def spectral_margin(self) -> Array:
-        """Return 1 minus the spectral radius, which is positive for stable gaits of every model."""
+        """Return 1 minus the spectral radius, which is positive for stable gaits of every model.
+
+        It is zero if no gait was found.
+        """
         return self._zero_without_gait(1.0 - self.spectral_radius)
 
     @property

@@ -123,7 +123,8 @@ def is_shared_cache_trusted() -> bool:
 def create_cache_folder(cache_folder: Path) -> None:
     """Create a folder for code, and its parents.
 
-    Only the user can access the folder, unless the user trusts a shared cache.
+    Only the user can access the folders that are created here, unless the user trusts a shared
+    cache.
     """
     for missing_folder in reversed([cache_folder, *cache_folder.parents]):
         if not missing_folder.exists():

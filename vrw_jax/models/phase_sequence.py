@@ -439,8 +439,9 @@ def _make_margins_and_required_friction(
     ]
 
     def find_lowest_margin(margin_name: str, *phase_indices: int) -> Array:
-        """Return the lowest minimum of a margin over the phases that occurred, or 0 if none
-        occurred.
+        """Return the lowest minimum of a margin over the phases that occurred.
+
+        It is 0 if none occurred, or if the minimum is not finite, as in a step that failed.
         """
         lowest_margin: Any = jnp.inf
         for phase_index in phase_indices:

@@ -518,6 +518,8 @@ def _make_solver() -> Any:
     import optimistix  # imported here, because its import takes long
 
     class LevenbergMarquardt(optimistix.AbstractGaussNewton):
+        """Optimistix's method with the first step size and the end that fits need."""
+
         rtol: float = FIT_TOLERANCE
         atol: float = FIT_TOLERANCE
         norm: Callable = optimistix.max_norm

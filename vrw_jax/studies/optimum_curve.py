@@ -32,7 +32,7 @@ MAX_STEP_HALVINGS = 5
 
 
 class ActiveSetChange(NamedTuple):
-    """Value of the parameter at which the set of active limits changes along a curve of optima.
+    """Change of the active constraints and bounds along a curve of optima, and where it happens.
 
     - `value`: value of the parameter;
     - `before`, `after`: names of the active constraints and bounds on both sides.

@@ -383,8 +383,9 @@ ZARR_METADATA_ERRORS = (
 def _open_zarr_group(
     store_path: Path, access_mode: Literal["r", "r+"], stored_metadata: StoredMetadata
 ) -> zarr.Group:
-    """Return the Zarr group of a store, opened with the first copy of the metadata that can be
-    read.
+    """Return the Zarr group of a store with all its arrays.
+
+    If the common copy of the metadata cannot be read, the files of the arrays are read instead.
     """
 
     import zarr  # This import is slow.
