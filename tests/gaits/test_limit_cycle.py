@@ -254,21 +254,22 @@ def test_vmap_agrees_with_single_wheels():
 
 def test_a_gait_that_only_walks_reach_is_found_inside_jit_and_vmap_too():
     """The first wheel has a gait on a gentle slope, and the second wheel has none."""
-    options = vrw.CycleOptions(mesh_intervals=(40, 32, 16))
     wheels = vrw.WheelParams(
         damping=np.array([120.0, 400.0]), stiffness=np.array([1800.0, 1e3]), slope=0.08
     )
-    expected = vrw.limit_cycles(wheels, options=options)
+    expected = vrw.limit_cycles(wheels)
     assert expected.found.tolist() == [True, False]
     find = lambda damping, stiffness: vrw.limit_cycle(
-        vrw.WheelParams(damping=damping, stiffness=stiffness, slope=0.08), options=options
+        vrw.WheelParams(damping=damping, stiffness=stiffness, slope=0.08)
     )
     gaits = jax.jit(jax.vmap(find))(wheels.damping, wheels.stiffness)
     assert gaits.outcome.tolist() == expected.outcome.tolist()
-    np.testing.assert_allclose(gaits.section_state, expected.section_state, rtol=1e-12)
-    period = lambda damping: find(damping, 1800.0).period
-    derivative = jax.jit(jax.grad(period))(120.0)
-    np.testing.assert_allclose(derivative, jax.grad(period)(120.0), rtol=1e-12)
+    # The meshes differ. The relative errors of both are 1e-9 in values and 1e-8 in derivatives.
+    np.testing.assert_allclose(gaits.section_state, expected.section_state, rtol=2e-9)
+    for measure in ("period", "spectral_radius"):
+        evaluate = lambda damping, measure=measure: find(damping, 1800.0).measure(measure)
+        derivative = jax.jit(jax.grad(evaluate))(120.0)
+        np.testing.assert_allclose(derivative, jax.grad(evaluate)(120.0), rtol=2e-8)
 
 
 @pytest.mark.slow
@@ -434,7 +435,7 @@ def test_too_coarse_a_mesh_is_reported_and_a_finer_one_finds_the_gait():
     row = table_1(slope=0.12)
     coarse, fine = (
         jax.tree.map(lambda x: x[0], differentiate_measures(row, options)[1])
-        for options in (None, TIGHT_OPTIONS)
+        for options in (vrw.CycleOptions(), TIGHT_OPTIONS)
     )
     assert int(coarse.outcome) == Outcome.MESH_TOO_COARSE
     assert "more intervals" in coarse.why

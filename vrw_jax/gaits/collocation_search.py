@@ -59,13 +59,71 @@ LaneParameters = Float[Array, "n_parameters lanes"]
 
 
 class CollocationSystem(NamedTuple):
-    """Collocation system of a limit cycle: phases, number of gait steps, and meshes."""
+    """Collocation system of a limit cycle: phases, number of gait steps, and meshes.
+
+    Inside `jit`, where no value tells which mesh a gait needs, each wheel may have one of two
+    meshes. Arrays then have the size of the fine mesh. A solution on the mesh of `coarse_options`
+    fills the first mesh intervals, and the others contain zeros.
+    """
 
     n_legs: int
     period_n: int
     cycle_options: CycleOptions
     stop_at_lift_off: bool = True  # whether the normal force must be positive in an admissible gait
     law_structure: Any = NO_LAWS
+    coarse_options: CycleOptions | None = None
+
+    @property
+    def coarse_system(self) -> "CollocationSystem":
+        """Return the system on the coarse mesh, or this system if it has one mesh."""
+        return self._replace(
+            cycle_options=self.coarse_options or self.cycle_options, coarse_options=None
+        )
+
+    @property
+    def fine_system(self) -> "CollocationSystem":
+        """Return the system on the fine mesh alone."""
+        return self._replace(coarse_options=None)
+
+    def select_coarse_state(self, state: "CollocationState") -> "CollocationState":
+        """Return the state on the coarse mesh, of use for the wheels whose gaits are there."""
+        accelerations = tuple(
+            x[:, : mesh.n_intervals]
+            for x, mesh in zip(
+                state.solution.accelerations, self.coarse_system.phase_meshes, strict=True
+            )
+        )
+        return state._replace(solution=state.solution._replace(accelerations=accelerations))
+
+    def is_on_coarse_mesh(self, state: "CollocationState") -> Any:
+        """Return for each wheel whether its solution is on the coarse mesh."""
+        if self.coarse_options is None:
+            return jnp.asarray(False)
+        return jnp.all(state.solution.accelerations[1][:, -1] == 0.0, (0, 1, 2))
+
+    def on_each_mesh(self, make_function: Callable) -> Callable:
+        """Return `make_function(system)`, a function of parameters and a state of one wheel.
+
+        With two meshes the result is that on the mesh of the wheel, padded with zeros to the size
+        of the fine mesh.
+        """
+        if self.coarse_options is None:
+            return make_function(self)
+        on_coarse, on_fine = make_function(self.coarse_system), make_function(self.fine_system)
+
+        def evaluate(parameters: Array, state: CollocationState, *arguments: Any) -> Any:
+            is_coarse = self.is_on_coarse_mesh(state)
+            mask = lambda state, flag: state._replace(
+                has_cycle=jnp.where(flag, state.has_cycle, 0.0)
+            )
+            coarse_state = mask(self.select_coarse_state(state), is_coarse)
+            coarse = on_coarse(parameters, coarse_state, *arguments)
+            fine = on_fine(parameters, mask(state, ~is_coarse), *arguments)
+            return jax.tree.map(
+                lambda x, y: jnp.where(is_coarse, pad_with_zeros(x, y.shape), y), coarse, fine
+            )
+
+        return evaluate
 
     @property
     def phase_sequence(self) -> PhaseSequence:
@@ -288,6 +346,12 @@ for namedtuple_class in (CollocationSolution, CollocationState, CycleSearchResul
     export.register_namedtuple_serialization(
         namedtuple_class, serialized_name=f"vrw_jax.{namedtuple_class.__name__}"
     )
+
+
+def pad_with_zeros(array: Array, shape: tuple[int, ...]) -> Array:
+    """Return an array of a larger shape, with zeros after the entries of each axis."""
+    widths = [(0, m - n, 0) for m, n in zip(shape, array.shape, strict=True)]
+    return lax.pad(array, jnp.zeros((), array.dtype), widths)
 
 
 def predict_start_from_gait_surface(

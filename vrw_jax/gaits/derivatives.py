@@ -21,6 +21,8 @@ from vrw_jax.gaits.collocation_search import (
     CollocationSystem,
     CycleSearchResult,
     LaneParameters,
+    init_search_result,
+    pad_with_zeros,
     run_search_attempts,
     search_all_attempts,
 )
@@ -32,7 +34,12 @@ from vrw_jax.lanes.autodiff import (
     make_zero_tangent,
     with_implicit_derivative,
 )
-from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
+from vrw_jax.lanes.batching import (
+    BatchFunction,
+    apply_function_in_blocks,
+    make_zeros_like_output,
+    unbatch,
+)
 from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.lanes.python_calls import call_python
 from vrw_jax.lanes.settings import with_default_jax_settings
@@ -176,7 +183,9 @@ def _zero_without_cycle(collocation_state: CollocationState, tree_over_lanes: An
 
 
 def make_derivative_compiler(
-    n_compiled_orders: int, collocation_system: CollocationSystem
+    n_compiled_orders: int,
+    collocation_system: CollocationSystem,
+    skips_batches_without_cycles: bool = False,
 ) -> ExecutionWrapper:
     """Return a function that compiles a batch function for a given order of derivatives.
 
@@ -188,20 +197,46 @@ def make_derivative_compiler(
         function_of_element: BatchFunction, derivative_order: int
     ) -> BatchFunction:
         if derivative_order < n_compiled_orders:
-            return compile_batch_function(function_of_element, batch_size)
-        return apply_function_in_blocks(function_of_element, batch_size)
+            compiled = compile_batch_function(function_of_element, batch_size)
+        else:
+            compiled = apply_function_in_blocks(function_of_element, batch_size)
+        return skip_without_cycles(compiled) if skips_batches_without_cycles else compiled
 
     return compile_function
 
 
-def make_tangent_function(collocation_system: CollocationSystem) -> Callable:
+def skip_without_cycles(function: BatchFunction) -> BatchFunction:
+    """Return a function whose results are zero for a batch that contains no cycle."""
+
+    def evaluate(parameters: Array, trees: Any) -> Any:
+        find_state = lambda tree: (
+            tree if isinstance(tree, CollocationState) else find_state(tree[0])
+        )
+        return lax.cond(
+            jnp.any(find_state(trees).has_cycle > 0.5),
+            function,
+            lambda *arguments: make_zeros_like_output(function, *arguments),
+            parameters,
+            trees,
+        )
+
+    return evaluate
+
+
+def make_tangent_function(
+    collocation_system: CollocationSystem, skips_batches_without_cycles: bool = False
+) -> Callable:
     """Return a differentiable function that computes `_compute_collocation_tangents`
     for one wheel.
     """
+    if collocation_system.coarse_options is not None:
+        return collocation_system.on_each_mesh(
+            functools.partial(make_tangent_function, skips_batches_without_cycles=True)
+        )
     compute_tangents = with_implicit_derivative(
         functools.partial(_compute_collocation_tangents, collocation_system),
         lambda *primal_arrays: compute_tangents(*primal_arrays),
-        make_derivative_compiler(2, collocation_system),
+        make_derivative_compiler(2, collocation_system, skips_batches_without_cycles),
     )
     return compute_tangents
 
@@ -284,15 +319,21 @@ def solve_cycle_with_derivatives(
 
     - `search_missing_cycles`: Python function that searches again for cycles that were not found.
     """
+    searched_system = collocation_system.coarse_system
     batched_search = compile_batch_function(
-        functools.partial(run_search_attempts, collocation_system),
-        collocation_system.cycle_options.batch_size,
+        functools.partial(run_search_attempts, searched_system),
+        searched_system.cycle_options.batch_size,
     )
 
     def search_lanes(parameters: LaneParameters, *guess: CollocationState) -> CycleSearchResult:
         search_result = _search_in_scaled_units(
-            collocation_system, batched_search, starts_only_from_guess, parameters, *guess
+            searched_system, batched_search, starts_only_from_guess, parameters, *guess
         )
+        if collocation_system.coarse_options is not None:
+            zeros = init_search_result(collocation_system, parameters)
+            search_result = jax.tree.map(
+                lambda x, y: pad_with_zeros(x, y.shape), search_result, zeros
+            )
         if search_missing_cycles is None:
             return search_result
         return lax.cond(
@@ -339,15 +380,21 @@ def attach_monodromy_derivatives(
     """Return `monodromy_value` with the derivatives of the monodromy matrix on the
     branch of cycles.
     """
-    compute_parameter_jacobian = make_implicit_jacobian(
-        functools.partial(_compute_masked_monodromy, collocation_system),
-        make_tangent_function(collocation_system),
-        make_derivative_compiler(2, collocation_system),
-        make_jacobian=functools.partial(_compute_monodromy_tangents, collocation_system),
-    )
+    skips = collocation_system.coarse_options is not None
+
+    def make_monodromy_jacobian(system: CollocationSystem) -> Callable:
+        return make_implicit_jacobian(
+            functools.partial(_compute_masked_monodromy, system),
+            make_tangent_function(system, skips),
+            make_derivative_compiler(2, system, skips),
+            make_jacobian=functools.partial(_compute_monodromy_tangents, system),
+        )
 
     return attach_derivatives(
-        compute_parameter_jacobian, monodromy_value, parameters, collocation_state
+        collocation_system.on_each_mesh(make_monodromy_jacobian),
+        monodromy_value,
+        parameters,
+        collocation_state,
     )
 
 

@@ -59,6 +59,7 @@ def search_further(
     batch_sizes: tuple[int, ...],
     guess_states: np.ndarray | None = None,
     can_refine_mesh: bool = True,
+    max_mesh_error: float = MAX_UNREFINED_MESH_ERROR,
 ) -> list[tuple[CollocationFinder, np.ndarray, MeshSearch]]:
     """Return further gaits of a batch: for each mesh its finder, indices of wheels, and gaits.
 
@@ -66,10 +67,11 @@ def search_further(
 
     - `first_search`: result of the search on the mesh of `gait_finder`;
     - `guess_states`: section states of the user's guesses, shape (wheels, 3);
-    - `can_refine_mesh`: whether a finer mesh may be used.
+    - `can_refine_mesh`: whether a finer mesh may be used;
+    - `max_mesh_error`: estimated mesh error above which it is used.
     """
     outcomes, mesh_errors, collocation_state = jax.tree.map(np.asarray, first_search[:3])
-    is_coarse = (outcomes == Outcome.MESH_TOO_COARSE) | (mesh_errors > MAX_UNREFINED_MESH_ERROR)
+    is_coarse = (outcomes == Outcome.MESH_TOO_COARSE) | (mesh_errors > max_mesh_error)
     is_walk_needed = (
         np.isin(outcomes, RETRY_OUTCOMES)
         & ~(is_coarse & can_refine_mesh)
@@ -128,7 +130,7 @@ def search_further(
             is_mesh_too_coarse = mesh_search.outcome == Outcome.MESH_TOO_COARSE
             can_walk_help = is_mesh_too_coarse | (~is_found & is_settled[searched_wheels])
             is_walking = np.isin(searched_wheels, walking_wheels)
-            is_coarse = mesh_search.mesh_error > MAX_UNREFINED_MESH_ERROR
+            is_coarse = mesh_search.mesh_error > max_mesh_error
             is_coarse |= is_mesh_too_coarse & ~is_walking
             new_roots = select_tree_rows(mesh_search.collocation_state, is_coarse)
             walking_wheels = searched_wheels[is_walking & can_walk_help]

@@ -4,7 +4,7 @@ The search in `collocation_search` starts from predicted gaits for the paper's p
 a mesh that suits these gaits. If it fails, batches of walks (`models.step_batch`) begin at starts
 that scale with the wheel. The end of a walk that settles is the start of another search. If the
 mesh is too coarse, it is refined. These fallbacks depend on concrete values. Under a caller's `jit`
-or `vmap`, a Python function runs them, on one mesh.
+or `vmap`, a Python function runs them.
 """
 
 import dataclasses
@@ -136,8 +136,8 @@ def limit_cycle(
     made as fine as these errors require. With `options` the mesh is fixed, and `mesh_error`
     estimates its error. The cycle is differentiable in every mode and to every order.
 
-    If the search fails, walks and finer meshes are used. Under `jax.jit` and `jax.vmap` the mesh is
-    that of the options, and walks require `start_jax` and a CPU with several cores.
+    If the search fails, walks and finer meshes are used. Under `jax.jit` and `jax.vmap` these need
+    `start_jax` and a CPU with several cores, and the mesh is refined once.
 
     If no gait is found, `outcome` and `why` contain the reason, and numbers and derivatives are
     zero. With `on_failure="nan"` they are NaN, so that an optimization loop does not stop
@@ -391,6 +391,7 @@ def _search_with_fallbacks(
     search_options: dict[str, Any] = {}
     if is_traced and can_programs_call_jax():
         if gait_finder.supports_cold_start:
+            gait_finder = gait_finder.with_second_mesh() if can_refine_mesh else gait_finder
             search_options = {"search_missing_cycles": _search_missing_cycles}
         elif gait_finder.is_multistable and cycle_guess is None:
             cycle_guess = _choose_gait_inside_jit(gait_finder, params_without_tangents, gait_choice)
@@ -559,11 +560,18 @@ def _search_missing_cycles(
     )
     if guess:
         guesses = jax.tree.map(lambda x: np.moveaxis(x[..., missing], -1, 0), guess[0])
+        if collocation_system.coarse_options is not None:
+            coarse_options = collocation_system.coarse_options
+            coarse_finder = dataclasses.replace(gait_finder, cycle_options=coarse_options)
+            guesses = transfer_to_mesh(
+                coarse_finder, gait_finder, guesses, batch_sizes.GAIT_BATCH_SIZES
+            )
         rows = [select_tree_rows((params, guesses), i) for i in range(len(missing))]
         cycles = [search(*jax.device_put(row)) for row in rows]
         cycle = jax.tree.map(lambda *x: np.stack(x), *cycles)
     else:
         cycle = search(params, None)
+    is_found = np.asarray(cycle.found)
     for result, found in zip(
         jax.tree.leaves(search_result),
         jax.tree.leaves(
@@ -576,7 +584,7 @@ def _search_missing_cycles(
         ),
         strict=True,
     ):
-        result[..., missing] = np.moveaxis(np.asarray(found), 0, -1)
+        result[..., missing[is_found]] = np.moveaxis(np.asarray(found)[is_found], 0, -1)
     return search_result
 
 

@@ -6,6 +6,7 @@ cycles, in forward and reverse mode, and to any order.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -120,6 +121,11 @@ class LimitCycle(AbstractCycle):
             self.monodromy_value, self.parameters, self.collocation_state
         )
 
+    def _evaluate_on_mesh(self, make_function: Callable, *arguments: Any) -> Any:
+        """Return the value of a function of a gait, see `CollocationSystem.on_each_mesh`."""
+        evaluate = self.map_over_batch_axes(self.system.on_each_mesh(make_function))
+        return evaluate(self.parameters, self.collocation_state, *arguments)
+
     @property
     def jury_margins(self) -> Array:
         """Return the margins to a fold, a period doubling and a Neimark-Sacker bifurcation.
@@ -141,8 +147,10 @@ class LimitCycle(AbstractCycle):
         See `collocation.estimate_mesh_error`. A gait whose estimate is above 1e-5 is rejected. More
         mesh intervals in `CycleOptions` reduce the error.
         """
-        estimate_error = self.map_over_batch_axes(self.system.estimate_mesh_error)
-        return jnp.where(self.found, estimate_error(self.collocation_state.solution), 0.0)
+        mesh_error = self._evaluate_on_mesh(
+            lambda system: lambda _, state: system.estimate_mesh_error(state.solution)
+        )
+        return jnp.where(self.found, mesh_error, 0.0)
 
     @property
     def takeoff_acceleration(self) -> Array:
@@ -151,8 +159,12 @@ class LimitCycle(AbstractCycle):
         See `margin_defaults`.
         """
         return self._zero_without_gait(
-            self.map_over_batch_axes(self.system.measure_takeoff_acceleration)(
-                self.parameters, self.collocation_state.solution
+            self._evaluate_on_mesh(
+                lambda system: (
+                    lambda parameters, state: system.measure_takeoff_acceleration(
+                        parameters, state.solution
+                    )
+                )
             )
         )
 
@@ -168,8 +180,7 @@ class LimitCycle(AbstractCycle):
                 f"the cycle has {self.period_n} steps, but a gait sensitivity norm is defined here "
                 "for gaits that repeat after one: give a cycle of period_n = 1."
             )
-        compute_response = self.map_over_batch_axes(make_slope_response_function(self.system))
-        return compute_response(self.parameters, self.collocation_state)
+        return self._evaluate_on_mesh(make_slope_response_function)
 
     def gait_sensitivity(self, measure_name: str) -> Array:
         """Return the gait sensitivity norm of a measure, in the measure's unit per rad of slope.
@@ -188,14 +199,15 @@ class LimitCycle(AbstractCycle):
         )
 
     def _evaluate_own_measure(self, measure: Measure) -> Array:
-        evaluate = functools.partial(evaluate_own_measure, measure, self.system, self.model)
-        return self.map_over_batch_axes(evaluate)(
-            self.parameters, self.collocation_state.solution, self.section_state
-        )
+        def make_evaluate(system: CollocationSystem) -> Callable:
+            return lambda parameters, state, section_state: evaluate_own_measure(
+                measure, system, self.model, parameters, state.solution, section_state
+            )
+
+        return self._evaluate_on_mesh(make_evaluate, self.section_state)
 
     def _locate_force_peaks(self) -> dict[str, Array]:
-        measure = self.map_over_batch_axes(functools.partial(measure_force_peaks, self.system))
-        return measure(self.parameters, self.collocation_state)
+        return self._evaluate_on_mesh(lambda system: functools.partial(measure_force_peaks, system))
 
     @property
     def margins(self) -> Margins:

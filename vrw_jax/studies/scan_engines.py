@@ -35,7 +35,11 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.finder import MeasureReader, confirm_outcome_by_step, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.further_search import MeshSearch, search_further
+from vrw_jax.gaits.further_search import (
+    MAX_UNREFINED_MESH_ERROR,
+    MeshSearch,
+    search_further,
+)
 from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
@@ -68,6 +72,13 @@ from vrw_jax.wheel.params import (
     WheelParams,
     make_wheel_from_parameters,
 )
+
+UNSTABLE_GAIT_MESH_ERROR = 1e-11
+"""Largest mesh error of a gait that an event-driven step has not confirmed on a coarser mesh.
+
+The value is chosen because the error of a gait with a multiplier of 9 then stays far below
+the tolerance of the confirmation.
+"""
 
 
 class EvaluationRequest(NamedTuple):
@@ -168,28 +179,43 @@ class CollocationScanEngine:
                 self._compile(key, self._make_cycle_function(mesh_finder), *shapes)
             return MeshSearch(*self._run(key, size, *arguments))
 
-        first_search = MeshSearch(*self._run("cycles", size, rows))
-        outcomes, gaits = np.array(first_search.outcome), first_search.gaits
+        search = MeshSearch(*self._run("cycles", size, rows))
+        cycle_outcomes, gaits = np.array(search.outcome), search.gaits
         model, params = finder.model.from_parameter_values(
             tuple(jax.device_put(list(rows.T))), finder.n_legs
         )
         default_finder: Any = make_finder(finder.model, finder.n_legs, period_n=finder.period_n)
-        for _, indices, mesh_search in search_further(
-            find_from_starts,
-            finder,
-            model.attach_laws(params),
-            first_search,
-            (batch_sizes.GAIT_READ_BATCH_SIZE,),
-            # A mesh that the user has chosen is fixed.
-            can_refine_mesh=finder.cycle_options == default_finder.cycle_options,
-        ):
-            outcomes[indices] = mesh_search.outcome
-            gaits = replace_rows(gaits, indices, mesh_search.gaits)
-        section_states, measures = gaits
-        step_outcomes, end_states, step_measures = self._run(
-            "steps", size, rows, section_states, shared=(step_options,)
-        )
-        outcomes = confirm_outcome_by_step(outcomes, section_states, step_outcomes, end_states)
+        # A mesh that the user has chosen is fixed.
+        can_refine_mesh = finder.cycle_options == default_finder.cycle_options
+        searched, params = np.arange(len(rows)), model.attach_laws(params)
+        outcomes, max_mesh_error = cycle_outcomes, MAX_UNREFINED_MESH_ERROR
+        for is_last_round in (not can_refine_mesh, True):
+            for _, indices, mesh_search in search_further(
+                find_from_starts,
+                finder,
+                select_tree_rows(params, searched),
+                search,
+                (batch_sizes.GAIT_READ_BATCH_SIZE,),
+                can_refine_mesh=can_refine_mesh,
+                max_mesh_error=max_mesh_error,
+            ):
+                cycle_outcomes[searched[indices]] = mesh_search.outcome
+                gaits = replace_rows(gaits, searched[indices], mesh_search.gaits)
+            section_states, measures = gaits
+            step_outcomes, end_states, step_measures = self._run(
+                "steps", size, rows, section_states, shared=(step_options,)
+            )
+            outcomes = confirm_outcome_by_step(
+                cycle_outcomes, section_states, step_outcomes, end_states
+            )
+            # The errors of unstable gaits grow in the step, so that they may need a finer mesh.
+            is_unconfirmed = (cycle_outcomes == Outcome.STEPPED) & (
+                outcomes == Outcome.MESH_TOO_COARSE
+            )
+            searched = np.flatnonzero(is_unconfirmed)
+            if is_last_round or not len(searched):
+                break
+            search, max_mesh_error = select_tree_rows(search, searched), UNSTABLE_GAIT_MESH_ERROR
         return mask_failed_samples(outcomes, measures | step_measures)
 
     def _compile(self, key: Any, function: Callable, *arguments: Any) -> None:
