@@ -228,6 +228,26 @@ def test_a_batched_walk_equals_single_walks_and_ends_at_its_first_failure():
     np.testing.assert_allclose(batch_result.section_state[0], last, atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    "arguments", [{}, {"engine": "diffrax"}, {"model": vrw.UnilateralWheel()}], ids=str
+)
+def test_a_batch_without_elements_has_results_of_the_usual_shapes(arguments):
+    results = [
+        vrw.step_batch(
+            vrw.WheelParams(), np.tile(vrw.paper_start(), (n, 1)), derivatives=names, **arguments
+        )
+        for n in (0, 2)
+        for names in ([], ["damping", "section_state"])
+    ]
+    for empty, full in zip(results[:2], results[2:], strict=True):
+        # Results of contact have more entries in a section state.
+        if "model" not in arguments:
+            assert empty.section_state.shape == (0, 3)
+        shapes = [[x.shape[1:] for x in jax.tree.leaves(y)] for y in (empty, full)]
+        assert shapes[0] == shapes[1]
+        assert len(empty.durations) == 0
+
+
 def test_results_are_new_arrays_and_arguments_are_not_modified():
     states = STARTS.copy()
     params = reference_values.make_wheels(reference_values.REFERENCE_PARAMETERS)

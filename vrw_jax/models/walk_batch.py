@@ -164,7 +164,6 @@ class WalkBatch:
         self.section_state, self.inputs = section_states, inputs
         if inputs:
             self.input_matrix = np.stack([x.select_values(0) for x in inputs])
-        self.durations = np.zeros((0, n_lanes))
         self.outcome, self.n_stepped, self.solver_steps = np.zeros((3, n_lanes), np.int32)
         self.derivative_names = derivative_names
         self.differentiated_inputs = {
@@ -185,6 +184,13 @@ class WalkBatch:
             )
         # The first index of each argument on axis 0 of the walk's Jacobian, and then of the start.
         self.first_rows = np.cumsum([0, *(n or 1 for n in self.n_values_by_argument.values())])
+        self._allocate_results(3, section_states.dtype)  # DLS, SLS-I and SLS-II
+
+    def _allocate_results(self, n_phases: int, dtype: Any) -> None:
+        n, n_lanes = self.section_state.shape
+        self.durations = np.zeros((n_phases, n_lanes), dtype)
+        n_rows = (self.first_rows[-1] + n) * bool(self.derivative_names)
+        self.walk_jacobian = np.zeros((n_rows, n + n_phases, n_lanes), dtype)
 
     def take_steps(
         self,
@@ -201,7 +207,8 @@ class WalkBatch:
         """
         for k in range(n_steps):
             walking = np.flatnonzero(self.outcome == Outcome.STEPPED)
-            if not len(walking):
+            # A walker without inputs takes a step of no lanes, which has its number of phases.
+            if not len(walking) and (k or self.inputs):
                 break
             lanes = select_lanes(walking, len(self.outcome))
             inputs = self._select_inputs(k, model)[:, lanes] if self.inputs else None
@@ -209,12 +216,7 @@ class WalkBatch:
                 walking, inputs, self.section_state[:, lanes], k
             )
             if k == 0:
-                self.durations = np.zeros((len(durations), len(walking)), durations.dtype)
-                n_rows = self.first_rows[-1] + len(self.section_state)
-                n_outputs = len(self.section_state) + len(durations)
-                self.walk_jacobian = np.zeros(
-                    (n_rows * len(jacobian), n_outputs, len(walking)), durations.dtype
-                )
+                self._allocate_results(len(durations), durations.dtype)
             if jacobian:
                 self.walk_jacobian[..., lanes] = self._chain_walk_jacobian(k, lanes, *jacobian)
             self.section_state[:, lanes] = section_state
