@@ -18,7 +18,7 @@ from experiments.shared.timing import measure_cpu_seconds
 from experiments.speed import peers
 from vrw_jax import Outcome
 from vrw_jax.hybrid import GuardsAndMargins, integrate_phase
-from vrw_jax.models.viscoelastic import make_diffrax_phase
+from vrw_jax.models.viscoelastic import make_element_phase
 from vrw_jax.wheel import (
     Motion,
     Symbols,
@@ -101,7 +101,7 @@ def step_with_leg(
     landing = transitions.resolve_landing(s, *x)
     is_requested = jnp.asarray(True)
     phases = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)
-    dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
+    dls, sls1, sls2 = (make_element_phase(phase, records_margins=False) for phase in phases)
     run = lambda phase, y: integrate_phase(
         phase.vector_field, phase.guards, y, is_requested, options
     )
@@ -250,7 +250,7 @@ def upright_rate(slope: float, start: np.ndarray) -> float:
     s = vrw.WheelParams(**SLOW_WALK_PARAMETERS, slope=slope).symbols()
     landing = transitions.resolve_landing(s, *start)
     double_support = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)[0]
-    field = make_diffrax_phase(double_support, records_margins=False).vector_field
+    field = make_element_phase(double_support, records_margins=False).vector_field
     push = jax.jit(lambda theta: field(jnp.stack([theta, 0.0 * theta]))[1])
     places = float(landing.theta_after_landing) + np.linspace(0.0, 1.0, 2001)
     rises = np.diff(np.sign(np.asarray(jax.vmap(push)(jnp.asarray(places))))) > 0

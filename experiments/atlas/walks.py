@@ -11,7 +11,7 @@ import numpy as np
 import vrw_jax as vrw
 from vrw_jax import Outcome
 from vrw_jax.hybrid import GuardsAndMargins, PhaseEnd, integrate_phase
-from vrw_jax.models.viscoelastic import DiffraxPhaseFunctions, make_diffrax_phase
+from vrw_jax.models.viscoelastic import ElementPhase, make_element_phase
 from vrw_jax.wheel import Motion, dynamics, make_paper_phases, transitions
 
 REFERENCE = Path(__file__).parents[2] / "tests" / "reference_code"
@@ -22,7 +22,7 @@ WALKS = {(1e-6, 1e-8, 1e-13): 10_000, (1e-10,): 100_000}
 
 
 def with_damping(
-    phase: DiffraxPhaseFunctions,
+    phase: ElementPhase,
     start: jax.Array,
     params: vrw.WheelParams,
     options: vrw.StepOptions,
@@ -54,7 +54,7 @@ def accounted_step(params: vrw.WheelParams, x: jax.Array, options: vrw.StepOptio
     before = transitions.compute_motion_before_landing(s, *x)
     landing = transitions.resolve_landing(s, *x)
     phases = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)
-    dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
+    dls, sls1, sls2 = (make_element_phase(phase, records_margins=False) for phase in phases)
     start = jnp.stack([landing.theta_after_landing, landing.motion_after.dtheta])
     first, lost_1, m = with_damping(dls, start, params, options)
     start = jnp.stack([first.state[0], m.L1, m.L2, m.dtheta, m.dL1, m.dL2])

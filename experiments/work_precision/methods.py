@@ -26,7 +26,7 @@ import vrw_jax as vrw
 from experiments.shared.wheels import PARAMETER_BOX, make_wheels
 from experiments.speed import peers
 from vrw_jax.flow import load_explicit_tableau
-from vrw_jax.models.viscoelastic import make_diffrax_phase
+from vrw_jax.models.viscoelastic import make_element_phase
 from vrw_jax.wheel import make_paper_phases, transitions
 
 VARIED_PARAMETERS = tuple(PARAMETER_BOX)
@@ -131,7 +131,7 @@ def by_diffeqsolve(solver: diffrax.AbstractAdaptiveSolver, fixed: bool) -> Calla
         s = make_wheels(row).symbols()
         landing = transitions.resolve_landing(s, *x)
         phases = make_paper_phases(s, landing.foot_distance, stop_at_lift_off=True)
-        dls, sls1, sls2 = (make_diffrax_phase(phase, records_margins=False) for phase in phases)
+        dls, sls1, sls2 = (make_element_phase(phase, records_margins=False) for phase in phases)
         y, first_time, n1 = until(
             dls, jnp.stack([landing.theta_after_landing, landing.motion_after.dtheta]), setting
         )

@@ -8,7 +8,7 @@ from support import reference_values
 
 import vrw_jax as vrw
 from vrw_jax.lanes.autodiff import enable_all_ad_modes
-from vrw_jax.models.viscoelastic import make_diffrax_phase
+from vrw_jax.models.viscoelastic import make_element_phase
 from vrw_jax.wheel import make_paper_phases, transitions
 
 PARAMS = vrw.WheelParams()
@@ -90,7 +90,7 @@ def test_the_saltation_formula_agrees(forward_jacobian):
         # The distance between the feet is a constant of double support: a third coordinate at rest.
         distance = at_landing[2]
         flows = lambda distance: [
-            make_diffrax_phase(phase, False) for phase in make_paper_phases(s, distance, True)
+            make_element_phase(phase, False) for phase in make_paper_phases(s, distance, True)
         ]
         first, second, third = flows(distance)
         with_distance = first._replace(

@@ -78,6 +78,47 @@ def test_too_slow_a_start_falls_back():
     assert int(result.outcome) == vrw.Outcome.FELL_BACK
 
 
+@pytest.mark.parametrize("rate", [3.4, 3.5, 3.6])
+def test_a_wheel_that_lands_before_the_vertical_steps(rate):
+    """On a slope below -alpha/2 the vertical lies beyond the next landing."""
+    params = vrw.WheelParams(slope=-0.6)
+    result = vrw.step(params, [HALF_ANGLE, rate, 0.0], model=rigid_walks())
+    mass, inertia = 10.0 + 8.0, 8.0 * 0.7**2
+    retained_share = (mass * np.cos(np.pi / 4) + inertia) / (mass + inertia)
+    gained = 4.0 * mass * 9.81 * np.sin(HALF_ANGLE) * np.sin(-0.6) / (mass + inertia)
+    squared_rate = (rate * retained_share) ** 2 + gained
+    assert (int(result.outcome) == vrw.Outcome.STEPPED) == (squared_rate > 0.0) == (rate > 3.46)
+    np.testing.assert_allclose(result.section_state[1] ** 2, max(squared_rate, 0.0), rtol=1e-12)
+
+
+def finish(model, params, theta, dtheta):
+    state = jnp.asarray([theta, 1.0, 1.0, dtheta, 0.0, 0.0])
+    return model.finish_step(params, 2, 0.7, state, vrw.StepOptions())
+
+
+@pytest.mark.parametrize("slope", [-0.6, 0.1, 0.3])
+def test_the_rest_of_a_step_ends_as_the_whole_step(slope):
+    params = vrw.WheelParams(slope=slope)
+    for model in vrw.RigidWheel(), rigid_walks():
+        outcomes = set()
+        for rate in np.linspace(0.3, 5.5, 27):
+            step = vrw.step(params, [HALF_ANGLE, rate, 0.0], model=model)
+            rest = finish(model, params, *step.post_impact)
+            assert int(rest.outcome) == int(step.outcome)
+            np.testing.assert_allclose(rest.section_state, step.section_state, rtol=1e-13)
+            np.testing.assert_allclose(rest.durations, step.durations, rtol=1e-13)
+            outcomes.add(int(step.outcome))
+        assert len(outcomes) == 2 + (model.stop_at_lift_off and slope > 0.0)
+
+
+def test_an_invalid_rest_of_a_step_is_bad_input():
+    for state in (np.nan, 1.0), (0.0, np.inf), (2.0, 1.0):
+        result = finish(vrw.RigidWheel(), vrw.WheelParams(), *state)
+        assert int(result.outcome) == vrw.Outcome.BAD_INPUT
+        assert not np.any(result.section_state)
+        assert not np.any(result.durations)
+
+
 def test_too_fast_a_start_lifts_off():
     result = vrw.step(vrw.WheelParams(slope=0.1), [HALF_ANGLE, 6.0, 0.0], model=vrw.RigidWheel())
     assert int(result.outcome) == vrw.Outcome.LEG_1_LIFTED_OFF

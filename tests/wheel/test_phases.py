@@ -11,7 +11,7 @@ from vrw_jax.gaits import PhasePoint
 from vrw_jax.gaits import phase_sequence as sequence
 from vrw_jax.hybrid import integrate_phase
 from vrw_jax.models import viscoelastic as lane_step
-from vrw_jax.models.viscoelastic import make_diffrax_phase
+from vrw_jax.models.viscoelastic import make_element_phase
 from vrw_jax.wheel import (
     PAPER_PHASES,
     Outcome,
@@ -195,7 +195,7 @@ def test_resets_agree_with_the_collisions():
 
 def end_by_diffrax():
     phase, q, v = make_state_at(2)
-    flow = make_diffrax_phase(phase, records_margins=False)
+    flow = make_element_phase(phase, records_margins=False)
     start = jnp.stack([*q, *v])
     run = jax.jit(
         lambda y: (

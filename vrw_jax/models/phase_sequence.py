@@ -40,7 +40,13 @@ from vrw_jax.wheel.ground import (
 )
 from vrw_jax.wheel.laws import compute_motor_work
 from vrw_jax.wheel.outcomes import replace_rest_outcome
-from vrw_jax.wheel.params import MAX_SI_VALUE, PARAMETER_DOMAINS, Symbols, WheelParams
+from vrw_jax.wheel.params import (
+    MAX_SI_VALUE,
+    PARAMETER_DOMAINS,
+    Symbols,
+    WheelParams,
+    compute_wheel_units,
+)
 from vrw_jax.wheel.phases import (
     PAPER_PHASES,
     AbstractPhase,
@@ -226,11 +232,7 @@ def finish_gait_step(
       determine are ignored;
     - `engine`: name of the engine, which the result reports.
     """
-    are_inputs_bounded = [
-        jnp.abs(input_array) < MAX_SI_VALUE for input_array in (*phase_state, foot_distance)
-    ]
-    is_valid_state = params.is_in_domain() & functools.reduce(operator.and_, are_inputs_bounded)
-    is_valid_state = is_valid_state & (jnp.abs(phase_state[0]) < 0.5 * jnp.pi)
+    is_valid_state = is_valid_phase_state(params, phase_state, foot_distance)
     params, phase_state = replace_invalid_inputs(
         is_valid_state, params, phase_state, FALLBACK_SINGLE_SUPPORT_STATE
     )
@@ -362,12 +364,27 @@ def make_step_result(
 
 
 def make_trajectory(
-    phase_sequence: PhaseSequenceResult, phase_samples: Sequence[Array]
+    phase_sequence: PhaseSequenceResult, sample_phase: Callable[..., Array], options: StepOptions
 ) -> Trajectory:
     """Return the trajectory of a step, computed from samples at equidistant times of each phase.
 
-    - `phase_samples`: samples of each phase, with axes (sample, coordinates and rates, ...).
+    - `sample_phase`: function of a phase, its start, its duration and options that returns samples,
+      with axes (sample, coordinates and rates, ...).
     """
+    phase_samples = [
+        sample_phase(
+            phase,
+            *start,
+            phase_end.duration,
+            compute_wheel_units(phase.s).scale_times_to_seconds(options),
+        )
+        for phase, start, phase_end in zip(
+            phase_sequence.phases,
+            phase_sequence.phase_start_states,
+            phase_sequence.phase_end_results,
+            strict=True,
+        )
+    ]
     advance_result = make_advance_result(phase_sequence, "")
     phase_durations, n_samples = advance_result.durations, len(phase_samples[0])
     start_times = jnp.stack(
@@ -527,6 +544,17 @@ def is_valid_start_state(params: WheelParams, x: SectionStateEntries) -> Array:
         operator.and_, [jnp.abs(state_entry) < max_entry for state_entry in x]
     )
     return params.is_in_domain() & are_entries_bounded & is_angle_in_range & (angular_rate > 0.0)
+
+
+def is_valid_phase_state(
+    params: WheelParams, phase_state: Vector, foot_distance: Elementwise
+) -> Array:
+    """Return whether a step can go on from a state within one of its phases; False for NaN."""
+    are_inputs_bounded = [jnp.abs(x) < MAX_SI_VALUE for x in (*phase_state, foot_distance)]
+    is_angle_in_range = jnp.abs(phase_state[0]) < 0.5 * jnp.pi
+    return params.is_in_domain() & functools.reduce(
+        operator.and_, are_inputs_bounded, is_angle_in_range
+    )
 
 
 def replace_invalid_inputs(

@@ -1,10 +1,11 @@
 """Rigid model: all legs are rigid, so a step has a closed form and needs no integration."""
 
 import dataclasses
-from functools import partial
-from typing import ClassVar, NamedTuple
+import functools
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -17,7 +18,12 @@ from vrw_jax.base.types import Elementwise
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.lanes.autodiff import compute_square_root
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.phase_sequence import replace_invalid_inputs, select_stance_line
+from vrw_jax.models.phase_sequence import (
+    FALLBACK_SINGLE_SUPPORT_STATE,
+    is_valid_phase_state,
+    replace_invalid_inputs,
+    select_stance_line,
+)
 from vrw_jax.models.step_results import (
     AnySectionState,
     DoubleSupportIndicators,
@@ -70,10 +76,10 @@ class RigidWheel(AbstractWheel):
 
     friction: float = eqx.field(static=True, converter=require_known_friction, default=1.0)
     stop_at_lift_off: bool = eqx.field(
-        static=True, converter=partial(check_bool, "stop_at_lift_off"), default=True
+        static=True, converter=functools.partial(check_bool, "stop_at_lift_off"), default=True
     )
     held_landing: bool = eqx.field(
-        static=True, converter=partial(check_bool, "held_landing"), default=False
+        static=True, converter=functools.partial(check_bool, "held_landing"), default=False
     )
 
     def explain_impossible_gait(self, params: WheelParams) -> str:
@@ -166,41 +172,30 @@ class RigidWheel(AbstractWheel):
         s = params.symbols()
         rate_before, rate_after = x[1], self._compute_landing_rate_ratio(s) * x[1]
         rolling_motion = RollingMotion(s, params.slope, rate_after, -0.5 * s.alpha, end_angle)
-
-        apex_angle = jnp.where(s.sin_phi < jnp.sin(half_angle), -params.slope, -half_angle)
-        has_passed_apex = rolling_motion.compute_squared_rate(apex_angle) > 0.0
-        margin_minima = rolling_motion.find_margin_minima()
-        step_outcome = self._classify_rolling(has_passed_apex, margin_minima[0])
-        step_outcome = jnp.where(is_valid_step, step_outcome, jnp.int32(Outcome.BAD_INPUT))
-        has_stepped = step_outcome == Outcome.STEPPED
-        final_angular_rate, rolling_duration = rolling_motion.compute_rate_and_time_at_end(
-            has_passed_apex
-        )
+        end, margin_minima = self._finish_rolling(rolling_motion, half_angle, is_valid_step)
 
         zero_like_rate = jnp.zeros_like(rate_before)
-        zero_invalid_steps = lambda step_quantity: jnp.where(is_valid_step, step_quantity, 0.0)
-        zero_unless_stepped = lambda step_quantity: jnp.where(has_stepped, step_quantity, 0.0)
-        rear_impulse, impact_friction, stopper_impulse = self._compute_landing_impulses(
-            s, x, rolling_motion
+        zero_invalid_steps: Any = functools.partial(_zero_unless, is_valid_step)
+        zero_unless_stepped: Any = functools.partial(_zero_unless, end.is_complete)
+        rear_impulse, impact_friction, stopper_impulse = zero_invalid_steps(
+            self._compute_landing_impulses(s, x, rolling_motion)
         )
+        margin_minima = zero_unless_stepped(margin_minima)
+        friction = zero_invalid_steps(friction + zero_like_rate)
         return StepResult(
-            section_state=zero_unless_stepped(
-                jnp.stack([half_angle + zero_like_rate, final_angular_rate, zero_like_rate])
-            ),
+            section_state=end.section_state,
             post_impact=zero_invalid_steps(jnp.stack([-half_angle + zero_like_rate, rate_after])),
-            durations=zero_unless_stepped(
-                jnp.stack([zero_like_rate, zero_like_rate, rolling_duration])
-            ),
+            durations=end.durations,
             step_length=zero_invalid_steps(2.0 * s.L0 * jnp.sin(half_angle)),
             indicators=DoubleSupportIndicators(
-                lambda_I4=zero_invalid_steps(rear_impulse.normal),
+                lambda_I4=rear_impulse.normal,
                 lambda_2=zero_invalid_steps(
                     rolling_motion.compute_foot_force_at_angle(-half_angle + zero_like_rate).normal
                 ),
                 lambda_4=zero_like_rate,
             ),
             margins=Margins(
-                fore_foot_force=zero_unless_stepped(margin_minima[0]),
+                fore_foot_force=margin_minima[0],
                 takeoff_acceleration=zero_like_rate,
                 clearance_sls1=zero_like_rate,
                 clearance_sls2=zero_unless_stepped(
@@ -208,22 +203,22 @@ class RigidWheel(AbstractWheel):
                         s, rolling_motion.compute_motion_at_angle(end_angle + zero_like_rate)
                     )
                 ),
-                locked_stopper_force=zero_unless_stepped(margin_minima[3:]),
-                rear_stopper_force=zero_unless_stepped(margin_minima[2]),
+                locked_stopper_force=margin_minima[3:],
+                rear_stopper_force=margin_minima[2],
                 contraction=zero_like_rate,
-                friction_fore=zero_unless_stepped(friction + margin_minima[1]),
-                friction_rear=zero_invalid_steps(friction + zero_like_rate),
-                landing_stopper_impulse=zero_invalid_steps(stopper_impulse),
+                friction_fore=zero_unless_stepped(friction) + margin_minima[1],
+                friction_rear=friction,
+                landing_stopper_impulse=stopper_impulse,
                 hit_stopper_impulse=jnp.zeros_like(stopper_impulse),
                 hit_planted_impulse=zero_like_rate,
-                landing_friction_fore=zero_invalid_steps(friction - impact_friction[0]),
-                landing_friction_rear=zero_invalid_steps(friction - impact_friction[1]),
+                landing_friction_fore=friction - impact_friction[0],
+                landing_friction_rear=friction - impact_friction[1],
             ),
             required_friction=RequiredFriction.from_parts(
-                zero_unless_stepped(0.0 - margin_minima[1]),
+                0.0 - margin_minima[1],
                 zero_like_rate,
-                zero_invalid_steps(impact_friction[0]),
-                zero_invalid_steps(impact_friction[1]),
+                impact_friction[0],
+                impact_friction[1],
                 zero_like_rate,
             ),
             energy=EnergyLoss(
@@ -235,8 +230,8 @@ class RigidWheel(AbstractWheel):
                 stopper=zero_like_rate,
                 damping=zero_like_rate,
             ),
-            outcome=step_outcome,
-            solver_steps=jnp.zeros_like(step_outcome),
+            outcome=end.outcome,
+            solver_steps=end.solver_steps,
         )
 
     def finish_step(
@@ -248,42 +243,38 @@ class RigidWheel(AbstractWheel):
         options: StepOptions,
     ) -> AdvanceResult:
         """Compute the rest of the step from theta and its rate. The other arguments have no
-        effect.
+        effect, but must be finite.
         """
-        wheel_angle, angular_rate = phase_state[0], phase_state[3]
-        s, half_angle = params.symbols(), jnp.asarray(0.5 * params.leg_angle, wheel_angle.dtype)
-        rolling_motion = RollingMotion(s, params.slope, angular_rate, wheel_angle, half_angle)
-        apex_angle = jnp.maximum(wheel_angle, -params.slope)
-        has_passed_apex = (angular_rate > 0.0) & (
-            rolling_motion.compute_squared_rate(apex_angle) > 0.0
+        is_valid_state = is_valid_phase_state(params, tuple(phase_state), foot_distance)
+        params, (theta, _, _, dtheta, _, _) = replace_invalid_inputs(
+            is_valid_state, params, tuple(phase_state), FALLBACK_SINGLE_SUPPORT_STATE
         )
-        sampled_angles = jnp.linspace(wheel_angle, half_angle, N_ANGLES_PER_ZOOM_ROUND)
-        lowest_normal_force = jnp.min(
-            rolling_motion.compute_foot_force_at_angle(sampled_angles).normal
-        )
-        step_outcome = self._classify_rolling(has_passed_apex, lowest_normal_force)
-        has_stepped, zero_like_angle = step_outcome == Outcome.STEPPED, jnp.zeros_like(angular_rate)
-        final_angular_rate, rolling_duration = rolling_motion.compute_rate_and_time_at_end(
-            has_stepped
-        )
-        section_state = jnp.stack(
-            [half_angle + zero_like_angle, final_angular_rate, zero_like_angle]
-        )
-        phase_durations = jnp.stack([zero_like_angle, zero_like_angle, rolling_duration])
-        return AdvanceResult(
-            section_state=jnp.where(has_stepped, section_state, 0.0),
-            durations=jnp.where(has_stepped, phase_durations, 0.0),
-            outcome=step_outcome,
-            solver_steps=jnp.zeros_like(step_outcome),
-        )
+        half_angle = jnp.asarray(0.5 * params.leg_angle, theta.dtype)
+        rolling_motion = RollingMotion(params.symbols(), params.slope, dtheta, theta, half_angle)
+        return self._finish_rolling(rolling_motion, half_angle, is_valid_state)[0]
 
-    def _classify_rolling(self, has_passed_apex: Array, lowest_normal_force: Array) -> Array:
-        """Return the outcome of a valid step, which fails if the wheel falls back or lifts off."""
-        step_outcome = jnp.where(
-            has_passed_apex, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.FELL_BACK)
+    def _finish_rolling(
+        self, rolling_motion: "RollingMotion", half_angle: Array, is_valid: Array
+    ) -> tuple[AdvanceResult, Array]:
+        """Return the end of a rolling motion, and the minima of its margins.
+
+        The step fails if the wheel falls back or lifts off.
+        """
+        margin_minima = rolling_motion.find_margin_minima()
+        reaches_end = rolling_motion.reaches_end()
+        lifts_off = (margin_minima[0] <= 0.0) & self.stop_at_lift_off
+        outcome = jnp.where(reaches_end, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.FELL_BACK))
+        outcome = jnp.where(reaches_end & lifts_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
+        outcome = jnp.where(is_valid, outcome, jnp.int32(Outcome.BAD_INPUT))
+        rate, duration = rolling_motion.compute_rate_and_time_at_end(reaches_end)
+        zero = jnp.zeros_like(rolling_motion.initial_rate)
+        section_state, durations = _zero_unless(
+            outcome == Outcome.STEPPED,
+            (jnp.stack([half_angle + zero, rate, zero]), jnp.stack([zero, zero, duration])),
         )
-        has_lifted_off = has_passed_apex & (lowest_normal_force <= 0.0) & self.stop_at_lift_off
-        return jnp.where(has_lifted_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), step_outcome)
+        return AdvanceResult(
+            section_state, durations, outcome, jnp.zeros_like(outcome)
+        ), margin_minima
 
     def _compute_landing_impulses(
         self,
@@ -478,6 +469,13 @@ class RollingMotion(eqx.Module):
         )
         return self.initial_rate**2 + 2.0 * _compute_gravity_stiffness(s) * height_drop
 
+    def reaches_end(self) -> Array:
+        """Return whether the wheel rolls forward to the end angle, past the highest position of the
+        hub on its way.
+        """
+        apex_angle = jnp.clip(-self.phi, self.first_angle, self.end_angle)
+        return (self.initial_rate > 0.0) & (self.compute_squared_rate(apex_angle) > 0.0)
+
     def compute_time_to_angle(self, theta: Elementwise) -> Elementwise:
         """Return the time between the first angle and theta, s, computed with Carlson's R_F.
 
@@ -633,6 +631,10 @@ class RollingMotion(eqx.Module):
         return self.evaluate_margins_at_angles(lax.stop_gradient(minimum_angles))
 
 
+def _zero_unless(condition: Array, tree: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.where(condition, x, 0.0), tree)
+
+
 def _compute_hub_inertia(s: Symbols) -> Elementwise:
     """Return the moment of inertia of all leg masses about the hub, n m (L0 - a)^2, kg m^2."""
     return s.n * s.m * s.c0**2
@@ -674,8 +676,10 @@ def _compute_rolling_time(
     larger_half_angle = jnp.sqrt(jnp.where(has_nonzero_range, last_half_angle_squared, 1.0))
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
     x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
-    y3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * y1**2, 1e-300))
-    x3 = jnp.sqrt(jnp.maximum(min_rate_squared + 2.0 * kappa * x1**2, 1e-300))
+    y3, x3 = (
+        jnp.sqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))
+        for square in (min_rate_squared + 2.0 * kappa * sine**2 for sine in (y1, x1))
+    )
     squared_sine_difference = x1**2 - y1**2
     u12 = (x1 * x2 * y3 + y1 * y2 * x3) / squared_sine_difference
     u13 = (x1 * x3 * y2 + y1 * y3 * x2) / squared_sine_difference

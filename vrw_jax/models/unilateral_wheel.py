@@ -385,14 +385,14 @@ _embed_section_compiled = jax.jit(lambda params, x: embed_section_state(params.s
 def _compile_step(is_detailed: bool, engine: str, measures_force_peaks: bool) -> Callable:
     """Return a compiled function of (wheel, params, x, options), differentiable in any mode."""
     settings = is_detailed, engine, measures_force_peaks
-    take_diffrax_step = call_with_one_lane(
+    take_element_step = call_with_one_lane(
         partial(take_contact_steps, partial(prepare_walk, *settings, True))
     )
-    take_tight_step = lambda *arguments: take_diffrax_step(
+    take_tight_step = lambda *arguments: take_element_step(
         *arguments[:-1], arguments[-1].with_derivative_tolerances()
     )
     if engine == "diffrax":
-        return lanes.differentiate(take_diffrax_step, take_tight_step)
+        return lanes.differentiate(take_element_step, take_tight_step)
     prepare = partial(prepare_walk, *settings, False)
     return lanes.differentiate(
         lanes.jit_batch(partial(take_contact_steps, prepare)),

@@ -2,8 +2,9 @@
 
 Its step consists of a landing, double support, single support I, a stopper collision and single
 support II. Machine code computes the step for batches, and on other devices the same source runs by
-XLA. In this source, each array holds one quantity for all wheels. diffrax computes steps with
-implicit solvers, and second and higher derivatives.
+XLA. In this source, each array holds one quantity for all wheels. For second and higher
+derivatives, for implicit solvers, and with `engine="diffrax"`, functions named after an element
+integrate equations of first order for one wheel instead.
 """
 
 import dataclasses
@@ -142,36 +143,27 @@ class ViscoelasticWheel(AbstractWheel):
         params = self.attach_laws(params)
         if can_use_batch_kernel(options):
             return _compile_sampling(self.stop_at_lift_off, n_samples)(params, x, options)
-        return self._sample_by_diffrax(params, x, options, n_samples)
+        return self._sample_element(params, x, options, n_samples)
 
-    def _sample_by_diffrax(
+    def _sample_element(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
     ) -> Trajectory:
         phase_sequence = self._run_phases(params, x, options, records_margins=False)
-        phase_samples = []
-        for phase, phase_start, phase_end in zip(
-            phase_sequence.phases,
-            phase_sequence.phase_start_states,
-            phase_sequence.phase_end_results,
-            strict=True,
-        ):
-            phase_samples.append(
-                sample_phase(
-                    make_diffrax_phase(phase, records_margins=False).vector_field,
-                    jnp.stack([*phase_start[0], *phase_start[1]]),
-                    phase_end.duration,
-                    n_samples,
-                    compute_wheel_units(phase.s).scale_times_to_seconds(options),
-                    jnp.stack(phase.coordinate_units),
-                )
-            )
-        return make_trajectory(phase_sequence, phase_samples)
+        sample = lambda phase, q, v, duration, options: sample_phase(
+            make_element_phase(phase, records_margins=False).vector_field,
+            jnp.stack([*q, *v]),
+            duration,
+            n_samples,
+            options,
+            jnp.stack(phase.coordinate_units),
+        )
+        return make_trajectory(phase_sequence, sample, options)
 
     def _run_phases(
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
-        """Integrate all phases of a step with diffrax and return their starts and ends."""
-        phase_runner = _make_diffrax_phase_runner(options, records_margins)
+        """Integrate all phases of a step of one wheel and return their starts and ends."""
+        phase_runner = _make_element_phase_runner(options, records_margins)
         return run_step_phases(phase_runner, params, tuple(x), options, self.stop_at_lift_off)
 
     def finish_step(
@@ -184,11 +176,11 @@ class ViscoelasticWheel(AbstractWheel):
     ) -> AdvanceResult:
         params = self.attach_laws(params)
 
-        def finish_by_diffrax(
+        def finish_element_step(
             params: WheelParams, foot_distance: Array, phase_state: Array, options: StepOptions
         ) -> AdvanceResult:
             return finish_gait_step(
-                _make_diffrax_phase_runner(options, records_margins=False),
+                _make_element_phase_runner(options, records_margins=False),
                 params,
                 phase_index,
                 foot_distance,
@@ -200,13 +192,13 @@ class ViscoelasticWheel(AbstractWheel):
 
         inputs = params, jnp.asarray(foot_distance), phase_state, options
         if not can_use_batch_kernel(options):
-            return finish_by_diffrax(*inputs)
+            return finish_element_step(*inputs)
         finish_lane_steps = functools.partial(
             _finish_lane_steps, self.stop_at_lift_off, phase_index
         )
         return lanes.differentiate(
             lanes.jit_batch(finish_lane_steps),
-            finish_by_diffrax,
+            finish_element_step,
             functools.partial(_make_column_function, finish_lane_steps),
         )(*inputs)
 
@@ -236,8 +228,8 @@ def _compile_step(model: ViscoelasticWheel, engine: str, records_margins: bool) 
     - `records_margins`: whether the results include indicators, margins and energies.
     """
 
-    def take_diffrax_step(params: WheelParams, x: SectionState, options: StepOptions) -> Any:
-        """Compute a step with diffrax.
+    def take_element_step(params: WheelParams, x: SectionState, options: StepOptions) -> Any:
+        """Compute a step of one wheel.
 
         If the batch kernel is the engine, this function is used only for second and higher
         derivatives. The results still report the name of the batch kernel's engine.
@@ -249,11 +241,11 @@ def _compile_step(model: ViscoelasticWheel, engine: str, records_margins: bool) 
             else make_advance_result(phase_sequence, engine)
         )
 
-    take_tight_step = lambda params, x, options: take_diffrax_step(
+    take_tight_step = lambda params, x, options: take_element_step(
         params, x, options.with_derivative_tolerances()
     )
     if engine == "diffrax":
-        return lanes.differentiate(take_diffrax_step, take_tight_step)
+        return lanes.differentiate(take_element_step, take_tight_step)
     take_lane_steps = functools.partial(
         take_steps_of_lanes, model.stop_at_lift_off, model.friction if records_margins else None
     )
@@ -271,7 +263,7 @@ def _compile_sampling(stop_at_lift_off: bool, n_samples: int) -> Callable:
     model = ViscoelasticWheel(stop_at_lift_off=stop_at_lift_off)
     return lanes.differentiate(
         lanes.jit_batch(sample_lane_steps),
-        lambda params, x, options: model._sample_by_diffrax(
+        lambda params, x, options: model._sample_element(
             params, x, options.with_derivative_tolerances(), n_samples
         ),
         functools.partial(_make_column_function, sample_lane_steps),
@@ -365,23 +357,10 @@ def _sample_lane_steps(
 ) -> Trajectory:
     """Return samples of a batch of walking steps at equidistant times of each phase."""
     phase_sequence, tableau = _run_lane_phases(stop_at_lift_off, False, params, x, options)
-    phase_samples = [
-        sample_batch_phase(
-            make_batch_phase(phase, False),
-            tableau,
-            *phase_start,
-            phase_end.duration,
-            n_samples,
-            compute_wheel_units(phase.s).scale_times_to_seconds(options),
-        )
-        for phase, phase_start, phase_end in zip(
-            phase_sequence.phases,
-            phase_sequence.phase_start_states,
-            phase_sequence.phase_end_results,
-            strict=True,
-        )
-    ]
-    return make_trajectory(phase_sequence, phase_samples)
+    sample = lambda phase, q, v, duration, options: sample_batch_phase(
+        make_batch_phase(phase, False), tableau, q, v, duration, n_samples, options
+    )
+    return make_trajectory(phase_sequence, sample, options)
 
 
 class _NextPhaseInputs(NamedTuple):
@@ -629,10 +608,8 @@ def _run_lane_phases(
     ), tableau
 
 
-class DiffraxPhaseFunctions(NamedTuple):
-    """Functions that the diffrax integrator calls for a phase. The state y = (q, v) is one
-    vector.
-    """
+class ElementPhase(NamedTuple):
+    """Equations of first order of a phase of one wheel. The state y = (q, v) is one vector."""
 
     motion_unpacker: Callable[[StateArray], Motion]
     vector_field: VectorField
@@ -640,8 +617,8 @@ class DiffraxPhaseFunctions(NamedTuple):
     kinks: PhaseKinks | None
 
 
-def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPhaseFunctions:
-    """Return the functions of a phase that the diffrax integrator calls.
+def make_element_phase(phase: AbstractPhase, records_margins: bool) -> ElementPhase:
+    """Return the functions of a phase that `flow.phase_integration` calls.
 
     - `records_margins`: whether the integrator also evaluates margins.
     """
@@ -662,10 +639,10 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
     )
 
     def enter_sides(sides: Vector) -> tuple[VectorField, Callable]:
-        functions = make_diffrax_phase(phase.on_sides(sides), records_margins)
+        functions = make_element_phase(phase.on_sides(sides), records_margins)
         return functions.vector_field, functions.guards.evaluate_guards_and_margins
 
-    return DiffraxPhaseFunctions(
+    return ElementPhase(
         phase.unpack_motion,
         evaluate_vector_field,
         guards_and_margins,
@@ -675,21 +652,24 @@ def make_diffrax_phase(phase: AbstractPhase, records_margins: bool) -> DiffraxPh
     )
 
 
-def _make_diffrax_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
-    """Return a function that integrates one phase to its end with diffrax."""
+def _make_element_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
+    """Return a function that integrates one phase of one wheel to its end.
+
+    diffrax takes the steps of implicit solvers, and of all solvers with `engine="diffrax"`.
+    """
 
     def run_phase(
         phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: PhaseResult | None
     ) -> PhaseResult:
-        diffrax_phase = make_diffrax_phase(phase, records_margins)
+        element_phase = make_element_phase(phase, records_margins)
         phase_end = integrate_phase(
-            diffrax_phase.vector_field,
-            diffrax_phase.guards,
+            element_phase.vector_field,
+            element_phase.guards,
             jnp.stack([*q, *v]),
             is_phase_active,
             compute_wheel_units(phase.s).scale_times_to_seconds(options),
             jnp.stack(phase.coordinate_units),
-            diffrax_phase.kinks,
+            element_phase.kinks,
         )
         end_state = tuple(phase_end.state)
         return PhaseResult(
