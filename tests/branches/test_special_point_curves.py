@@ -20,7 +20,7 @@ from vrw_jax.branches.curve_problems import (
 )
 from vrw_jax.branches.map_branch import MapContinuation
 from vrw_jax.branches.special_point_curves import continue_special_points
-from vrw_jax.branches.walker_curves import check_parameter_plane
+from vrw_jax.branches.walker_curves import check_curve_arguments
 
 CURVE_OPTIONS = ArclengthOptions(max_points=400, max_ds=0.05)
 BATCH_SIZE = 8
@@ -114,7 +114,7 @@ def assert_through_the_branch(curve):
 
 def test_the_bounds_of_a_parameter_are_read_once():
     bounds = {"damping": map(float, ("100", "200")), "slope": (0.2, 0.3)}
-    _, ranges = check_parameter_plane(("damping", "slope"), bounds, str, {})
+    _, ranges, *_ = check_curve_arguments(("damping", "slope"), bounds, str, {}, None, None)
     np.testing.assert_array_equal(ranges, [[100.0, 200.0], [0.2, 0.3]])
 
 

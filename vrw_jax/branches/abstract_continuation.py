@@ -133,7 +133,7 @@ class AbstractContinuation(abc.ABC):
         tangent = np.append(tangent, point.fraction_rate)
         return FixedPoint(section_state, float(point.p), point.return_map_jacobian, tangent)
 
-    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable | None:
+    def make_point_reader(self, owner: int, point: ContinuationPoint) -> Callable | None:
         """Return a function that finds the gait at a point, or None if no gait can be found."""
         return None
 

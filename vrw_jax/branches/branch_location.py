@@ -612,7 +612,7 @@ def continue_and_locate_special_points(
             root.parameter,
             continuation.make_fixed_point(beside),
             ends_branch,
-            continuation.make_cycle_finder(int(root.beside.owners[0]), beside),
+            continuation.make_point_reader(int(root.beside.owners[0]), beside),
             root.n_multipliers,
         )
 

@@ -96,7 +96,7 @@ class BranchStart(NamedTuple):
     z: np.ndarray
     outcomes: np.ndarray  # outcomes of the first gaits
     # function of (wheel index, point) that returns a function, which finds the gait at the point
-    make_cycle_finder: Callable | None = None
+    make_point_reader: Callable | None = None
     cycles: Any = None  # the first gaits
     # None for a problem without a mesh
     finer_cycle_options: CycleOptions | None = None
@@ -201,7 +201,7 @@ def _find_collocation_starts(
         shapes=tuple(x.shape[1:] for x in jax.tree.leaves(solution)),
     )
 
-    def make_cycle_finder(wheel_index: int, point: ContinuationPoint) -> Callable[[], LimitCycle]:
+    def make_point_reader(wheel_index: int, point: ContinuationPoint) -> Callable[[], LimitCycle]:
         wheel, state = select_tree_rows((params, cycle.collocation_state), wheel_index)
         # A partial call can be pickled.
         return functools.partial(
@@ -221,7 +221,7 @@ def _find_collocation_starts(
         ),
         problem.pack(solution),
         np.asarray(cycle.outcome),
-        make_cycle_finder,
+        make_point_reader,
         cycle,
         cycle_options.refine_mesh(),
     )
@@ -286,7 +286,7 @@ def split_legs(quantities: QuantitiesByName, n_legs: int) -> QuantitiesByName:
 class GaitContinuation(AbstractContinuation):
     """Continuation of gaits."""
 
-    cycle_finder: Callable | None  # see `BranchStart.make_cycle_finder`
+    cycle_finder: Callable | None  # see `BranchStart.make_point_reader`
 
     test_functions: ClassVar[Mapping[str, TestFunction]] = GAIT_TEST_FUNCTIONS
     linear_margin_substitutes: ClassVar[Mapping[str, str]] = {
@@ -299,7 +299,7 @@ class GaitContinuation(AbstractContinuation):
     cannot resolve the shallowest descents, but the linear quantity changes its sign.
     """
 
-    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable | None:
+    def make_point_reader(self, owner: int, point: ContinuationPoint) -> Callable | None:
         return self.cycle_finder and self.cycle_finder(owner, point)
 
     def evaluate_point_quantities(
@@ -409,7 +409,7 @@ def continue_branch(
         )  # fmt: skip
     if margins or switch_at is not None:
         raise ValueError(
-            "margins and switch_at are for a HybridSystem, but the model is a wheel: leave them "
+            "margins and switch_at are for a walker of yours, but the model is a wheel: leave them "
             "out, and give cycle=vrw.limit_cycle(..., period_n=2) for gaits of two steps."
         )
     require_single_wheel(params, "use vrw.continue_branches for a batch")
@@ -472,7 +472,7 @@ def continue_branches(
         >>> [round(branch.special_points[-1].value, 4) for branch in branches]
         [219.8477, 219.8477]
     """
-    require_untraced_arguments("vrw.continue_branch", DIFFERENTIATION_ADVICE, params, cycle)
+    require_untraced_arguments("vrw.continue_branches", DIFFERENTIATION_ADVICE, params, cycle)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     model, step_options = (
         convert_model_argument(model),
@@ -598,7 +598,7 @@ def _continue_gait_branches(
                 options,
                 start.wheels,
                 bounds,
-                start.make_cycle_finder,
+                start.make_point_reader,
             ),
             start.z,
             np.asarray(parameter_values),

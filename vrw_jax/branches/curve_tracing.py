@@ -514,7 +514,7 @@ def choose_continued_special_point_name(
 
 
 def can_continue_special_point(special_point_name: str) -> bool:
-    """Return whether `GaitTestFunction` can continue the named special point as a curve."""
+    """Return whether the named special point can be continued as a curve."""
     continued_special_point_names = (
         *BIFURCATIONS,
         *DISCONTINUOUS_QUANTITIES,

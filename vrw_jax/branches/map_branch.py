@@ -455,7 +455,7 @@ class HybridContinuation(AbstractMapContinuation):
         parameters = {x.name: x for x in list_tree_parameters(self.wheels)}
         return parameters[self.name].domain.unit
 
-    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Callable:
+    def make_point_reader(self, owner: int, point: ContinuationPoint) -> Callable:
         params = replace_tree_parameter(
             jax.tree.map(lambda leaf: leaf[owner], self.wheels), self.name, float(point.p)
         )

@@ -38,12 +38,14 @@ from vrw_jax.branches.curve_tracing import (
     TracedCurve,
     compute_distances_to_polyline,
 )
-from vrw_jax.branches.map_branch import MarginFunctions, check_arclength_options
+from vrw_jax.branches.map_branch import MarginFunctions
 from vrw_jax.branches.test_functions import BIFURCATIONS
 from vrw_jax.branches.walker_curves import (
     DEFAULT_CURVE_OPTIONS,
-    check_parameter_plane,
+    UNTRACED_CURVE_TEXT,
+    check_curve_arguments,
     continue_walker_special_point,
+    find_nearest_points,
 )
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.walker_finder import HybridGait
@@ -147,8 +149,8 @@ def continue_special_points(
     """
     known_names = cycle.model.parameter_names if isinstance(cycle, LimitCycle) else PARAMETER_NAMES
     check_name = lambda name: check_parameter_name(name, known_names, "parameter")
-    parameters, limits = check_parameter_plane(
-        parameters, bounds, check_name, DEFAULT_PARAMETER_BOUNDS
+    parameters, limits, options, step_options = check_curve_arguments(
+        parameters, bounds, check_name, DEFAULT_PARAMETER_BOUNDS, options, step_options
     )
     check_type(
         "cycle",
@@ -160,9 +162,6 @@ def continue_special_points(
         raise ValueError(
             f"the gait has {cycle.period_n} steps, but a curve needs a gait of one step: give one."
         )
-    options = check_arclength_options(options, DEFAULT_CURVE_OPTIONS)
-    step_options = StepOptions.tight() if step_options is None else step_options
-    check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
     curve_tracer = CurveTracer(
         parameters,
         np.array(limits),
@@ -172,28 +171,17 @@ def continue_special_points(
         measures_force_peaks=not set(names).isdisjoint(FORCE_QUANTITY_NAMES),
     )
     params = cycle.system.make_wheel(cycle.parameters)
-    seeds: dict[str, CurveSeed] = {}
-    for i, parameter_name in enumerate(parameters):
-        if set(names) - set(seeds):
-            start_value = float(cycle.model.get_parameter(params, parameter_name))
-            found = curve_tracer.find_seeds(i, *select_tree_rows((params, cycle), None))
-            # The nearest seed of each name comes last and replaces the others.
-            found.sort(key=lambda x: -abs(x.parameter_values[i] - start_value))
-            seeds = {seed.special_point_name: seed for seed in found} | seeds
-    missing = sorted(set(names) - set(seeds))
-    if missing:
-        raise ValueError(
-            f"no special point {missing[0]!r} on branches along {parameters[0]} and "
-            f"{parameters[1]} within their bounds (found: {', '.join(sorted(seeds)) or 'none'}): "
-            "give a gait nearer to it, or wider bounds."
-        )
+    start_values = [float(cycle.model.get_parameter(params, x)) for x in parameters]
+    batch = select_tree_rows((params, cycle), None)
+    find_on_branch = lambda i: [
+        (seed.special_point_name, seed.parameter_values[i], seed)
+        for seed in curve_tracer.find_seeds(i, *batch)
+    ]
+    seeds = find_nearest_points(names, parameters, start_values, find_on_branch)
     traced = curve_tracer.trace_curves([seeds[name] for name in names], ())
     curves = {x.special_point_curve.name: x.special_point_curve for x in traced}
     for name in sorted(set(names) - set(curves)):
-        raise ValueError(
-            f"special point {name} at {seeds[name].parameter_values[0]:.9g} can't be continued: "
-            "give a gait nearer to the special point."
-        )
+        raise ValueError(UNTRACED_CURVE_TEXT.format(name, seeds[name].parameter_values[0]))
     return tuple(curves[name] for name in names)
 
 

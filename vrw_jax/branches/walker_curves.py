@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -26,7 +26,7 @@ from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.walker import AbstractWalker, make_return_map
 from vrw_jax.branches.abstract_continuation import AbstractContinuation, QuantitiesByName
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
-from vrw_jax.branches.branch import Codim2Point, SpecialPoint, SpecialPointCurve
+from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation_problems import MapProblem
 from vrw_jax.branches.curve_problems import (
@@ -113,7 +113,7 @@ class AbstractCurveContinuation(AbstractContinuation):
         RANGE_EDGE: TestFunction("lost", "The second parameter's range ends.", True)
     }
 
-    def make_cycle_finder(self, owner: int, point: ContinuationPoint) -> Any:
+    def make_point_reader(self, owner: int, point: ContinuationPoint) -> Any:
         return lambda: point
 
     def add_second_parameter(
@@ -177,11 +177,10 @@ def continue_walker_special_point(
             "a curve needs a gait of a walker without invariants, but "
             f"{'the walker has some' if walker.invariants else gait.why}: give another gait."
         )
-    options = check_arclength_options(options, DEFAULT_CURVE_OPTIONS)
-    step_options = StepOptions.tight() if step_options is None else step_options
-    check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
     find_leaf = functools.partial(find_tree_parameter, params)
-    names, limits = check_parameter_plane(parameters, bounds, find_leaf, {})
+    names, limits, options, step_options = check_curve_arguments(
+        parameters, bounds, find_leaf, {}, options, step_options
+    )
     start_values = [jax.tree.leaves(params)[find_leaf(name)] for name in names]
     for parameter_name, value, (lower, upper) in zip(names, start_values, limits, strict=True):
         if np.ndim(value) or not lower <= value <= upper:
@@ -190,17 +189,15 @@ def continue_walker_special_point(
                 f"within the bounds: give one in [{lower:g}, {upper:g}]."
             )
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
-    values, start = _find_start(
-        walker,
-        params,
-        name,
-        names,
-        list(map(float, start_values)),
-        limits,
-        gait,
-        step_options,
-        margins,
-    )
+    find_on_branch = lambda i: [
+        (point.name, point.value, (i, point))
+        for point in continue_hybrid_branch(
+            walker, params, names[i], limits[i], gait, 1, step_options, None, margins, None, ()
+        ).special_points
+    ]
+    values = np.array(start_values, float)
+    i, start = find_nearest_points((name,), names, values, find_on_branch)[name]
+    values[i] = start.value
 
     def map_section_state(params: Any, x: Array, values: Array) -> Array:
         for i, parameter_name in enumerate(names):
@@ -232,10 +229,7 @@ def continue_walker_special_point(
         np.array([True]),
     )
     if data is None:
-        raise ValueError(
-            f"special point {name} at {start.value:.9g} can't be continued: give a gait nearer to "
-            "the special point."
-        )
+        raise ValueError(UNTRACED_CURVE_TEXT.format(name, start.value))
     quantities = data.quantities
     columns = {"period": quantities["period"], **{key: quantities[key] for key in margins or {}}}
     dataset = xr.Dataset(
@@ -257,13 +251,15 @@ def continue_walker_special_point(
     return SpecialPointCurve(name, names, dataset, codim2_points, data.end_reasons)
 
 
-def check_parameter_plane(
+def check_curve_arguments(
     parameters: Any,
     bounds: Any,
     check_name: Callable[[str], object],
     default_bounds: Mapping[str, tuple[float, float]],
-) -> tuple[tuple[str, str], list[tuple[float, float]]]:
-    """Return the names of two parameters and their bounds, or raise an error.
+    options: ArclengthOptions | None,
+    step_options: StepOptions | None,
+) -> tuple[tuple[str, str], list[tuple[float, float]], ArclengthOptions, StepOptions]:
+    """Return the names of two parameters, their bounds, and the options, or raise an error.
 
     - `check_name`: function that raises an error for the name of no parameter.
     """
@@ -280,38 +276,42 @@ def check_parameter_plane(
         if name not in limits:
             raise ValueError(f"bounds has no {name!r}: give (lower, upper) of each parameter.")
         limits[name] = check_range(f"bounds[{name!r}]", limits[name])
+    options = check_arclength_options(options, DEFAULT_CURVE_OPTIONS)
+    step_options = StepOptions.tight() if step_options is None else step_options
+    check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
     first, second = names
-    return (first, second), [limits[first], limits[second]]
+    return (first, second), [limits[first], limits[second]], options, step_options
 
 
-def _find_start(
-    walker: AbstractWalker,
-    params: Any,
-    name: str,
-    names: tuple[str, str],
-    start_values: list[float],
-    limits: list[tuple[float, float]],
-    gait: HybridGait,
-    step_options: StepOptions,
-    margins: MarginFunctions | None,
-) -> tuple[np.ndarray, SpecialPoint]:
-    """Return the values of both parameters, and the special point nearest to the gait.
+UNTRACED_CURVE_TEXT = (
+    "special point {} at {:.9g} can't be continued: give a gait nearer to the special point."
+)
 
-    The point is on a branch in the first parameter, or else on one in the second.
+
+def find_nearest_points(
+    names: Sequence[str],
+    parameters: tuple[str, str],
+    start_values: Any,
+    find_on_branch: Callable[[int], list],
+) -> dict[str, Any]:
+    """Return the special points nearest to a gait by name, or raise an error.
+
+    They are on a branch in the first parameter, or else on one in the second.
+
+    - `start_values`: values of both parameters at the gait;
+    - `find_on_branch`: function of the index of a parameter that returns the name, the value of the
+      parameter and data of each special point on the branch.
     """
-    found_names: list[str] = []
-    for i, bounds in enumerate(limits):
-        branch = continue_hybrid_branch(
-            walker, params, names[i], bounds, gait, 1, step_options, None, margins, None, ()
+    nearest: dict[str, Any] = {}
+    for i, start_value in enumerate(start_values):
+        if not nearest.keys() >= {*names}:
+            # The nearest point of each name comes last and replaces the others.
+            found = sorted(find_on_branch(i), key=lambda x: -abs(x[1] - start_value))
+            nearest = {name: point for name, _, point in found} | nearest
+    for name in sorted({*names} - nearest.keys()):
+        raise ValueError(
+            f"no special point {name!r} on branches along {' and '.join(parameters)} within their "
+            f"bounds (found: {', '.join(sorted(nearest)) or 'none'}): give a gait nearer to it, or "
+            "wider bounds."
         )
-        points = [point for point in branch.special_points if point.name == name]
-        if points:
-            start = min(points, key=lambda point: abs(point.value - start_values[i]))
-            start_values[i] = start.value
-            return np.array(start_values), start
-        found_names += [point.name for point in branch.special_points]
-    raise ValueError(
-        f"no special point {name!r} on branches along {names[0]} and {names[1]} within their "
-        f"bounds (found: {', '.join(sorted(set(found_names))) or 'none'}): give a gait nearer to "
-        "it, or wider bounds."
-    )
+    return nearest
