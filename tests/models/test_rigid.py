@@ -8,7 +8,7 @@ from scipy import integrate, special
 from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
-from vrw_jax.models.rigid import evaluate_carlson_rf
+from vrw_jax.models.rigid import _compute_rolling_time, evaluate_carlson_rf
 
 HALF_ANGLE = np.pi / 8
 # Point mass at the hub, l = 1, g = 9.8, slope 0.15: Tedrake, Underactuated Robotics.
@@ -71,6 +71,14 @@ def test_carlsons_integral_agrees_with_scipy():
     np.testing.assert_allclose(
         jax.vmap(evaluate_carlson_rf)(x, y, z), special.elliprf(x, y, z), rtol=1e-14
     )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_time_to_an_angle_out_of_reach_has_finite_derivatives(dtype):
+    arguments = [jnp.asarray(x, dtype) for x in (0.01, 0.01, -20.0, 5.0)]
+    value, gradient = jax.value_and_grad(_compute_rolling_time, argnums=(0, 1, 2, 3))(*arguments)
+    assert value == 0.0
+    assert np.all(np.isfinite(gradient))
 
 
 def test_too_slow_a_start_falls_back():

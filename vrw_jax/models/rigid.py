@@ -676,9 +676,10 @@ def _compute_rolling_time(
     larger_half_angle = jnp.sqrt(jnp.where(has_nonzero_range, last_half_angle_squared, 1.0))
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
     x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
+    # Where the wheel does not get, any rate keeps the masked derivatives finite.
     y3, x3 = (
-        jnp.sqrt(jnp.maximum(square, jnp.finfo(square.dtype).tiny))
-        for square in (min_rate_squared + 2.0 * kappa * sine**2 for sine in (y1, x1))
+        jnp.sqrt(jnp.where(squared_rate > 0.0, squared_rate, 1.0))
+        for squared_rate in (min_rate_squared + 2.0 * kappa * sine**2 for sine in (y1, x1))
     )
     squared_sine_difference = x1**2 - y1**2
     u12 = (x1 * x2 * y3 + y1 * y2 * x3) / squared_sine_difference
