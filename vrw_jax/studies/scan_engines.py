@@ -15,7 +15,7 @@ then evaluated with unilateral contact.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
 from threading import Lock
@@ -108,6 +108,43 @@ class EvaluationRequest(NamedTuple):
             rows[:, model.parameter_names.index(name)] = samples
         return rows
 
+    def make_gait_finder(self) -> Any:
+        """Return the finder of gaits, whose programs do not depend on the values of a law.
+
+        These values are in the rows of parameters.
+        """
+        return make_finder(
+            self.wheel_model.without_values(),
+            self.base_wheel.n_legs,
+            period_n=self.wheel_model.leg_period,
+            cycle_options=self.cycle_options,
+            step_options=self.step_options,
+        )
+
+    @property
+    def direct_names(self) -> tuple[str, ...]:
+        """Return the names of the measures that are no derivatives, and of the spectral radius."""
+        names = (name for name in self.measure_names if parse_derivative(name) is None)
+        return tuple(dict.fromkeys((*names, "spectral_radius")))
+
+    def read_derivatives(
+        self, differentiate: Callable[..., Mapping[str, Any]], model: Any
+    ) -> dict[str, Any]:
+        """Return the requested derivatives by the names of their variables.
+
+        - `differentiate`: function of names of measures that returns the derivatives of each
+          measure by all parameters of the model, (samples, parameters).
+        """
+        derivatives = list(filter(None, map(parse_derivative, self.measure_names)))
+        if not derivatives:
+            return {}
+        jacobians = differentiate(tuple(dict.fromkeys(x.measure_name for x in derivatives)))
+        index = model.parameter_names.index
+        return {
+            x.variable_name: jacobians[x.measure_name][:, index(x.parameter_name)]
+            for x in derivatives
+        }
+
 
 class CollocationScanEngine:
     """Scan engine for the paper's model and a fixed set of measures, compiled on the first call.
@@ -124,14 +161,7 @@ class CollocationScanEngine:
         - `n_threads`: number of CPU threads, by default one per core.
         """
         self._request, devices = request, jax.local_devices()
-        # The values of a law are in the rows, so that its programs do not depend on them.
-        self._finder: Any = make_finder(
-            request.wheel_model.without_values(),
-            request.base_wheel.n_legs,
-            period_n=request.wheel_model.leg_period,
-            cycle_options=request.cycle_options,
-            step_options=request.step_options,
-        )
+        self._finder = request.make_gait_finder()
         self.evaluate_cycles = self._make_cycle_function(self._finder)
         self.evaluate_steps: Callable = jax.vmap(
             functools.partial(_evaluate_step, self._finder, request.measure_names),
@@ -367,36 +397,21 @@ def _evaluate_contact_block(
     rows = rows[has_enough_friction] if has_enough_friction.any() else rows[:1]
     slow_gaits = find_slow_gaits(gait_finder, rows)
     make_reader = functools.partial(MeasureReader, gait_finder.measure_reader)
-    derivatives = list(filter(None, map(parse_derivative, evaluation_request.measure_names)))
-    names = [name for name in evaluation_request.measure_names if parse_derivative(name) is None]
-    read_gaits = functools.partial(_read_gait_measures, make_reader((*names, "spectral_radius")))
+    read_gaits = functools.partial(
+        _read_gait_measures, make_reader(evaluation_request.direct_names)
+    )
     results = map_in_batches(read_gaits, batch_size, slow_gaits)
-    if derivatives:
-        names = list(dict.fromkeys(derivative.measure_name for derivative in derivatives))
-        _, jacobians = map_in_batches(
-            functools.partial(evaluate_on_gaits, make_reader(tuple(names))),
-            batch_size,
-            gait_finder.find_gaits(jnp.asarray(rows), slow_gaits.section_state),
-        )
-        results |= _select_derivatives(derivatives, jacobians, model.parameter_names)
+    differentiate = lambda names: map_in_batches(
+        functools.partial(evaluate_on_gaits, make_reader(names)),
+        batch_size,
+        gait_finder.find_gaits(jnp.asarray(rows), slow_gaits.section_state),
+    )[1]
+    results |= evaluation_request.read_derivatives(differentiate, model)
     # Samples without a gait may have any index.
     gait_indices = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
     outcomes, results = select_tree_rows((slow_gaits.outcome, results), gait_indices)
     outcomes = np.where(has_enough_friction, outcomes, Outcome.NO_CYCLE_FOUND)
     return mask_failed_samples(outcomes, results)
-
-
-def _select_derivatives(
-    derivatives: Sequence[Any], jacobians: Mapping[str, Any], parameter_names: Sequence[str]
-) -> dict[str, Any]:
-    """Return derivatives of measures by the names of their variables.
-
-    - `jacobians`: derivatives of each measure by all parameters, (samples, parameters).
-    """
-    return {
-        x.variable_name: jacobians[x.measure_name][:, parameter_names.index(x.parameter_name)]
-        for x in derivatives
-    }
 
 
 @eqx.filter_jit
@@ -414,36 +429,27 @@ def evaluate_gaits_with_kinks(
 
     Event-driven steps stop at the kinks. The gaits are found one after another.
     """
-    finder: Any = make_finder(
-        evaluation_request.wheel_model.without_values(),
-        evaluation_request.base_wheel.n_legs,
-        period_n=evaluation_request.wheel_model.leg_period,
-        cycle_options=evaluation_request.cycle_options,
-        step_options=evaluation_request.step_options,
-    )
+    finder = evaluation_request.make_gait_finder()
     rows = jnp.asarray(evaluation_request.stack_parameter_rows(samples_by_parameter))
     cycles = jax.tree.map(lambda *x: jnp.stack(x), *map(finder.find_cycle_from_values, rows))
-    names = [name for name in evaluation_request.measure_names if parse_derivative(name) is None]
-    reader = MeasureReader(
-        finder.measure_reader, (*dict.fromkeys((*names, "spectral_radius", *MARGIN_MEASURES)),)
-    )
+    names = (*dict.fromkeys((*evaluation_request.direct_names, *MARGIN_MEASURES)),)
     results = map_in_batches(
-        functools.partial(_read_gaits_with_kinks, finder, reader),
+        functools.partial(
+            _read_gaits_with_kinks, finder, MeasureReader(finder.measure_reader, names)
+        ),
         (batch_sizes.GAIT_READ_BATCH_SIZE,),
         rows,
         cycles,
     )
-    derivatives = list(filter(None, map(parse_derivative, evaluation_request.measure_names)))
-    if derivatives:
-        names = list(dict.fromkeys(derivative.measure_name for derivative in derivatives))
-        jacobians = np.stack(
-            [
-                finder.measure_gait(row, state, tuple(names)).parameter_jacobian
-                for row, state in zip(rows, cycles.section_state, strict=True)
-            ]
-        )
-        jacobians_by_name = dict(zip(names, np.moveaxis(jacobians, 1, 0), strict=True))
-        results |= _select_derivatives(derivatives, jacobians_by_name, finder.model.parameter_names)
+
+    def differentiate(names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        jacobians = [
+            finder.measure_gait(row, state, names).parameter_jacobian
+            for row, state in zip(rows, cycles.section_state, strict=True)
+        ]
+        return dict(zip(names, np.stack(jacobians, 1), strict=True))
+
+    results |= evaluation_request.read_derivatives(differentiate, finder.model)
     return mask_failed_samples(np.asarray(cycles.outcome), results)
 
 
