@@ -5,6 +5,7 @@ from vrw_jax.flow.hybrid_simulation import (
     Guard,
     HybridSolution,
     Mode,
+    ReturnMap,
     Termination,
     simulate_hybrid,
     time_errors,
@@ -12,9 +13,7 @@ from vrw_jax.flow.hybrid_simulation import (
 from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
 from vrw_jax.flow.integrate import PhaseEnd
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
-from vrw_jax.flow.return_map import ReturnMap
-from vrw_jax.flow.saltation import flow_jacobian_determinant
-from vrw_jax.flow.segments import product_multipliers, segment_maps
+from vrw_jax.flow.segments import flow_jacobian_determinant, product_multipliers, segment_maps
 
 __all__ = (
     "Guard",

@@ -15,7 +15,6 @@ from typer.testing import CliRunner
 
 from vrw_jax import plot as plots
 from vrw_jax.app import commands as cli
-from vrw_jax.app import paper_claims as facts
 from vrw_jax.app import paper_reproduction as reproduce
 from vrw_jax.app.paper_evidence import PaperEvidence
 from vrw_jax.base.outcomes import Outcome
@@ -47,13 +46,15 @@ def reproduction_result(
 
 def test_every_published_fact_holds(evidence: PaperEvidence) -> None:
     failing = [
-        f"{f.claim}: found {f.computed}" for f in facts.compute_paper_facts(evidence) if not f.holds
+        f"{f.claim}: found {f.computed}"
+        for f in reproduce.compute_paper_facts(evidence)
+        if not f.holds
     ]
     assert not failing
 
 
 def test_every_fact_has_a_source_and_a_reason_for_its_tolerance(evidence: PaperEvidence) -> None:
-    for fact in facts.compute_paper_facts(evidence):
+    for fact in reproduce.compute_paper_facts(evidence):
         assert fact.source
         assert fact.published_value
         assert fact.computed
@@ -62,7 +63,7 @@ def test_every_fact_has_a_source_and_a_reason_for_its_tolerance(evidence: PaperE
 
 
 def test_the_table_covers_every_figure_and_the_misprints(evidence: PaperEvidence) -> None:
-    text = facts.format_facts_page(facts.compute_paper_facts(evidence))
+    text = reproduce.format_facts_page(reproduce.compute_paper_facts(evidence))
     for word in ("Fig. 6", "Fig. 8", "Fig. 9", "Fig. 10(a)", "Fig. 10(b)", "J43", "eq. (35)",
                  "eqs (16), (17)", "φ = 0.10", "friction", "stopper"):  # fmt: skip
         assert word in text
@@ -91,7 +92,7 @@ def test_a_failed_fact_is_printed_and_sets_the_exit_code(
     monkeypatch.setattr("vrw_jax.app.commands.start_jax", lambda: None)
     result = CliRunner().invoke(cli.app, ["reproduce", "--out", str(tmp_path)])
     assert result.exit_code == cli.ExitCode.CHECK_FAILED
-    table = facts.compute_paper_facts(broken)
+    table = reproduce.compute_paper_facts(broken)
     assert f"{sum(fact.holds for fact in table)} of {len(table)} facts hold" in result.output
     assert "26 with published numbers, 28 with independent code" in " ".join(result.output.split())
     assert "does not" in result.output
@@ -171,9 +172,11 @@ def test_every_fact_can_fail(evidence: PaperEvidence) -> None:
         _corrupt_states,
         _sink_foot,
     )
-    unmoved = {fact.claim for fact in facts.compute_paper_facts(evidence)}
+    unmoved = {fact.claim for fact in reproduce.compute_paper_facts(evidence)}
     for spoil in spoils:
-        unmoved &= {fact.claim for fact in facts.compute_paper_facts(spoil(evidence)) if fact.holds}
+        unmoved &= {
+            fact.claim for fact in reproduce.compute_paper_facts(spoil(evidence)) if fact.holds
+        }
     assert not unmoved
 
 

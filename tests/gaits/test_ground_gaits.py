@@ -14,7 +14,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.branches.arclength import ArclengthOptions
-from vrw_jax.branches.test_functions import evaluate_bifurcations
+from vrw_jax.branches.branch import evaluate_bifurcations
 from vrw_jax.gaits import unilateral_finder as on_ground
 from vrw_jax.gaits.floquet import (
     compute_jury_margins,

@@ -31,7 +31,7 @@ from vrw_jax.flow.tangents import BatchPhase
 from vrw_jax.lanes import lane_function
 from vrw_jax.lanes.batching import choose_batch_size
 from vrw_jax.models import step_batch as lane_batch
-from vrw_jax.models.batch_stiffness import select_cheapest_solver
+from vrw_jax.models.step_batch import select_cheapest_solver
 
 STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(

@@ -247,7 +247,7 @@ def print_paper_facts(paper_facts: "list[PaperFact]", folder: Path) -> None:
         ),
         ("fact", "where", "published", "found", ""),
     )
-    from vrw_jax.app.paper_claims import summarize_paper_facts
+    from vrw_jax.app.paper_reproduction import summarize_paper_facts
 
     stdout_console.print(
         f"{summarize_paper_facts(paper_facts)}; see the figures and {folder / 'facts.md'}."

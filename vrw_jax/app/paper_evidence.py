@@ -34,7 +34,7 @@ from vrw_jax.models.measures import (
     make_locked_leg_coordinate,
     make_measure_attributes,
 )
-from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.step_results import SectionState
 from vrw_jax.models.stepping import step, walk
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

@@ -17,11 +17,11 @@ from vrw_jax.branches.arclength import (
     Track,
     run_together,
 )
-from vrw_jax.branches.branch import FixedPoint
-from vrw_jax.branches.test_functions import (
+from vrw_jax.branches.branch import (
     BIFURCATIONS,
     BRANCH_POINT,
     FOLD,
+    FixedPoint,
     TestFunction,
     compute_multipliers,
     evaluate_bifurcations,

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from vrw_jax.base.checks import check_int, check_positive
 from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
-from vrw_jax.branches.test_functions import is_multiplier_change_explained
+from vrw_jax.branches.branch import is_multiplier_change_explained
 from vrw_jax.lanes.batching import select_tree_rows
 
 Unknowns = Float[np.ndarray, " unknowns"]

@@ -23,12 +23,12 @@ from vrw_jax.branches.abstract_continuation import (
     stack_points,
 )
 from vrw_jax.branches.arclength import ContinuationPoint, ContinuationStatus
-from vrw_jax.branches.branch import SpecialPoint
-from vrw_jax.branches.test_functions import (
+from vrw_jax.branches.branch import (
     BIFURCATIONS,
     BRANCH_POINT,
     FOLD,
     NEIMARK_SACKER,
+    SpecialPoint,
     classify_multipliers,
     has_unit_circle_pair,
 )

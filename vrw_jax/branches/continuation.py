@@ -39,7 +39,7 @@ from vrw_jax.branches.abstract_continuation import (
     QuantitiesByName,
 )
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
-from vrw_jax.branches.branch import Branch, SpecialPoint
+from vrw_jax.branches.branch import BIFURCATIONS, Branch, SpecialPoint, TestFunction
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation_problems import (
     FRICTION_SURPLUS,
@@ -54,7 +54,6 @@ from vrw_jax.branches.map_branch import (
     continue_hybrid_branch,
     make_stability_variables,
 )
-from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
@@ -77,7 +76,7 @@ from vrw_jax.models.measures import (
     make_labeled_variables,
     make_locked_leg_coordinate,
 )
-from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,

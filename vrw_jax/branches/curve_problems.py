@@ -23,6 +23,7 @@ from vrw_jax.branches.arclength import (
     ContinuationPoint,
     NewtonStep,
 )
+from vrw_jax.branches.branch import BIFURCATIONS, FOLD, evaluate_bifurcations
 from vrw_jax.branches.continuation import (
     DOUBLE_SUPPORT_INDICATOR_NAMES,
     SECOND_PEAK_RATE_NAME,
@@ -33,7 +34,6 @@ from vrw_jax.branches.continuation_problems import (
     CollocationProblem,
     make_trial_linearizer,
 )
-from vrw_jax.branches.test_functions import BIFURCATIONS, FOLD, evaluate_bifurcations
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration
 from vrw_jax.gaits.phase_collocation import CollocationSolution

@@ -21,7 +21,14 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.abstract_continuation import QuantitiesByName
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
-from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
+from vrw_jax.branches.branch import (
+    BIFURCATIONS,
+    BRANCH_POINT,
+    FOLD,
+    Codim2Point,
+    SpecialPointCurve,
+    TestFunction,
+)
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation import (
     GAIT_TEST_FUNCTIONS,
@@ -44,13 +51,12 @@ from vrw_jax.branches.curve_problems import (
     locate_jump_onset,
     select_test_quantity,
 )
-from vrw_jax.branches.test_functions import BIFURCATIONS, BRANCH_POINT, FOLD, TestFunction
 from vrw_jax.branches.walker_curves import RANGE_EDGE, AbstractCurveContinuation
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
-from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.params import WheelParams
 

@@ -57,16 +57,18 @@ from vrw_jax.branches.arclength import (
     Track,
     run_together,
 )
-from vrw_jax.branches.branch import Branch, FixedPoint, SpecialPoint
-from vrw_jax.branches.branch_location import continue_and_locate_special_points
-from vrw_jax.branches.continuation_problems import POINT_BATCH_SIZES, MapProblem, number_rows
-from vrw_jax.branches.test_functions import (
+from vrw_jax.branches.branch import (
     BIFURCATIONS,
     BRANCH_POINT,
     PERIOD_DOUBLING,
+    Branch,
+    FixedPoint,
+    SpecialPoint,
     TestFunction,
     compute_multipliers,
 )
+from vrw_jax.branches.branch_location import continue_and_locate_special_points
+from vrw_jax.branches.continuation_problems import POINT_BATCH_SIZES, MapProblem, number_rows
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.fixed_points import (
     UNIT_MULTIPLIER_ADVICE,

@@ -21,7 +21,7 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
 from vrw_jax.branches.abstract_continuation import COARSE_MESH_END_NAME
 from vrw_jax.branches.arclength import ArclengthOptions
-from vrw_jax.branches.branch import SpecialPointCurve
+from vrw_jax.branches.branch import BIFURCATIONS, SpecialPointCurve
 from vrw_jax.branches.continuation import (
     BRANCH_ENDING_QUANTITIES,
     SECOND_PEAK_RATE_NAME,
@@ -39,7 +39,6 @@ from vrw_jax.branches.curve_tracing import (
     compute_distances_to_polyline,
 )
 from vrw_jax.branches.map_branch import MarginFunctions
-from vrw_jax.branches.test_functions import BIFURCATIONS
 from vrw_jax.branches.walker_curves import (
     DEFAULT_CURVE_OPTIONS,
     UNTRACED_CURVE_TEXT,

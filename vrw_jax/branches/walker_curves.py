@@ -26,7 +26,7 @@ from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.walker import AbstractWalker, make_return_map
 from vrw_jax.branches.abstract_continuation import AbstractContinuation, QuantitiesByName
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
-from vrw_jax.branches.branch import Codim2Point, SpecialPointCurve
+from vrw_jax.branches.branch import BIFURCATIONS, Codim2Point, SpecialPointCurve, TestFunction
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.continuation_problems import MapProblem
 from vrw_jax.branches.curve_problems import (
@@ -42,7 +42,6 @@ from vrw_jax.branches.map_branch import (
     declare_margins,
     make_stability_variables,
 )
-from vrw_jax.branches.test_functions import BIFURCATIONS, TestFunction
 from vrw_jax.gaits.fixed_points import estimate_state_units
 from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.batching import select_tree_rows

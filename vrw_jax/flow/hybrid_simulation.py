@@ -1,4 +1,4 @@
-"""Simulation of hybrid systems, which consist of modes, guards and resets.
+"""Simulation and return maps of hybrid systems, which consist of modes, guards and resets.
 
     ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounce),))
     simulate_hybrid((ball,), start, events=10)
@@ -7,6 +7,7 @@ A mode whose functions have wrong shapes raises a ValueError. If the simulation 
 has a code of `Termination` and contains all earlier events.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -21,7 +22,6 @@ from jaxtyping import Array, Float, Int
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
 from vrw_jax.base.elementwise import make_opaque_loop_condition, select_entry_by_mask
-from vrw_jax.base.forward_only import forbid_reverse_mode
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import (
     StatusCode,
@@ -40,6 +40,7 @@ from vrw_jax.flow.phase_integration import (
     integrate_phase,
     is_machine_code_better,
 )
+from vrw_jax.flow.tangents import forbid_reverse_mode
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 MAX_STORED_NUMBERS = 100_000_000
@@ -577,3 +578,59 @@ def simulate_modes(
     run = run_events(modes, options, start, first_mode_index, events, log, record_event)
     last_values = run.n_events, run.time, run.state, run.mode, run.solver_steps, run.termination
     return HybridSolution._make((*run.log, *last_values))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ReturnMap:
+    """Map from section coordinates to the section coordinates after `events` events.
+
+    The map returns NaN if the simulation ends early, so that its last state is not taken for a
+    return. `solve_fixed_point` reports the termination of the simulation in addition to the fixed
+    point.
+
+    - `modes`: modes of the system, as in `simulate_hybrid`;
+    - `embed`: function from section coordinates to the state in which the simulation begins;
+    - `project`: function from the state after the last event to its section coordinates;
+    - `events`: number of events per return;
+    - `mode`: index of the mode in which the simulation begins;
+    - `options`: options of the simulation.
+    """
+
+    modes: Sequence[Mode] | Mode
+    embed: Callable[[Float[Array, " n"]], StateArray]
+    project: Callable[[StateArray], Float[Array, " n"]]
+    events: int = 1
+    mode: int = 0
+    options: StepOptions | None = None
+
+    def simulate(self, x: Float[Array, " n"]) -> HybridSolution:
+        """Return the simulation that begins at section coordinates `x`, shape (n,)."""
+        return simulate_hybrid(
+            self.modes, self.embed(x), events=self.events, mode=self.mode, options=self.options
+        )
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the section coordinates after one return from `x`, shape (n,).
+
+        The result is NaN if the simulation ends early.
+        """
+        hybrid_solution = self.simulate(x)
+        section_coordinates = self.project(hybrid_solution.state)
+        return section_coordinates * jnp.where(
+            hybrid_solution.termination == Termination.MAX_EVENTS_REACHED, 1.0, jnp.nan
+        ).astype(section_coordinates.dtype)
+
+    def find_termination(self, x: Float[Array, " n"], period_n: int = 1) -> Int[Array, ""]:
+        """Return the `Termination` of the first of `period_n` returns from `x` that ends early.
+
+        If no return ends early, the result is the termination of the last return.
+        """
+        x = lax.stop_gradient(x)
+        termination = jnp.full((), Termination.MAX_EVENTS_REACHED, jnp.int32)
+        for _ in range(period_n):
+            solution = self.simulate(x)
+            termination = jnp.where(
+                termination == Termination.MAX_EVENTS_REACHED, solution.termination, termination
+            )
+            x = self.project(solution.state)
+        return termination

@@ -19,8 +19,7 @@ from vrw_jax.base.printing import (
 )
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.hybrid_simulation import Termination
-from vrw_jax.flow.return_map import ReturnMap
+from vrw_jax.flow.hybrid_simulation import ReturnMap, Termination
 from vrw_jax.gaits.floquet import UNIT_CIRCLE_DISTANCE, floquet_multipliers
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian, make_zero_tangent
 from vrw_jax.lanes.saved_traces import get_compiled_program

@@ -27,7 +27,7 @@ from vrw_jax.gaits.gait_walks import (
 )
 from vrw_jax.gaits.limit_cycle_result import transfer_solution_to_mesh
 from vrw_jax.lanes.batching import concatenate_tree_rows, map_in_batches, select_tree_rows
-from vrw_jax.models.batch_stiffness import SolverIndex, select_cheapest_solver
+from vrw_jax.models.step_batch import SolverIndex, select_cheapest_solver
 from vrw_jax.wheel.params import WheelParams
 
 MAX_UNREFINED_MESH_ERROR = 1e-7

@@ -1,10 +1,23 @@
-"""Registry of models. To add a model, only the table in this module has to be extended."""
+"""Registry of models, and the attributes of a dataset that state how a model computed it.
 
+To add a model, only the table in this module has to be extended.
+"""
+
+import platform
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from vrw_jax.base.options import StepOptions
+from vrw_jax.base.parameters import list_tree_parameters
+from vrw_jax.lanes.disk_cache import find_library_version
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import LadderWheel
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel.params import WheelParams
 
 MODEL_CLASSES: dict[str, type[AbstractWheel]] = {
     "viscoelastic": ViscoelasticWheel,
@@ -45,3 +58,34 @@ def describe_accepted_models(
         for name in list_model_config_names(command_name, parameter_name)
     )
     return " or ".join(filter(None, (", ".join(first_expressions), last_expression)))
+
+
+def collect_provenance_attributes(
+    params: Any, model: object, options: StepOptions | None = None
+) -> dict[str, str | float | int]:
+    """Return dataset attributes that describe how a result was computed.
+
+    They state versions, device, floating-point type, tolerances and parameters. The default of
+    `options` is `StepOptions()`.
+    """
+    options = StepOptions() if options is None else options
+    parameter_attributes: dict[str, str | float | int] = {
+        f"parameter_{parameter.name}": float(parameter.value)
+        for parameter in list_tree_parameters(params)
+        if jnp.ndim(parameter.value) == 0
+    }
+    if isinstance(params, WheelParams):
+        parameter_attributes["parameter_n_legs"] = params.n_legs
+    return parameter_attributes | {
+        "model": repr(model),
+        "versions": ", ".join(
+            f"{library_name} {find_library_version(library_name)}"
+            for library_name in ("vrw-jax", "jax", "diffrax", "numpy")
+        )
+        + f", python {platform.python_version()}",
+        "device": jax.devices()[0].device_kind,
+        "dtype": str(jnp.result_type(*jax.tree.leaves(params), float)),
+        "solver": options.solver,
+        "rtol": float(options.rtol),
+        "atol": float(options.atol),
+    }

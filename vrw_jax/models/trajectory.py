@@ -37,7 +37,7 @@ from vrw_jax.models.interface import complete_ground_line_slopes, compute_rises
 from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.models.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
 from vrw_jax.models.phase_sequence import select_stance_line
-from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.stepping import (
     ModelLike,
     SectionStateLike,

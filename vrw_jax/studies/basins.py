@@ -42,7 +42,7 @@ from vrw_jax.models.measures import (
     PRE_TOUCHDOWN_COMPONENT_NAMES,
     make_measure_attributes,
 )
-from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import (
     ModelLike,

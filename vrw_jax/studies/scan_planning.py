@@ -32,8 +32,7 @@ from vrw_jax.models.measures import (
     describe_parameter,
     make_locked_leg_coordinate,
 )
-from vrw_jax.models.provenance import collect_provenance_attributes
-from vrw_jax.models.registry import describe_accepted_models
+from vrw_jax.models.registry import collect_provenance_attributes, describe_accepted_models
 from vrw_jax.models.stepping import (
     convert_model_argument,
     convert_step_options,

@@ -56,7 +56,7 @@ from vrw_jax.models.measures import (
     make_flag_attributes,
     make_measure_attributes,
 )
-from vrw_jax.models.provenance import collect_provenance_attributes
+from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -66,7 +66,6 @@ from vrw_jax.models.stepping import (
     require_single_wheel,
 )
 from vrw_jax.studies.optimum_curve import follow_optimum
-from vrw_jax.studies.tune_exploration import ExplorationResult, explore_starts
 from vrw_jax.studies.tune_maximization import (
     EvaluatedTrial,
     MaximizationResult,
@@ -87,7 +86,13 @@ from vrw_jax.studies.tune_objective import (
     restore_sign_of_bound,
     zero_objective,
 )
-from vrw_jax.studies.tune_result import ActiveConstraint, TuneResult, WalkValidation
+from vrw_jax.studies.tune_result import (
+    ActiveConstraint,
+    ExplorationResult,
+    TuneResult,
+    WalkValidation,
+    explore_starts,
+)
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,
