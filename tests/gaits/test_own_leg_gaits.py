@@ -80,6 +80,37 @@ def test_derivatives_of_a_gait_with_a_kink_are_differences_of_gaits():
     np.testing.assert_allclose(jax.grad(measure_kinked_period)(100.0), difference, rtol=1e-5)
 
 
+@pytest.mark.slow
+def test_gaits_with_a_kink_and_contact_are_those_of_the_papers_wheel():
+    """With a friction of 50, the rear foot slides before it leaves the ground."""
+    expected, law = find_gait(BumpStop(100.0)), BumpStop(100.0)
+    wheel = vrw.UnilateralWheel(friction=np.inf, infinite_friction_rule="paper", leg_force=law)
+    cycle = vrw.limit_cycle(PARAMS, model=wheel)
+    assert abs(cycle.period - expected.period) < 1e-10
+    np.testing.assert_allclose(cycle.multipliers[:2], expected.multipliers[:2], atol=1e-7)
+    smooth_law = vrw.UnilateralWheel(friction=50.0, leg_force=law.__call__)
+    peaks, expected_peaks = (
+        vrw.limit_cycle(PARAMS, model=model).force_peaks
+        for model in (vrw.UnilateralWheel(friction=50.0, leg_force=law), smooth_law)
+    )
+    # Without the declaration, forces are less accurate.
+    for name, value in peaks.items():
+        np.testing.assert_allclose(value, expected_peaks[name], rtol=1e-8)
+    ladder = vrw.LadderWheel(friction=50.0, leg_force=law)
+    assert vrw.limit_cycle(PARAMS, model=ladder).period == expected.period
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_gait_with_a_kink_and_slip_are_differences_of_gaits():
+    make_contact_wheel = lambda k2: vrw.UnilateralWheel(friction=0.7, leg_force=BumpStop(k2))
+    find = lambda k2: vrw.limit_cycle(PARAMS, model=make_contact_wheel(k2))
+    assert find(100.0).steps.slip[0] > 0.01  # m
+    difference = float(find(100.5).period - find(99.5).period)  # of 1 N/m
+    table = vrw.sensitivities(PARAMS, measures=["period"], model=make_contact_wheel(100.0))
+    assert float(table.derivative.sel(parameter="leg.k2")[0]) == pytest.approx(difference, rel=1e-5)
+    np.testing.assert_allclose(jax.grad(lambda k2: find(k2).period)(100.0), difference, rtol=1e-5)
+
+
 def test_derivatives_by_parameters_of_law_and_wheel_are_differences_of_gaits():
     gradient = jax.grad(measure_period, (0, 1))(60.0, 150.0)
     differences = (

@@ -5,10 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference_code import constrained_wheel, five_coordinates
+from reference_code import complementarity, constrained_wheel, five_coordinates
 from support.leg_laws import BumpStop, QuadraticDamper, make_wheel
 
 import vrw_jax as vrw
+from vrw_jax.models.contact_state import find_kink_sides, select_kink_sides
+from vrw_jax.wheel.laws import evaluate_damping_power
 
 PARAMS = vrw.WheelParams(damping=150.0)
 START = np.array([0.1, 1.6, -0.1])
@@ -18,8 +20,8 @@ TIGHT_OPTIONS = vrw.StepOptions.tight()
 class KinkedLeg(eqx.Module):
     """A spring, a damper, and what has a kink or a jump where its number is not zero.
 
-    The second spring touches below 0.9 m, and the second damper acts below 0.93 m, so that the
-    force jumps. Dry friction may stop the leg. All three laws of the tests are one program.
+    Below 0.9 m, a second spring touches, and a second damper acts, so that the force jumps. Dry
+    friction may stop the leg. All three laws of the tests are one program.
     """
 
     k2: float = 0.0
@@ -27,29 +29,32 @@ class KinkedLeg(eqx.Module):
     friction: float = 0.0
 
     def __call__(self, L, dL, params):
-        spring = params.stiffness * (params.natural_length - L) + self.k2 * jnp.maximum(
-            0.9 - L, 0.0
-        )
-        damping = params.damping + jnp.where(L < 0.93, self.c2, 0.0)
-        return spring - damping * dL - jnp.where(dL > 0.0, self.friction, -self.friction)
+        spring = params.stiffness * (params.natural_length - L)
+        damping = params.damping + jnp.where(L < 0.9, self.c2, 0.0)
+        friction = jnp.where(dL > 0.0, self.friction, 0.0) - jnp.where(dL < 0.0, self.friction, 0.0)
+        return spring + self.k2 * jnp.maximum(0.9 - L, 0.0) - damping * dL - friction
 
     def kinks(self, L, dL, params):
-        return (L - 0.9, L - 0.93, dL)
+        return (L - 0.9, dL)
+
+    def potential(self, L, params):
+        spring = 0.5 * params.stiffness * (params.natural_length - L) ** 2
+        return spring + 0.5 * self.k2 * jnp.maximum(0.9 - L, 0.0) ** 2
 
 
 class ReferenceLaw:
     """A law of this module for the reference code, on fixed sides of the kinks of both legs."""
 
-    def __init__(self, law, damping=150.0):
-        self.damping, self.sides = damping, None
+    def __init__(self, law, damping=150.0, stiffness=500.0):
+        self.damping, self.stiffness, self.sides = damping, stiffness, None
         self.k2, self.c2, self.friction = law.k2, law.c2, law.friction
 
     def kink(self, length, rate):
-        return rate if self.friction else length - (0.9 if self.k2 else 0.93)
+        return rate if self.friction else length - 0.9
 
     def __call__(self, length, rate):
         is_positive = self.kink(length, rate) > 0.0 if self.sides is None else self.sides > 0.0
-        force = 500.0 * (1.02 - length) - self.damping * rate
+        force = self.stiffness * (1.02 - length) - self.damping * rate
         if self.friction:
             return force - self.friction * np.where(is_positive, 1.0, -1.0)
         return force + np.where(is_positive, 0.0, self.k2 * (0.9 - length) - self.c2 * rate)
@@ -217,7 +222,125 @@ def test_kinks_that_are_no_functions_of_each_leg_are_refused(kinks):
         make_wheel(type("OddBumpStop", (BumpStop,), {"kinks": kinks})())
 
 
-@pytest.mark.parametrize("model_class", [vrw.UnilateralWheel, vrw.LadderWheel])
-def test_unilateral_contact_refuses_kinks(model_class):
-    with pytest.raises(ValueError, match="steps with unilateral contact do not stop there"):
-        model_class(leg_force=BumpStop())
+PARAMS_WITH_FLIGHT = vrw.WheelParams(damping=100.0, stiffness=2000.0)
+START_OF_FLIGHT = np.array([0.1, 1.2, -0.1])
+"""Section state of a step in which feet slide and all leave the ground, with a friction of 0.5."""
+
+
+def differentiate_contact_step(law, friction, params, start, engine="auto"):
+    """Return results of a step with unilateral contact, and their derivatives.
+
+    The derivatives are those by the numbers of the law, friction and damping. The results are the
+    section state without contacts, durations, and the energy lost in the dampers.
+    """
+
+    def take_step(values):
+        *numbers, friction, damping = values
+        step = vrw.step(
+            eqx.tree_at(lambda params: params.damping, params, damping),
+            start,
+            model=vrw.UnilateralWheel(
+                friction=friction, infinite_friction_rule="paper", leg_force=KinkedLeg(*numbers)
+            ),
+            options=TIGHT_OPTIONS,
+            engine=engine,
+        )
+        results = [step.section_state[:20], step.durations, step.energy_damping[None]]
+        return jnp.concatenate(results), (jnp.concatenate(results), step.outcome)
+
+    values = jnp.array([law.k2, law.c2, law.friction, friction, float(params.damping)])
+    jacobian, (results, outcome) = jax.jacfwd(take_step, has_aux=True)(values)
+    assert outcome == vrw.Outcome.STEPPED
+    return np.asarray(results), np.asarray(jacobian)
+
+
+@pytest.mark.parametrize("law", LAWS, ids=LAW_NAMES)
+def test_a_step_with_contact_is_that_of_the_papers_wheel(law):
+    """The reference has the contacts of this step, and the potential of the law."""
+    step = vrw.step(PARAMS, START, model=make_wheel(law), options=TIGHT_OPTIONS)
+    results, _ = differentiate_contact_step(law, np.inf, PARAMS, START)
+    dls, *sls = step.durations
+    expected = [*step.section_state, dls, sum(sls), 0.0, step.energy.damping]
+    np.testing.assert_allclose(results[[0, 1, 12, *range(20, 24)]], expected, atol=1e-11)
+
+
+@pytest.mark.parametrize("law", LAWS[:2], ids=LAW_NAMES[:2])
+def test_a_step_with_slip_and_flight_agrees_with_another_event_driven_code(law, monkeypatch):
+    reference_law, n_crossed = ReferenceLaw(law, 100.0, 2000.0), 0
+    make_guards, integrate = complementarity._make_guards, complementarity._integrate_to_event
+
+    def make_guards_with_kinks(wheel, place):
+        names, evaluate, armed, leaves = make_guards(wheel, place)
+        legs = np.flatnonzero(~np.array(place.is_locked))
+        evaluate_all = lambda y: np.append(
+            evaluate(y), (reference_law.sides * reference_law.kink(y[3:11], y[14:]))[legs]
+        )
+        kink_names = [("kink", leg) for leg in legs]
+        armed = np.append(armed, np.full(len(legs), 1e-14))
+        return names + kink_names, evaluate_all, armed, np.append(leaves, np.zeros(len(legs), bool))
+
+    def integrate_to_event_or_kink(wheel, place):
+        nonlocal n_crossed
+        time, y, (name, leg) = integrate(wheel, place)
+        if name == "kink":
+            reference_law.sides[leg] *= -1.0
+            n_crossed += 1
+        return time, y, (name, leg)
+
+    monkeypatch.setattr(complementarity, "_make_guards", make_guards_with_kinks)
+    monkeypatch.setattr(complementarity, "_integrate_to_event", integrate_to_event_or_kink)
+    wheel = complementarity.ComplementarityWheel(0.5, leg_force=reference_law)
+    start = complementarity.paper_start(wheel, *START_OF_FLIGHT)
+    reference_law.sides = np.where(reference_law.kink(start.q[3:], start.v[3:]) > 0.0, 1.0, -1.0)
+    reference = complementarity.compute_step(wheel, start)
+    assert n_crossed > 0
+    assert reference.durations[2] > 0.01  # s, without a foot on the ground
+    results, _ = differentiate_contact_step(law, 0.5, PARAMS_WITH_FLIGHT, START_OF_FLIGHT)
+    q, v = reference.end.q, reference.end.v
+    end = [q[2] + complementarity.ALPHA, v[2], *v[:2], *np.roll(q[3:], -1), *np.roll(v[3:], -1)]
+    np.testing.assert_allclose(results[:20], end, atol=1e-11)
+    np.testing.assert_allclose(results[20:23], reference.durations, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", LAWS, ids=LAW_NAMES)
+def test_derivatives_of_a_step_with_slip_and_flight_are_central_differences(law):
+    arguments = PARAMS_WITH_FLIGHT, START_OF_FLIGHT
+    _, jacobian = differentiate_contact_step(law, 0.5, *arguments)
+    (number_name,) = (name for name in NUMBER_NAMES if getattr(law, name))
+
+    def compute_results(number_change, friction_change):
+        number = getattr(law, number_name) + number_change
+        changed_law = KinkedLeg(**{number_name: number})
+        return differentiate_contact_step(changed_law, 0.5 + friction_change, *arguments)[0]
+
+    differences = [
+        (compute_results(*change) - compute_results(*-change)) / (2.0 * change.sum())
+        for change in np.diag([1e-3, 1e-6])
+    ]
+    columns = jacobian[:, [NUMBER_NAMES.index(number_name), 3]]
+    np.testing.assert_allclose(columns.T, differences, rtol=1e-6, atol=1e-7)
+
+
+# XLA compiles the step of diffrax, with its derivatives, for two minutes.
+@pytest.mark.slow
+def test_diffrax_computes_contacts_and_derivatives_of_machine_code():
+    for law in LAWS:
+        lanes, diffrax = (
+            differentiate_contact_step(law, 0.5, PARAMS_WITH_FLIGHT, START_OF_FLIGHT, engine)
+            for engine in ("lanes", "diffrax")
+        )
+        for value, expected in zip(diffrax, lanes, strict=True):
+            np.testing.assert_allclose(value, expected, rtol=1e-11, atol=1e-11)
+
+
+def test_the_power_of_dampers_is_that_of_the_law_beside_its_kinks():
+    """The force at rest, from which the power is computed, has no friction."""
+    law = vrw.UnilateralWheel(leg_force=KinkedLeg(300.0, 40.0, 5.0)).laws
+    s = PARAMS.attach_laws(law).symbols()
+    L, dL = jnp.asarray(np.random.default_rng(0).uniform((0.8, -1.0), (1.0, 1.0), (8, 2)).T)
+    sides = find_kink_sides(s, L, dL)
+    expected, power = (
+        evaluate_damping_power(symbols, L, dL, np.arange(1, 9))
+        for symbols in (s, select_kink_sides(s, sides))
+    )
+    np.testing.assert_allclose(power, expected, rtol=1e-12)

@@ -147,6 +147,18 @@ def test_samples_of_a_law_with_kinks_are_the_gaits_of_walks():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("friction", [50.0, 0.7])
+def test_samples_with_kinks_and_contact_are_gaits_of_the_selected_model(friction):
+    design = vrw.grid({"leg.k2": [99.0, 101.0]})
+    ladder = vrw.LadderWheel(friction=friction, leg_force=BumpStop(100.0))
+    scan = vrw.scan(design, ["period", "slip"], base=PARAMS, model=ladder)
+    model = ladder.viscoelastic_model if friction == 50.0 else ladder.unilateral_model
+    expected = vrw.scan(design, ["period"], base=PARAMS, model=model)
+    np.testing.assert_allclose(scan.period, expected.period, rtol=1e-12)
+    assert (scan.slip > 0.0).all() == (friction == 0.7)
+
+
+@pytest.mark.slow
 def test_measures_of_legs_in_turn_with_kinks_are_those_of_both_steps():
     """In sensitivities as in scans, with derivatives equal to central differences of the scan."""
     model = make_wheel(vrw.AlternatingLegs(BumpStop(100.0), BumpStop(80.0)))

@@ -53,7 +53,12 @@ from vrw_jax.models.contact_modes import (
     choose_combination,
     is_release_consistent,
 )
-from vrw_jax.models.contact_state import ContactState, GuardLayout
+from vrw_jax.models.contact_state import (
+    ContactState,
+    GuardLayout,
+    find_kink_sides,
+    select_kink_sides,
+)
 from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols
@@ -76,6 +81,8 @@ class ContactEvent(NamedTuple):
     is_stopping_to_slide: Bool[Array, "2 ..."]  # whether the foot in the slot stops sliding
     # whether the stopper force of the slot's leg vanishes
     is_releasing_stopper: Bool[Array, "2 ..."]
+    # whether the function of each kink changes sign, for all legs
+    is_kink_crossed: tuple[Bool[Array, "n_legs ..."], ...]
 
     @property
     def is_impact(self) -> Bool[Array, "..."]:
@@ -98,6 +105,12 @@ def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) ->
         is_starting_to_slide_down=select_flags(guard_layout.first_slip_down_guard, 2),
         is_stopping_to_slide=select_flags(guard_layout.first_slip_end_guard, 2),
         is_releasing_stopper=select_flags(guard_layout.first_stopper_release_guard, 2),
+        is_kink_crossed=tuple(
+            select_flags(first_guard, n_legs)
+            for first_guard in range(
+                guard_layout.first_kink_guard, guard_layout.first_force_rate_guard, n_legs
+            )
+        ),
     )
 
 
@@ -773,6 +786,36 @@ def _replace_liftoff_by_slip(
     )
 
 
+def _update_kink_sides(
+    s: Symbols,
+    motion: WheelMotion,
+    is_at_stopper: Array,
+    contact_state: ContactState,
+    contact_event: ContactEvent,
+) -> tuple[Array, ...]:
+    """Return the sides of the kinks after an event.
+
+    An impact changes rates, on which the functions of kinks may depend.
+
+    - `motion`, `is_at_stopper`: motion and stoppers after the impact, if there is one.
+    """
+    if not contact_state.is_kink_positive:
+        return ()
+    sides_after_impact = find_kink_sides(
+        s, jnp.where(is_at_stopper, s.L0, motion.L), jnp.where(is_at_stopper, 0.0, motion.dL)
+    )
+    kinks = zip(
+        sides_after_impact,
+        contact_state.is_kink_positive,
+        contact_event.is_kink_crossed,
+        strict=True,
+    )
+    return tuple(
+        jnp.where(contact_event.is_impact, after_impact, before ^ is_crossed)
+        for after_impact, before, is_crossed in kinks
+    )
+
+
 def resolve_event(
     contact_law: ContactLaw,
     motion: WheelMotion,
@@ -829,6 +872,10 @@ def resolve_event(
     impact_energy_loss = compute_kinetic_energy(s, motion) - compute_kinetic_energy(s, motion_after)
     stopper_impulse = jnp.where(is_stopper_holding, velocity_solution.stopper_forces, jnp.inf)
 
+    is_kink_positive = _update_kink_sides(
+        s, motion_after, is_at_stopper, contact_state, contact_event
+    )
+    contact_law = contact_law._replace(s=select_kink_sides(s, is_kink_positive))
     acceleration_solution, contact_slots, was_resting, is_stopper_holding = (
         _solve_acceleration_level(
             contact_law, motion_after, contact_modes, is_at_stopper, contact_event
@@ -852,6 +899,7 @@ def resolve_event(
         has_just_unlocked=(contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper)
         & ~is_leg_locked,
         has_just_slid=contact_slots.scatter_to_legs(is_sliding & was_resting) > 0,
+        is_kink_positive=is_kink_positive,
     )
     n_impact_solutions = velocity_solution.chosen_combination.n_solutions
     n_force_solutions = acceleration_solution.n_solutions

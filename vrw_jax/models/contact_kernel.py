@@ -83,10 +83,12 @@ from vrw_jax.models.contact_state import (
 )
 from vrw_jax.models.phase_sequence import find_stance_slope
 from vrw_jax.wheel.ground import GroundAhead
+from vrw_jax.wheel.laws import count_kinks
 from vrw_jax.wheel.params import (
     NO_LAWS,
     PARAMETER_NAMES,
     Symbols,
+    WheelLaws,
     add_laws,
     compute_symbols,
     compute_wheel_units,
@@ -179,8 +181,12 @@ class BatchWalkSettings(NamedTuple):
     @property
     def guard_layout(self) -> GuardLayout:
         """Return the order of the guards."""
+        laws: Any = jax.tree.unflatten(self.law_structure, [1.0] * self.law_structure.num_leaves)
         return make_guard_layout(
-            self.n_legs, self.has_one_sided_stoppers, self.measures_force_peaks
+            self.n_legs,
+            self.has_one_sided_stoppers,
+            self.measures_force_peaks,
+            count_kinks((laws or WheelLaws()).leg),
         )
 
     @property
@@ -468,7 +474,12 @@ class BatchWalkSettings(NamedTuple):
         motion, next_contact_state = select_trees_by_condition(
             is_contact_event,
             (event_result.motion, event_result.contact_state),
-            (motion, ContactState.without_recent_changes(*contact_state[:2])),
+            (
+                motion,
+                ContactState.without_recent_changes(
+                    *contact_state[:2], contact_state.is_kink_positive
+                ),
+            ),
         )
         force_rate_signs = update_force_rate_signs(
             self.make_lane_contact_dynamics(input_columns, next_contact_state),

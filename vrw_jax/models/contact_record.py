@@ -130,7 +130,7 @@ class UnilateralMargins(eqx.Module):
 class GaitStepCounters(NamedTuple):
     """Numbers of events and solver steps in a walking step, and durations by loaded feet."""
 
-    n_events: Int[Array, "..."]  # number of changes of contacts and stoppers
+    n_events: Int[Array, "..."]  # number of changes of contacts and stoppers, and of kinks
     durations: Float[Array, "3 ..."]  # durations with two, one and no loaded feet, s
     n_solver_steps: Int[Array, "..."]  # number of attempted solver steps
 
@@ -446,7 +446,8 @@ class UnilateralStep(AbstractContactStep):
     - `energy_damping`: energy lost in the dampers, J;
     - `energy_friction`: energy lost by sliding between impacts, J;
     - `slip`: total path length of all sliding feet, m;
-    - `events`: number of events, at which contacts or stoppers change;
+    - `events`: number of events, at which contacts or stoppers change, or a leg passes a kink of
+      its force;
     - `impacts`: number of events in which velocities jumped;
     - `fewest_solutions`, `most_solutions`: smallest and largest number of admissible combinations
       at an event; both are 1 if all events are well posed;

@@ -13,7 +13,7 @@ from vrw_jax.models.contact_mechanics import (
     compute_foot_positions,
     compute_leg_directions,
 )
-from vrw_jax.models.contact_state import ContactState
+from vrw_jax.models.contact_state import ContactState, find_kink_sides
 from vrw_jax.models.phase_sequence import (
     is_slope_in_domain,
     is_valid_start_state,
@@ -162,7 +162,10 @@ def unpack_section_state(s: Symbols, section_state: FullState) -> tuple[WheelMot
     )
     dtheta, vx, vz = section_state[1], section_state[2], section_state[3]
     motion = WheelMotion(hub_x, hub_z, theta, vx, vz, dtheta, L, dL)
-    return motion, ContactState.without_recent_changes(contact_modes, is_leg_locked)
+    is_kink_positive = find_kink_sides(s, L, dL)
+    return motion, ContactState.without_recent_changes(
+        contact_modes, is_leg_locked, is_kink_positive
+    )
 
 
 def pack_section_state(

@@ -1,7 +1,8 @@
 """Dynamics of the wheel between two events, and the guards that detect the next event.
 
-A *contact state* consists of the contact modes of all feet and the stopper flags of all legs. The
-contact state is constant between two events.
+A *contact state* consists of the contact modes of all feet, the stopper flags of all legs and, if
+the force of a leg has kinks, the side of each kink. The contact state is constant between two
+events.
 """
 
 import itertools
@@ -16,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.base.types import Elementwise, Scalar
+from vrw_jax.flow.event_location import has_guard_crossed
 from vrw_jax.models.contact_jvp import (
     ContactConfiguration,
     WheelForceSolution,
@@ -43,9 +45,12 @@ from vrw_jax.models.contact_mechanics import (
 from vrw_jax.models.contact_modes import replace_infinite_friction
 from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.laws import (
+    OneSidedLegForce,
     compute_motor_work,
+    count_kinks,
     evaluate_damping_power,
     evaluate_hub_torque,
+    evaluate_leg_kinks,
     number_legs,
 )
 from vrw_jax.wheel.outcomes import ContactMode, are_coordinates_at_rest, are_rates_negligible
@@ -99,12 +104,45 @@ class ContactState(NamedTuple):
     has_just_slid: Bool[Array, " n_legs"]  # whether a foot at rest has begun to slide then
     # sign of each of the `NormalForceRates` in this state; None if force peaks are not measured
     force_rate_signs: Array | None = None
+    # whether the function of each kink is positive, for all legs
+    is_kink_positive: tuple[Bool[Array, " n_legs"], ...] = ()
 
     @classmethod
-    def without_recent_changes(cls, contact_modes: Array, is_leg_locked: Array) -> "ContactState":
+    def without_recent_changes(
+        cls, contact_modes: Array, is_leg_locked: Array, is_kink_positive: tuple[Array, ...]
+    ) -> "ContactState":
         """Return the contact state without changes at the last event, and without signs."""
         no_leg_flags = is_leg_locked & False
-        return cls(contact_modes, is_leg_locked, no_leg_flags, no_leg_flags, no_leg_flags)
+        return cls(
+            contact_modes,
+            is_leg_locked,
+            no_leg_flags,
+            no_leg_flags,
+            no_leg_flags,
+            is_kink_positive=is_kink_positive,
+        )
+
+
+def find_kink_sides(s: Symbols, L: LegArray, dL: LegArray) -> tuple[Array, ...]:
+    """Return `ContactState.is_kink_positive` for the lengths of the legs and their rates.
+
+    A function that is zero has the sign that it gets if the leg moves inwards, because a leg can
+    leave its stopper only in this direction.
+    """
+    if count_kinks(s.leg_force) == 0:
+        return ()
+    evaluate = lambda L, dL: evaluate_leg_kinks(s, L, dL, number_legs(L))
+    inwards = -jnp.ones_like(L)
+    values, changes = jax.jvp(evaluate, stop_gradients((L, dL)), (inwards, inwards))
+    return tuple(~has_guard_crossed(*kink) for kink in zip(values, changes, strict=True))
+
+
+def select_kink_sides(s: Symbols, is_kink_positive: tuple[Array, ...]) -> Symbols:
+    """Return symbols whose legs have forces that are smooth, as on the given sides of all kinks."""
+    if not is_kink_positive:
+        return s
+    sides = tuple(jnp.where(x, 1.0, -1.0) for x in is_kink_positive)
+    return s._replace(leg_force=OneSidedLegForce(s.leg_force, sides))
 
 
 class ContactModeDynamics(NamedTuple):
@@ -130,7 +168,12 @@ class ContactModeDynamics(NamedTuple):
     @property
     def guard_layout(self) -> "GuardLayout":
         """Return the positions of the guards in the result of `evaluate_guards`."""
-        return make_guard_layout(self.s.n, self.has_one_sided_stoppers, self.measures_force_peaks)
+        return make_guard_layout(
+            self.s.n,
+            self.has_one_sided_stoppers,
+            self.measures_force_peaks,
+            len(self.contact_state.is_kink_positive),
+        )
 
     def configure_contacts(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration for this motion, from which the forces are computed."""
@@ -163,7 +206,7 @@ def make_contact_mode_dynamics(
     - `ground_ahead`: uneven ground on which the next foot lands.
     """
     return ContactModeDynamics(
-        s,
+        select_kink_sides(s, contact_state.is_kink_positive),
         *find_slot_contacts(friction, *contact_state[:2]),
         has_one_sided_stoppers,
         contact_state,
@@ -272,6 +315,7 @@ class GuardLayout(NamedTuple):
     rolling_rate_guard: int  # rate of rolling, dtheta
     collapse_guard: int  # length of the shortest leg minus a
     first_airborne_release_guard: int  # stopper force in the air, one per leg, if one-sided
+    first_kink_guard: int  # function of each kink on its present side, one per leg
     first_force_rate_guard: int  # absolute value of each of the `NormalForceRates`, if requested
     n_guards: int
 
@@ -290,12 +334,16 @@ class GuardLayout(NamedTuple):
 
 
 def make_guard_layout(
-    n_legs: int, has_one_sided_stoppers: bool, measures_force_peaks: bool = False
+    n_legs: int,
+    has_one_sided_stoppers: bool,
+    measures_force_peaks: bool = False,
+    n_kinks: int = 0,
 ) -> GuardLayout:
     """Return the guard layout for a wheel with `n_legs` legs.
 
     - `has_one_sided_stoppers`: whether legs in the air may leave their stoppers;
-    - `measures_force_peaks`: whether guards detect the extrema of normal forces.
+    - `measures_force_peaks`: whether guards detect the extrema of normal forces;
+    - `n_kinks`: number of kinks that the law of a leg declares.
     """
     guard_group_sizes = (
         n_legs,
@@ -308,6 +356,7 @@ def make_guard_layout(
         1,
         1,
         n_legs if has_one_sided_stoppers else 0,
+        n_kinks * n_legs,
         len(NormalForceRates._fields) if measures_force_peaks else 0,
     )
     guard_group_offsets = np.concatenate([[0], np.cumsum(guard_group_sizes)])
@@ -544,6 +593,12 @@ def evaluate_guards(
                 contact_quantities.airborne_stopper_forces,
             )
         )
+    if contact_state.is_kink_positive:
+        kinks = evaluate_leg_kinks(s, motion.L, motion.dL, number_legs(motion.L))
+        guards += [
+            replace_if_not_evaluated(~contact_state.is_leg_locked, side * value)
+            for side, value in zip(s.leg_force.sides, kinks, strict=True)
+        ]
     if contact_quantities.force_rates is not None and contact_state.force_rate_signs is not None:
         # If only the fore foot is loaded, the extrema of its force are those of the total force.
         is_fore_loaded = contact_state.contact_modes[0] != ContactMode.OFF
@@ -570,10 +625,24 @@ def compute_guard_scales(contact_mode_dynamics: ContactModeDynamics) -> Array:
         + [speed_scale / s.L0, s.L0]
     )
     guard_scales += [force_scale] * s.n * contact_mode_dynamics.has_one_sided_stoppers
+    if contact_mode_dynamics.contact_state.is_kink_positive:
+        guard_scales += _compute_kink_scales(s, speed_scale)
     if contact_mode_dynamics.measures_force_peaks:
         force_rate_scale = force_scale * speed_scale / s.L0
         guard_scales += [force_rate_scale] * 2 + [force_rate_scale * speed_scale / s.L0]
     return jnp.stack(guard_scales)
+
+
+def _compute_kink_scales(s: Symbols, speed_scale: Array) -> list[Array]:
+    """Return the scale of the function of each kink for each leg, from its derivatives."""
+    L = jnp.stack([s.L0] * s.n)
+    zero, speed = 0.0 * L, jnp.stack([speed_scale] * s.n)
+    evaluate = lambda L, dL: evaluate_leg_kinks(s, L, dL, number_legs(L))
+    changes = (
+        jax.jvp(evaluate, (L, zero), direction)[1] for direction in ((L, zero), (zero, speed))
+    )
+    scales = (jnp.abs(x) + jnp.abs(y) for x, y in zip(*changes, strict=True))
+    return [jnp.where(x > 0.0, x, 1.0) for scale in scales for x in scale]
 
 
 def compute_state_units(s: Symbols) -> tuple[Array, Array]:

@@ -184,6 +184,7 @@ class ContactIntervalLog(NamedTuple):
     v: Array  # rates and losses in the step so far, (intervals, 3 + n + N_LOSSES)
     contact_modes: Array  # contact mode of every foot, (intervals, legs)
     is_leg_locked: Array
+    is_kink_positive: tuple[Array, ...]
     durations: Array  # s
 
 
@@ -287,15 +288,16 @@ def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[.
             jnp.concatenate([start.v[:n], start.step_losses]),
             start.contact_state.contact_modes,
             start.contact_state.is_leg_locked,
+            start.contact_state.is_kink_positive,
             lane_state.interval_duration,
         )
 
     def sample_logged_interval(arguments: tuple, interval_log: ContactIntervalLog) -> Array:
         walk_settings, input_columns, x = prepare_resolved(arguments)
-        q, v, contact_modes, is_leg_locked, durations = interval_log
+        q, v, contact_modes, is_leg_locked, is_kink_positive, durations = interval_log
         dynamics = walk_settings.make_lane_contact_dynamics(
             walk_settings.replace_invalid_lanes(input_columns, x)[0],
-            ContactState.without_recent_changes(contact_modes, is_leg_locked),
+            ContactState.without_recent_changes(contact_modes, is_leg_locked, is_kink_positive),
         )
         arguments = dynamics, q, v, durations, n_samples, walk_settings.step_options
         if walk_settings.tableau is None:

@@ -36,10 +36,10 @@ from vrw_jax.models.unilateral_wheel import (
     AbstractContactWheel,
     UnilateralTrajectory,
     UnilateralWheel,
-    convert_smooth_leg_force,
     convert_torque_of_rate,
 )
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
+from vrw_jax.wheel.laws import convert_leg_force
 from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import WheelParams, convert_friction
 
@@ -242,7 +242,7 @@ class LadderWheel(AbstractContactWheel):
     can_walk_on_uneven_ground = False
 
     friction: Scalar = eqx.field(converter=convert_friction, default=0.7)
-    leg_force: Any = eqx.field(converter=convert_smooth_leg_force, default=None)
+    leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
     hub_torque: Any = eqx.field(converter=convert_torque_of_rate, default=None)
 
     if TYPE_CHECKING:

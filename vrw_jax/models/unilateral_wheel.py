@@ -45,7 +45,6 @@ from vrw_jax.models.viscoelastic import can_use_batch_kernel
 from vrw_jax.wheel.laws import (
     convert_hub_torque,
     convert_leg_force,
-    count_kinks,
     takes_angle,
 )
 from vrw_jax.wheel.params import (
@@ -60,17 +59,6 @@ STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
 """Kinds of stoppers for legs in the air: they hold the leg with any force, or they only push."""
 FRICTION_LIMIT, FRICTION_PAPER_RULE = "limit", "paper"
 """Meaning of infinite friction: limit of large friction, or rule (A1)-(A4) of the paper."""
-
-
-def convert_smooth_leg_force(leg_force: Any) -> Any:
-    """Return a law of the legs as `convert_leg_force` does, or raise an error if it has kinks."""
-    leg_force = convert_leg_force(leg_force)
-    if count_kinks(leg_force):
-        raise ValueError(
-            "leg_force declares kinks, but steps with unilateral contact do not stop there: give a "
-            "law without the method kinks, or take vrw.ViscoelasticWheel."
-        )
-    return leg_force
 
 
 def convert_torque_of_rate(hub_torque: Any) -> Any:
@@ -244,7 +232,7 @@ class UnilateralWheel(AbstractContactWheel):
     stoppers: str = eqx.field(static=True, default=STOPPERS_BILATERAL)
     restitution: Scalar | None = eqx.field(converter=_convert_restitution, default=None)
     infinite_friction_rule: str = eqx.field(static=True, default=FRICTION_LIMIT)
-    leg_force: Any = eqx.field(converter=convert_smooth_leg_force, default=None)
+    leg_force: Any = eqx.field(converter=convert_leg_force, default=None)
     hub_torque: Any = eqx.field(converter=convert_torque_of_rate, default=None)
     uneven: UnevenGround | None = None
 

@@ -496,7 +496,7 @@ class ModelSelectionScanEngine:
                 measure_name, (measure_name,)
             )
         )
-        self._paper_engine = CollocationScanEngine(
+        self._paper_engine = make_scan_engine(
             evaluation_request._replace(
                 measure_names=tuple(dict.fromkeys(paper_measure_names)),
                 wheel_model=self._paper_model,

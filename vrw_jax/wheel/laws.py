@@ -5,6 +5,7 @@ the hub is a function `f(dtheta, params)` of the rate at which the wheel turns, 
 `f(theta, dtheta, params)`. Laws are equinox modules, whose fields are parameters with derivatives.
 """
 
+import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -150,7 +151,9 @@ class OneSidedLegForce(eqx.Module):
 
     law: Any
     sides: Vector  # signs of the functions of the kinks
-    other_sides: Vector  # those of the neighboring legs
+    other_sides: Vector | None = None  # of the neighboring legs; None if `sides` has all legs
+    # whether the force has two sides at kinks that depend on the rate, as for a leg at rest
+    is_at_rest: bool = eqx.field(static=True, default=False)
 
     def __call__(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> Elementwise:
         length_unit = params.locked_length
@@ -164,6 +167,8 @@ class OneSidedLegForce(eqx.Module):
             value, slope_L = jax.jvp(evaluate, (inner_L, inner_dL), (one, zero))
             slope_dL = jax.jvp(evaluate, (inner_L, inner_dL), (zero, one))[1]
             step_L, step_dL = slope_L * length_unit, slope_dL * velocity_unit
+            if self.is_at_rest:
+                step_L, step_dL = jnp.where(step_dL == 0.0, step_L, 0.0), 0.0 * step_dL
             squared_slope = step_L * step_L + step_dL * step_dL
             squared_slope = jnp.where(squared_slope > 0.0, squared_slope, 1.0)
             missing_value = ONE_SIDED_DISTANCE * jnp.sqrt(squared_slope) - value
@@ -179,7 +184,12 @@ class OneSidedLegForce(eqx.Module):
         return evaluate_kinks(self.law, L, dL, params)
 
     def exchange(self) -> "OneSidedLegForce":
-        return OneSidedLegForce(_exchange_legs(self.law), self.other_sides, self.sides)
+        law = _exchange_legs(self.law)
+        if self.other_sides is not None:
+            return OneSidedLegForce(law, self.other_sides, self.sides, self.is_at_rest)
+        if law is self.law:
+            return self
+        return OneSidedLegForce(law, self.sides, is_at_rest=self.is_at_rest)
 
 
 class ScaledLegForce(eqx.Module):
@@ -251,8 +261,8 @@ def _exchange_legs(leg_force: Any) -> Any:
 
 
 def _apply_to_legs(
-    s: Symbols, evaluate: Callable[[Any], Elementwise], leg_numbers: int | np.ndarray
-) -> Elementwise:
+    s: Symbols, evaluate: Callable[[Any], Any], leg_numbers: int | np.ndarray
+) -> Any:
     """Return `evaluate(law)` for the law of each leg. Even legs may have another law."""
     has_odd_number = leg_numbers % 2 == 1
     other_law = _exchange_legs(s.leg_force)
@@ -260,7 +270,8 @@ def _apply_to_legs(
         return evaluate(s.leg_force)
     if not np.any(has_odd_number):
         return evaluate(other_law)
-    return jnp.where(has_odd_number, evaluate(s.leg_force), evaluate(other_law))
+    select_leg = lambda odd, even: jnp.where(has_odd_number, odd, even)
+    return jax.tree.map(select_leg, evaluate(s.leg_force), evaluate(other_law))
 
 
 def evaluate_leg_force(
@@ -273,16 +284,17 @@ def evaluate_leg_force(
     if s.leg_force is None:
         return s.k * (s.Ls - L) - s.c * dL
     params = _collect_law_parameters(s)
-    if isinstance(s.leg_force, OneSidedLegForce) and np.ndim(leg_numbers):
+    if np.ndim(leg_numbers) and getattr(s.leg_force, "other_sides", None) is not None:
         s = s._replace(leg_force=s.leg_force.law)  # The sides are those of Leg 1 and Leg 2.
     return _apply_to_legs(s, lambda law: law(L, dL, params), leg_numbers)
 
 
-def evaluate_leg_kinks(s: Symbols, L: Elementwise, dL: Elementwise, leg_number: int) -> Vector:
-    """Return the values of the functions that change sign at the kinks of a leg's force."""
+def evaluate_leg_kinks(
+    s: Symbols, L: Elementwise, dL: Elementwise, leg_numbers: int | np.ndarray
+) -> Vector:
+    """Return the values of the functions that change sign at the kinks of the forces of legs."""
     params = _collect_law_parameters(s)
-    law = s.leg_force if leg_number % 2 == 1 else _exchange_legs(s.leg_force)
-    return evaluate_kinks(law, L, dL, params)
+    return _apply_to_legs(s, lambda law: evaluate_kinks(law, L, dL, params), leg_numbers)
 
 
 def compute_damping_coefficient(s: Symbols, L: Elementwise, dL: Elementwise) -> Elementwise:
@@ -371,8 +383,11 @@ def evaluate_damping_power(
     s: Symbols, L: Elementwise, dL: Elementwise, leg_numbers: int | np.ndarray = 1
 ) -> Elementwise:
     """Return the power that a user's law dissipates along each leg, W."""
-    rest_force, force = (evaluate_leg_force(s, L, x, leg_numbers) for x in (0.0 * dL, dL))
-    return (rest_force - force) * dL
+    rest_law = s.leg_force
+    if isinstance(rest_law, OneSidedLegForce):
+        rest_law = dataclasses.replace(rest_law, is_at_rest=True)
+    rest_force = evaluate_leg_force(s._replace(leg_force=rest_law), L, 0.0 * dL, leg_numbers)
+    return (rest_force - evaluate_leg_force(s, L, dL, leg_numbers)) * dL
 
 
 def convert_leg_force(leg_force: Any) -> Any:
