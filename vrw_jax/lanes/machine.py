@@ -9,8 +9,12 @@ from enum import IntEnum
 
 from vrw_jax.lanes.llvm_library import is_llvmlite_installed, llvm
 
-LLVM_OPTIMIZATION_LEVEL = 2
-"""LLVM's optimization level (0 to 3) for register allocation and instruction scheduling."""
+LLVM_OPTIMIZATION_LEVEL = 1
+"""LLVM's optimization level (0 to 3) for register allocation and instruction scheduling.
+
+Level 2 would only order the same instructions again after registers are allocated. The code would
+not be faster, and would take a fifth longer to compile.
+"""
 LLVM_PASS_NAMES = (
     "global_dead_code_eliminate",
     "instruction_combine",

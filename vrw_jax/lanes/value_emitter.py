@@ -76,9 +76,10 @@ class ValueEmitter:
         python_number = (
             int(constant_value) if isinstance(llvm_type, ir.IntType) else float(constant_value)
         )
-        return self.llvm_constants.setdefault(
-            (str(llvm_type), repr(python_number)), ir.Constant(llvm_type, python_number)
-        )
+        constant_key = (str(llvm_type), repr(python_number))
+        if constant_key not in self.llvm_constants:
+            self.llvm_constants[constant_key] = ir.Constant(llvm_type, python_number)
+        return self.llvm_constants[constant_key]
 
     def to_lane_vector(self, scalar_value: LlvmValue) -> LlvmValue:
         """Return a vector whose entries all equal the LLVM value `scalar_value`.
