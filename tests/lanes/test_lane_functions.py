@@ -249,6 +249,16 @@ def test_results_without_entries_are_returned_beside_others():
         assert (double == 2.0).all()
 
 
+def test_loops_read_and_write_arrays_without_entries():
+    def double_rows(x):
+        rows = jnp.broadcast_to(x, (3, 2)), jnp.broadcast_to(x, (3, 0))
+        return lax.map(lambda row: (2.0 * row[0], 2.0 * row[1]), rows)
+
+    full, empty = lanes.jit(double_rows).batch(np.arange(5.0))
+    np.testing.assert_array_equal(full, np.broadcast_to(2.0 * np.arange(5.0), (2, 3, 5)).T)
+    assert empty.shape == (5, 3, 0)
+
+
 def test_batches_of_different_lengths_are_refused_in_one_sentence():
     compiled = lanes.jit(lambda x, y: x + y)
     with pytest.raises(ValueError, match=r"lengths \[3, 4\]: give 0 or None for each argument"):

@@ -25,6 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool
 
+from vrw_jax import lanes
 from vrw_jax.base.batch_algebra import (
     FusionBarrierFn,
     LaneArray,
@@ -49,6 +50,12 @@ from vrw_jax.gaits.gauss import (
     build_phase_integration_matrices,
     compute_lagrange_weights,
 )
+
+MIN_LOOPED_PARAMETERS = 3
+"""Least number of parameters whose tangents machine code computes in a loop.
+
+A loop over fewer tangents would shorten the code by less than it adds.
+"""
 
 PhaseConstants = tuple[Elementwise, ...]
 """Constants in the equations of motion of all phases, one array per constant."""
@@ -178,78 +185,92 @@ class _StateAndTangents(NamedTuple):
     state: _PhaseState
     tangents: _PhaseState
 
-    def evaluate_interval_nodes(
-        self,
-        interval_length_fraction: Array,
-        h: LaneArray,
-        node_accelerations: LaneArray,
-    ) -> tuple[Array, ...]:
-        """Return the coordinates, the rates and their tangents at the nodes of a mesh interval.
 
-        - `interval_length_fraction`: length of the interval as a fraction of the phase's duration;
-        - `h`: length of the interval, s;
-        - `node_accelerations`: shape (node, coordinate, batch).
-        """
-        state, tangents = self
+class _MeshInterval(NamedTuple):
+    """Mesh interval with the state at its start and the accelerations at its nodes.
+
+    - `length_fraction`: length of the interval as a fraction of the phase's duration;
+    - `h`: length of the interval, s;
+    - `node_accelerations`: shape (node, coordinate, batch).
+    """
+
+    state: _PhaseState
+    length_fraction: Array
+    h: LaneArray
+    node_accelerations: LaneArray
+
+    def evaluate_nodes(self) -> tuple[Array, Array]:
+        """Return the coordinates and the rates at the nodes."""
+        state, _, h, node_accelerations = self
         gauss_nodes_as_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
-        duration_unit_tangent = _make_unit_tangent(len(tangents.q), -1, h.dtype)
         rate_increments = apply_matrix(INTEGRATION_MATRIX, node_accelerations)
         position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, node_accelerations)
         node_q = state.q + h * (gauss_nodes_as_column * state.v + h * position_increments)
-        node_v = state.v + h * rate_increments
+        return node_q, state.v + h * rate_increments
+
+    def evaluate_node_tangents(
+        self, tangents: _PhaseState, duration_direction: np.ndarray
+    ) -> Array:
+        """Return the tangents of coordinates and rates at the nodes: (tangent, node, argument,
+        batch).
+
+        - `duration_direction`: tangent of the phase's duration in each direction.
+        """
+        state, length_fraction, h, node_accelerations = self
+        gauss_nodes_as_column = GAUSS_NODES.astype(h.dtype)[:, None, None]
+        rate_increments = apply_matrix(INTEGRATION_MATRIX, node_accelerations)
+        position_increments = apply_matrix(DOUBLE_INTEGRATION_MATRIX, node_accelerations)
         node_q_tangents = (
             tangents.q[:, None]
             + (h * gauss_nodes_as_column) * tangents.v[:, None]
-            + duration_unit_tangent
-            * (
-                interval_length_fraction
-                * (gauss_nodes_as_column * state.v + 2.0 * h * position_increments)
-            )
+            + duration_direction
+            * (length_fraction * (gauss_nodes_as_column * state.v + 2.0 * h * position_increments))
         )
-        node_v_tangents = tangents.v[:, None] + duration_unit_tangent * (
-            interval_length_fraction * rate_increments
+        node_v_tangents = tangents.v[:, None] + duration_direction * (
+            length_fraction * rate_increments
         )
-        return node_q, node_v, node_q_tangents, node_v_tangents
+        return jnp.concatenate([node_q_tangents, node_v_tangents], 2)
 
-    def evaluate_interval_end(
-        self,
-        interval_length_fraction: Array,
-        h: LaneArray,
-        node_accelerations: LaneArray,
-        acceleration_tangents: LaneArray,
-    ) -> "_StateAndTangents":
-        """Return the state and its tangents at the end of a mesh interval.
-
-        The arguments are those of `evaluate_interval_nodes`, and the tangents of the node
-        accelerations.
-        """
-        (held_constants, q, v), (held_constants_tangents, q_tangents, v_tangents) = self
-        duration_unit_tangent = _make_unit_tangent(len(q_tangents), -1, h.dtype)[:, 0]
+    def evaluate_end(self) -> _PhaseState:
+        """Return the state at the end of the interval."""
+        (held_constants, q, v), _, h, node_accelerations = self
         rate_increment = sum_with_weights(END_WEIGHTS, node_accelerations)
         position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, node_accelerations)
-        rate_increment_tangents = sum_with_weights(END_WEIGHTS, acceleration_tangents).swapaxes(
-            0, 1
+        return _PhaseState(
+            held_constants, q + h * v + h * h * position_increment, v + h * rate_increment
         )
-        position_increment_tangents = sum_with_weights(DOUBLE_END_WEIGHTS, acceleration_tangents)
-        position_increment_tangents = position_increment_tangents.swapaxes(0, 1)
+
+    def evaluate_end_tangents(
+        self,
+        tangents: _PhaseState,
+        duration_direction: np.ndarray,
+        acceleration_tangents: LaneArray,
+    ) -> _PhaseState:
+        """Return the tangents of the state at the end of the interval.
+
+        - `acceleration_tangents`: tangents of the node accelerations, which have the axes (node,
+          row, tangent, batch).
+        """
+        (_, _, v), length_fraction, h, node_accelerations = self
+        duration_direction = duration_direction[:, 0]
+        rate_increment = sum_with_weights(END_WEIGHTS, node_accelerations)
+        position_increment = sum_with_weights(DOUBLE_END_WEIGHTS, node_accelerations)
+        rate_increment_tangents, position_increment_tangents = (
+            sum_with_weights(weights, acceleration_tangents).swapaxes(0, 1)
+            for weights in (END_WEIGHTS, DOUBLE_END_WEIGHTS)
+        )
         q_tangents = (
-            q_tangents
-            + h * v_tangents
+            tangents.q
+            + h * tangents.v
             + h * h * position_increment_tangents
-            + duration_unit_tangent
-            * (interval_length_fraction * (v + 2.0 * h * position_increment))
+            + duration_direction * (length_fraction * (v + 2.0 * h * position_increment))
         )
         v_tangents = (
-            v_tangents
+            tangents.v
             + h * rate_increment_tangents
-            + duration_unit_tangent * (interval_length_fraction * rate_increment)
+            + duration_direction * (length_fraction * rate_increment)
         )
-        return _StateAndTangents(
-            _PhaseState(
-                held_constants, q + h * v + h * h * position_increment, v + h * rate_increment
-            ),
-            _PhaseState(held_constants_tangents, q_tangents, v_tangents),
-        )
+        return _PhaseState(tangents.held_constants, q_tangents, v_tangents)
 
 
 def _make_unit_tangent(n_tangents: int, tangent_index: int, float_dtype: Any) -> np.ndarray:
@@ -288,15 +309,44 @@ class _LinearizationContext(NamedTuple):
         """Return the slice that selects the tangents for the section state."""
         return slice(1, 1 + self.phase_sequence.section_size)
 
+    @property
+    def has_parameter_loop(self) -> bool:
+        """Return whether a loop computes the tangents for the parameters one after another, so that
+        machine code is short.
+        """
+        return lanes.targets_machine_code() and len(self.parameter_indices) >= MIN_LOOPED_PARAMETERS
+
+    def split_tangents(self, tangents: Any) -> tuple[Any, Any]:
+        """Return the tangents that belong to no parameter, and those for the parameters."""
+        parameter_slice = slice(self.section_tangent_slice.stop, self.n_tangents)
+        others = lambda x: jnp.concatenate([x[: parameter_slice.start], x[self.n_tangents :]])
+        return jax.tree.map(others, tangents), jax.tree.map(lambda x: x[parameter_slice], tangents)
+
+    def join_tangents(self, others: Any, parameter_tangents: Any) -> Any:
+        """Return the tangents whose parts `split_tangents` returns."""
+        n = self.section_tangent_slice.stop
+        join = lambda x, y: jnp.concatenate([x[:n], y, x[n:]])
+        return jax.tree.map(join, others, parameter_tangents)
+
     def evaluate_function_with_tangents(
         self, function_of_point: Callable, phase_point: tuple, point_tangents: tuple
     ) -> tuple:
         """Evaluate `function_of_point(*point, *phase_constants)` and its tangents."""
+        evaluate_at_constants = functools.partial(
+            evaluate_with_jvps,
+            lambda *phase_point: function_of_point(*phase_point, *self.phase_constants),
+            tuple(phase_point),
+        )
         if not self.parameter_indices:
-            return evaluate_with_jvps(
-                lambda *phase_point: function_of_point(*phase_point, *self.phase_constants),
-                tuple(phase_point),
-                point_tangents,
+            return evaluate_at_constants(point_tangents)
+        if self.has_parameter_loop:
+            others, parameter_tangents = self.split_tangents(tuple(point_tangents))
+            value, other_tangents = evaluate_at_constants(others)
+            primals = (*phase_point, *self.phase_constants)
+            compute_tangent = lambda t: jax.jvp(function_of_point, primals, t)[1]
+            return value, self.join_tangents(
+                other_tangents,
+                lax.map(compute_tangent, (*parameter_tangents, *self.phase_constants_tangents)),
             )
         tangent_padding = (
             (self.section_tangent_slice.stop, point_tangents[0].shape[0] - self.n_tangents),
@@ -374,22 +424,41 @@ class _LinearizationContext(NamedTuple):
             )
         )
 
-    def assemble_node_system(
-        self,
-        held_constants_tangents: LaneArray,
-        h: LaneArray,
-        linearized_residual: tuple,
-        state_tangents: LaneArray,
-    ) -> tuple[Array, Array]:
-        """Assemble the linear equations whose solutions are the tangents of the node accelerations.
+    def assemble_node_matrix(self, h: LaneArray, residual_jacobian: LaneArray) -> Any:
+        """Return the matrix of the linear equations whose solutions are the tangents of the node
+        accelerations.
+        """
+        n_coordinates = residual_jacobian.shape[1]
+        double_integration_matrix, integration_matrix = (
+            float64_matrix.astype(h.dtype)[:, None, :, None, None]
+            for float64_matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
+        )
+        residual_by_q, residual_by_v, residual_by_a = (
+            residual_jacobian[:, :, None, i * n_coordinates : (i + 1) * n_coordinates]
+            for i in range(3)
+        )
+        node_identity = np.eye(N_GAUSS_NODES, dtype=h.dtype)[:, None, :, None, None]
+        return node_identity * residual_by_a + h * (
+            h * double_integration_matrix * residual_by_q + integration_matrix * residual_by_v
+        )
 
-        Return the matrix and the right-hand sides. Each tangent has one right-hand side.
+    def assemble_right_hand_sides(
+        self,
+        linearized_residual: tuple,
+        held_constants_tangents: LaneArray,
+        node_tangents: LaneArray,
+        correction_direction: np.ndarray,
+    ) -> Array:
+        """Return the right-hand sides of these equations, one for each tangent.
+
+        - `linearized_residual`: the residual, its Jacobian, and its tangents for the parameters of
+          these tangents, if any;
+        - `correction_direction`: 1 for the tangent that is the Newton correction, 0 for others.
         """
         dynamics_residual, residual_jacobian, parameter_derivatives = linearized_residual
         n_coordinates = dynamics_residual.shape[1]
-        float_dtype = h.dtype
         tangent_terms = [
-            residual_jacobian[:, :, state_index] * state_tangents[:, :, state_index, None]
+            residual_jacobian[:, :, state_index] * node_tangents[:, :, state_index, None]
             for state_index in range(2 * n_coordinates)
         ]
         tangent_terms += [
@@ -397,27 +466,10 @@ class _LinearizationContext(NamedTuple):
             * held_constants_tangents[:, constant_index, None, None]
             for constant_index in range(held_constants_tangents.shape[1])
         ]
-        right_hand_sides = sum(
-            tangent_terms,
-            start=_make_unit_tangent(len(state_tangents), 0, float_dtype) * dynamics_residual,
-        )
-        if self.parameter_indices:
-            right_hand_sides = right_hand_sides + jnp.pad(
-                parameter_derivatives, ((self.section_tangent_slice.stop, 1), *((0, 0),) * 3)
-            )
-        double_integration_matrix, integration_matrix = (
-            float64_matrix.astype(float_dtype)[:, None, :, None, None]
-            for float64_matrix in (DOUBLE_INTEGRATION_MATRIX, INTEGRATION_MATRIX)
-        )
-        residual_by_q, residual_by_v, residual_by_a = (
-            residual_jacobian[:, :, None, i * n_coordinates : (i + 1) * n_coordinates]
-            for i in range(3)
-        )
-        node_identity = np.eye(N_GAUSS_NODES, dtype=float_dtype)[:, None, :, None, None]
-        system_matrix = node_identity * residual_by_a + h * (
-            h * double_integration_matrix * residual_by_q + integration_matrix * residual_by_v
-        )
-        return system_matrix, -jnp.moveaxis(right_hand_sides, 0, 2)
+        right_hand_sides = sum(tangent_terms, start=correction_direction * dynamics_residual)
+        if not isinstance(parameter_derivatives, tuple):
+            right_hand_sides = right_hand_sides + parameter_derivatives
+        return -jnp.moveaxis(right_hand_sides, 0, 2)
 
     def linearize_phase(
         self,
@@ -432,46 +484,92 @@ class _LinearizationContext(NamedTuple):
         Both have the directions of `phase_start`, and after them one further direction, that of the
         phase's duration.
         """
+        float_dtype = phase_duration.dtype
+        append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+        tangents = jax.tree.map(append_duration_tangent, phase_start.tangents)
+        parts = self.split_tangents(tangents) if self.has_parameter_loop else (tangents,)
+        n_tangents = len(parts[0].q)
+        correction_direction, duration_direction = (
+            _make_unit_tangent(n_tangents, i, float_dtype) for i in (0, -1)
+        )
+        no_direction = np.zeros((1, 1, 1, 1), float_dtype)
 
         def linearize_mesh_interval(
-            start: _StateAndTangents, interval_scan_inputs: tuple
-        ) -> tuple[_StateAndTangents, Array]:
-            node_accelerations, interval_length_fraction = interval_scan_inputs
-            h = interval_length_fraction * phase_duration
-            mesh_interval = interval_length_fraction, h, node_accelerations
-            node_q, node_v, node_q_tangents, node_v_tangents = self.prevent_fusion(
-                start.evaluate_interval_nodes(*mesh_interval)
+            start: tuple[_PhaseState, tuple[_PhaseState, ...]], interval_scan_inputs: tuple
+        ) -> tuple[tuple, tuple[Array, ...]]:
+            (state, (tangents, *parameter_tangents)) = start
+            node_accelerations, length_fraction = interval_scan_inputs
+            h = length_fraction * phase_duration
+            interval = _MeshInterval(state, length_fraction, h, node_accelerations)
+            node_q, node_v = self.prevent_fusion(interval.evaluate_nodes())
+            residual, jacobian, parameter_derivatives = self.linearize_residual(
+                phase, state.held_constants, node_q, node_v, node_accelerations
             )
-            linearized_residual = self.linearize_residual(
-                phase, start.state.held_constants, node_q, node_v, node_accelerations
-            )
-            # Axes: (tangent, node, argument, batch).
-            state_tangents = jnp.concatenate([node_q_tangents, node_v_tangents], 2)
-            node_system = self.prevent_fusion(
-                self.assemble_node_system(
-                    start.tangents.held_constants, h, linearized_residual, state_tangents
-                )
-            )
-            # Axes: (node, row, tangent, batch).
-            acceleration_tangents = self.prevent_fusion(
-                solve_node_equations(*node_system, self.parameters)
-            )
-            return (
-                start.evaluate_interval_end(*mesh_interval, acceleration_tangents),
-                jnp.moveaxis(acceleration_tangents, 2, 0),
-            )
+            node_matrix = self.prevent_fusion(self.assemble_node_matrix(h, jacobian))
 
-        append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+            def propagate_tangents(
+                tangents: _PhaseState,
+                directions: tuple[np.ndarray, np.ndarray],
+                parameter_derivatives: Any,
+            ) -> tuple[_PhaseState, Array]:
+                correction_direction, duration_direction = directions
+                right_hand_sides = self.assemble_right_hand_sides(
+                    (residual, jacobian, parameter_derivatives),
+                    tangents.held_constants,
+                    self.prevent_fusion(
+                        interval.evaluate_node_tangents(tangents, duration_direction)
+                    ),
+                    correction_direction,
+                )
+                # Axes: (node, row, tangent, batch).
+                acceleration_tangents = self.prevent_fusion(
+                    solve_node_equations(
+                        node_matrix, self.prevent_fusion(right_hand_sides), self.parameters
+                    )
+                )
+                return (
+                    interval.evaluate_end_tangents(
+                        tangents, duration_direction, acceleration_tangents
+                    ),
+                    jnp.moveaxis(acceleration_tangents, 2, 0),
+                )
+
+            def propagate_parameter_tangent(inputs: tuple) -> tuple[_PhaseState, Array]:
+                tangents, parameter_derivatives = jax.tree.map(lambda x: x[None], inputs)
+                results = propagate_tangents(
+                    tangents, (no_direction, no_direction), parameter_derivatives
+                )
+                return jax.tree.map(lambda x: x[0], results)
+
+            if self.parameter_indices and not parameter_tangents:
+                padding = ((self.section_tangent_slice.stop, 1), *((0, 0),) * 3)
+                parameter_derivatives = jnp.pad(parameter_derivatives, padding)
+            results = [
+                propagate_tangents(
+                    tangents,
+                    (correction_direction, duration_direction),
+                    () if parameter_tangents else parameter_derivatives,
+                )
+            ]
+            results += [
+                lax.map(propagate_parameter_tangent, (x, parameter_derivatives))
+                for x in parameter_tangents
+            ]
+            end_tangents, acceleration_tangents = zip(*results, strict=True)
+            return (interval.evaluate_end(), end_tangents), acceleration_tangents
+
         interval_length_fractions = jnp.asarray(
             phase_mesh.interval_length_fractions, phase_duration.dtype
         )
-        return lax.scan(
+        (state, parts), acceleration_tangents = lax.scan(
             linearize_mesh_interval,
-            phase_start._replace(
-                tangents=jax.tree.map(append_duration_tangent, phase_start.tangents)
-            ),
+            (phase_start.state, parts),
             (phase_accelerations, interval_length_fractions),
         )
+        # Axes: (tangent, interval, node, row, batch).
+        acceleration_tangents = tuple(jnp.swapaxes(x, 0, 1) for x in acceleration_tangents)
+        join = self.join_tangents if self.has_parameter_loop else lambda x: x
+        return _StateAndTangents(state, join(*parts)), join(*acceleration_tangents)
 
     def eliminate_phase_duration(
         self,
@@ -571,10 +669,7 @@ class _LinearizationContext(NamedTuple):
                 )
             )
             duration_tangents.append(phase_duration_tangents)
-            # Axes: (tangent, interval, node, row, batch).
-            acceleration_tangents.append(
-                eliminate_duration_tangent(jnp.swapaxes(phase_acceleration_tangents, 0, 1))
-            )
+            acceleration_tangents.append(eliminate_duration_tangent(phase_acceleration_tangents))
             phase_start = self.prevent_fusion(phase_start)
         # After the loop, the end belongs to the last phase, and the start to the next gait step.
         gait_step_tangent_outputs = (

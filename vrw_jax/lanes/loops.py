@@ -10,6 +10,7 @@ from vrw_jax.lanes.array_emitter import (
     ArrayEmitter,
     LaneAxisError,
     get_shape_without_lanes,
+    make_entry_array,
     split_into_entry_arrays,
 )
 from vrw_jax.lanes.lazy_arrays import (
@@ -97,7 +98,9 @@ def emit_scan_loop(
             "do the same to each lane, and give other axes another length."
         )
     scanned_arrays = [
-        x if isinstance(x, TransposedMemoryView) else array_emitter.store_array_in_memory(x)
+        x
+        if isinstance(x, TransposedMemoryView) or 0 in x.shape
+        else array_emitter.store_array_in_memory(x)
         for x in scanned_operands
     ]
     stacked_arrays = [
@@ -117,9 +120,9 @@ def emit_scan_loop(
         operands[n_loop_constants : n_loop_constants + n_carried_arrays],
     )
 
-    def get_scanned_slice(
-        scanned_array: MemoryArray | TransposedMemoryView, iteration_index: LlvmValue
-    ) -> LlvmArray:
+    def get_scanned_slice(scanned_array: LlvmArray, iteration_index: LlvmValue) -> LlvmArray:
+        if not isinstance(scanned_array, MemoryArray | TransposedMemoryView):
+            return make_entry_array(scanned_array.shape[1:], [])  # It has no entries.
         scanned_slice = scanned_array.get_subarray(iteration_index)
         fits_registers = (
             array_emitter.is_in_innermost_loop
@@ -144,9 +147,10 @@ def emit_scan_loop(
         for stacked_array, stacked_output in zip(
             stacked_arrays, body_results[n_carried_arrays:], strict=True
         ):
-            array_emitter.emit_array_stores(
-                stacked_array.get_subarray(iteration_index), stacked_output
-            )
+            if 0 not in stacked_array.shape:
+                array_emitter.emit_array_stores(
+                    stacked_array.get_subarray(iteration_index), stacked_output
+                )
         return loop_carry.get_next_register_values(body_results[:n_carried_arrays])
 
     final_loop_carry_arrays = loop_carry.make_loop_carry_arrays(
