@@ -113,7 +113,9 @@ class CollocationFinder(AbstractGaitFinder):
 
     def with_second_mesh(self) -> "CollocationFinder":
         """Return a finder for `jit`, which uses a fine mesh where its own mesh is too coarse."""
-        fine_intervals = tuple(map(max, self.cycle_options.mesh_intervals, SECOND_MESH_INTERVALS))
+        fine_intervals: Any = tuple(
+            map(max, self.cycle_options.mesh_intervals, SECOND_MESH_INTERVALS)
+        )
         return dataclasses.replace(
             self,
             cycle_options=dataclasses.replace(self.cycle_options, mesh_intervals=fine_intervals),

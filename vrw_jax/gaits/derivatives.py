@@ -196,6 +196,7 @@ def make_derivative_compiler(
     def compile_function(
         function_of_element: BatchFunction, derivative_order: int
     ) -> BatchFunction:
+        compiled: BatchFunction
         if derivative_order < n_compiled_orders:
             compiled = compile_batch_function(function_of_element, batch_size)
         else:
@@ -209,11 +210,11 @@ def skip_without_cycles(function: BatchFunction) -> BatchFunction:
     """Return a function whose results are zero for a batch that contains no cycle."""
 
     def evaluate(parameters: Array, trees: Any) -> Any:
-        find_state = lambda tree: (
-            tree if isinstance(tree, CollocationState) else find_state(tree[0])
-        )
+        state = trees
+        while not isinstance(state, CollocationState):  # Derivatives follow the state.
+            state = state[0]
         return lax.cond(
-            jnp.any(find_state(trees).has_cycle > 0.5),
+            jnp.any(state.has_cycle > 0.5),
             function,
             lambda *arguments: make_zeros_like_output(function, *arguments),
             parameters,

@@ -549,7 +549,7 @@ def _search_missing_cycles(
     missing = np.flatnonzero(search_result.collocation_state.has_cycle < 0.5)
     params = collocation_system.make_wheel(jax.device_put(parameters[:, missing]))
     model: Any = convert_model_argument(None).with_laws(params.laws)
-    gait_finder = make_finder(
+    gait_finder: Any = make_finder(
         dataclasses.replace(model, stop_at_lift_off=collocation_system.stop_at_lift_off),
         collocation_system.n_legs,
         period_n=collocation_system.period_n,
