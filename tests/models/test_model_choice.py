@@ -106,3 +106,9 @@ def test_a_walk_returns_to_the_papers_model_when_its_margins_hold_again():
     assert int(walk.steps.model_code[-1]) == ModelCode.VISCOELASTIC
     paper = vrw.limit_cycle(vrw.WheelParams())
     np.testing.assert_allclose(walk.steps.section_state[-1, :2], paper.section_state[:2], atol=1e-4)
+
+
+def test_a_batch_of_steps_has_one_model():
+    starts = np.tile(vrw.paper_start(), (2, 1))
+    with pytest.raises(ValueError, match="a batch of steps has one"):
+        vrw.step_batch(vrw.WheelParams(), starts, model=vrw.LadderWheel())

@@ -171,6 +171,11 @@ def step_batch(
         return _step_batch_of_own_walker(model, params, states, n_steps, options)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
     checked_model = convert_model_argument(model, allows_friction_arrays=True)
+    if checked_model.fallback_model is not checked_model:
+        raise ValueError(
+            "model selects a model for each wheel, but a batch of steps has one: give "
+            "vrw.ViscoelasticWheel() or vrw.UnilateralWheel(), or call vrw.step for each wheel."
+        )
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
     params = checked_model.attach_laws(params)
     checked_section_states = convert_section_state(states, "states", check_numpy_reals)
