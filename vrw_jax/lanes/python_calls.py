@@ -1,5 +1,6 @@
 """Python functions that JAX programs call, and that run JAX programs themselves."""
 
+import os
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -19,17 +20,20 @@ def dispatch_cpu_programs_synchronously() -> None:
     With asynchronous dispatch, programs that wait for Python functions can take all threads that
     these functions need.
     """
-    if not xla_bridge.backends_are_initialized() and not _spare_threads:
+    # XLA has one thread for each core, or as many as this variable states.
+    n_threads = int(os.environ.get("NPROC") or count_available_cores())
+    if n_threads > 1 and not xla_bridge.backends_are_initialized() and not _spare_threads:
         jax.config.update("jax_cpu_enable_async_dispatch", False)
-        _spare_threads.append(threading.Semaphore(count_available_cores() - 1))
+        _spare_threads.append(threading.Semaphore(n_threads - 1))
 
 
 def can_programs_call_jax() -> bool:
     """Return whether a Python function that a JAX program calls may run JAX programs itself.
 
-    Each such call holds a thread, and XLA has one thread for each core.
+    Each such call holds one of XLA's threads, and several devices would call at the same time.
     """
-    return bool(_spare_threads) and count_available_cores() > 1 and jax.default_backend() == "cpu"
+    is_one_cpu = jax.default_backend() == "cpu" and jax.local_device_count() == 1
+    return bool(_spare_threads) and is_one_cpu
 
 
 def call_python(
