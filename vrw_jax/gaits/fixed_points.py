@@ -50,7 +50,7 @@ class FixedPointResult(NamedTuple):
     - `termination`: `Termination` status of the simulation of a `ReturnMap` from `x`; None for any
       other map;
     - `n_invariants`: number of conserved quantities that the search kept, each of which has a
-      multiplier of 1.
+      multiplier of 1; None if it keeps none.
 
     Examples:
         >>> result = vrw.solve_fixed_point(lambda x: 0.5 * x + 1.0, jnp.zeros(1))
@@ -66,7 +66,7 @@ class FixedPointResult(NamedTuple):
     converged: Bool[Array, ""]
     n_iterations: Int[Array, ""]
     termination: Int[Array, ""] | None = None
-    n_invariants: Int[Array, ""] | int = 0
+    n_invariants: Int[Array, ""] | None = None
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
@@ -93,13 +93,12 @@ class FixedPointResult(NamedTuple):
                 return f"{convergence}. {UNIT_MULTIPLIER_ADVICE}"
             return convergence + ("." if converged else ": start nearer to the fixed point.")
 
+        n_invariants = np.asarray(0 if self.n_invariants is None else self.n_invariants)
         return format_each_batch_element(
             describe_convergence,
             self.converged,
             self.n_iterations,
-            np.asarray(
-                count_unit_multipliers(np.asarray(self.jacobian)) > np.asarray(self.n_invariants)
-            ),
+            np.asarray(count_unit_multipliers(np.asarray(self.jacobian)) > n_invariants),
         )
 
     def __repr__(self) -> str:
