@@ -541,7 +541,7 @@ def _search_missing_cycles(
     search_result: CycleSearchResult,
     *guess: CollocationState,
 ) -> CycleSearchResult:
-    """Return the result of a search with the cycles that all fallbacks find on the same mesh.
+    """Return the result of a search with the cycles that all fallbacks find on the fine mesh.
 
     JAX programs call this function. The last axis of the arrays is that of the wheels.
     """
