@@ -122,9 +122,12 @@ class CollocationFinder(AbstractGaitFinder):
             coarse_options=self.cycle_options,
         )
 
-    def with_finer_mesh(self) -> "CollocationFinder":
-        """Return a finder whose meshes are finer in each phase."""
-        return dataclasses.replace(self, cycle_options=self.cycle_options.refine_mesh())
+    def with_finer_mesh(self, n_doublings: int) -> "CollocationFinder":
+        """Return a finder whose numbers of mesh intervals are doubled `n_doublings` times."""
+        options = self.cycle_options
+        for _ in range(n_doublings):
+            options = options.refine_mesh()
+        return dataclasses.replace(self, cycle_options=options)
 
     @classmethod
     def read_measure(cls, measure_name: str, cycle: AbstractCycle, step: AbstractStep) -> Array:

@@ -34,8 +34,12 @@ MAX_UNREFINED_MESH_ERROR = 1e-7
 """Estimated mesh error above which a finer mesh is used. The value is chosen because actual errors
 are a hundredth of the estimate.
 """
-MAX_MESH_REFINEMENTS = 3
-"""Largest number of times that the number of mesh intervals is doubled."""
+MESH_DOUBLINGS = (2, 1)
+"""Number of times that the mesh intervals are doubled in each refinement of the mesh.
+
+The value is chosen because the search is compiled for each mesh, which takes longer than the search
+of a few gaits on a mesh with more intervals than they need.
+"""
 
 
 class MeshSearch(NamedTuple):
@@ -93,9 +97,9 @@ def search_further(
     coarse_wheels = np.flatnonzero(is_coarse)
     roots = select_tree_rows(collocation_state, coarse_wheels)
     gaits_by_mesh = []
-    for refinement_index in range(1 + (MAX_MESH_REFINEMENTS if can_refine_mesh else 0)):
-        if refinement_index:
-            finer_finder = gait_finder.with_finer_mesh()
+    for n_doublings in (0, *(MESH_DOUBLINGS if can_refine_mesh else ())):
+        if n_doublings:
+            finer_finder = gait_finder.with_finer_mesh(n_doublings)
             if len(coarse_wheels):
                 roots = transfer_to_mesh(gait_finder, finer_finder, roots, batch_sizes)
             gait_finder = finer_finder
@@ -109,7 +113,7 @@ def search_further(
                     walk_end_states[walking_wheels],
                 )
             )
-        if refinement_index and len(coarse_wheels):
+        if n_doublings and len(coarse_wheels):
             starts_by_origin.append(roots)
             wheels_by_origin.append(coarse_wheels)
         searched_wheels = np.concatenate(wheels_by_origin)
@@ -134,7 +138,7 @@ def search_further(
             is_coarse |= is_mesh_too_coarse & ~is_walking
             new_roots = select_tree_rows(mesh_search.collocation_state, is_coarse)
             walking_wheels = searched_wheels[is_walking & can_walk_help]
-            if refinement_index:
+            if n_doublings:
                 coarse_wheels, roots = searched_wheels[is_coarse], new_roots
             else:
                 coarse_wheels = np.concatenate([coarse_wheels, searched_wheels[is_coarse]])

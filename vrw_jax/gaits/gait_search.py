@@ -281,7 +281,7 @@ def limit_cycles(
     return _search_with_fallbacks(gait_finder, params, None, options is None, which)
 
 
-LAST_GAIT_DESCRIBERS[:] = [functools.partial(describe_last_gait, limit_cycle, limit_cycles)]
+LAST_GAIT_DESCRIBERS[:] = [functools.partial(describe_last_gait, limit_cycles)]
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
@@ -465,12 +465,11 @@ def _collect_starts_on_finest_mesh(
     """
     collocation_state = cycle.collocation_state
     for mesh_finder, wheel_indices, mesh_search in gaits_by_mesh:
-        while gait_finder.cycle_options != mesh_finder.cycle_options:
-            finer_finder = gait_finder.with_finer_mesh()
+        if gait_finder.cycle_options != mesh_finder.cycle_options:
             collocation_state = transfer_to_mesh(
-                gait_finder, finer_finder, collocation_state, batch_sizes.GAIT_BATCH_SIZES
+                gait_finder, mesh_finder, collocation_state, batch_sizes.GAIT_BATCH_SIZES
             )
-            gait_finder = finer_finder
+            gait_finder = mesh_finder
         collocation_state = replace_rows(
             collocation_state, wheel_indices, mesh_search.collocation_state
         )

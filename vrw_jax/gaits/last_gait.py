@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.further_search import MESH_DOUBLINGS
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
 from vrw_jax.lanes.batching import select_tree_rows
@@ -35,14 +37,12 @@ SMALL_QUANTITY_RATIO = 0.1
 """Ratio to the value in Table 1 below which a quantity is treated as the reason for the end."""
 
 
-def describe_last_gait(
-    find_gait: Callable[..., Any], find_gaits: Callable[..., Any], cycle: AbstractCycle
-) -> str:
+def describe_last_gait(find_gaits: Callable[..., Any], cycle: AbstractCycle) -> str:
     """Return sentences about the last gait on the way to the wheel of `cycle`, which has none.
 
     The text is empty if no gait of the wheel can exist, or if the gait has several steps.
 
-    - `find_gait`, `find_gaits`: functions that search for the gait of one wheel or of each wheel.
+    - `find_gaits`: function that searches for the gaits of a batch of wheels.
     """
     model, params = cycle.searched_wheel
     if cycle.period_n > 1 or model.explain_impossible_gait(params):
@@ -54,15 +54,19 @@ def describe_last_gait(
         values = jnp.asarray(start + fraction * change)
         return model.from_parameter_values(values, params.n_legs)[1]
 
+    finder: Any = make_finder(model, params.n_legs)
+    if isinstance(finder, CollocationFinder):  # One mesh is compiled, fine enough for most gaits.
+        finder = finder.with_finer_mesh(MESH_DOUBLINGS[0])
+
     def search_on_way(fractions: Any) -> Iterator[Any]:
         """Yield the cycle at each fraction of the way."""
         wheels = list(map(make_wheel, fractions))
-        if make_finder(model, params.n_legs).is_multistable:
+        if finder.is_multistable:
             # All wheels walk together.
             cycles = find_gaits(jax.tree.map(lambda *x: np.stack(x), *wheels), model=model)
             yield from (select_tree_rows(cycles, index) for index in range(len(wheels)))
         else:
-            yield from (find_gait(wheel, model=model) for wheel in wheels)
+            yield from map(finder.find_cycle, wheels)
 
     (first_gait,) = search_on_way([0.0])
     if first_gait.outcome != Outcome.STEPPED:
