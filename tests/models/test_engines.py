@@ -10,7 +10,7 @@ from vrw_jax import lanes
 from vrw_jax.base import batch_sizes
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, make_wheel_from_parameters
 
-N = 96
+N = 40
 ALL_INPUT_NAMES = ("section_state", *PARAMETER_NAMES)
 START = (0.1, 1.6, -0.1)
 MAX_PHASE_TIME_SECONDS = 5.0

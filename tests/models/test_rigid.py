@@ -1,5 +1,6 @@
 """The rigid wheel agrees with published closed forms, quadrature and the limit of stiff legs."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -99,8 +100,9 @@ def test_a_wheel_that_lands_before_the_vertical_steps(rate):
     np.testing.assert_allclose(result.section_state[1] ** 2, max(squared_rate, 0.0), rtol=1e-12)
 
 
+@eqx.filter_jit
 def finish(model, params, theta, dtheta):
-    state = jnp.asarray([theta, 1.0, 1.0, dtheta, 0.0, 0.0])
+    state = jnp.stack([theta, 1.0, 1.0, dtheta, 0.0, 0.0])
     return model.finish_step(params, 2, 0.7, state, vrw.StepOptions())
 
 
