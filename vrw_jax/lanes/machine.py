@@ -17,7 +17,6 @@ not be faster, and would take a fifth longer to compile.
 """
 LLVM_PASS_NAMES = (
     "global_dead_code_eliminate",
-    "instruction_combine",
     "simplify_cfg",
     "aggressive_dce",
     "sinking",
