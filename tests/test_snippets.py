@@ -24,9 +24,8 @@ PAGES = [
 SLOW_PAGES = {
     "docs/any_system.md", "docs/choose.md", "docs/own_loops.md", "docs/tuning.md",
     "docs/explanation/ladder.md",
-    "docs/explanation/batches.md", "docs/explanation/branches.md",
-    "docs/explanation/contact_gaits.md", "docs/explanation/contact_model.md",
-    "docs/explanation/numerics.md", "docs/explanation/tolerances.md",
+    "docs/explanation/branches.md", "docs/explanation/contact_model.md",
+    "docs/explanation/tolerances.md",
     *(f"docs/gallery/{page}.md" for page in PAGES_OF_WALKERS),
     "docs/howto/add_a_measure.md", "docs/howto/basins.md", "docs/howto/cluster.md",
     "docs/howto/export.md", "docs/howto/fit.md", "docs/howto/own_leg.md",
@@ -35,7 +34,6 @@ SLOW_PAGES = {
     "docs/studies/beyond_the_border.md", "docs/studies/borders.md",
     "docs/studies/double_support.md", "docs/studies/friction.md",
     "docs/studies/one_peak_or_two.md",
-    "docs/verification/contact.md",
 }  # fmt: skip
 """Pages that compile for long, or that a test of their own runs in the quick suite."""
 

@@ -12,7 +12,6 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import (
     FIGURES,
-    show_table,
     write_table,
 )
 from experiments.shared.wheels import WIDE_BOX
@@ -103,12 +102,6 @@ def main() -> None:
         measure_with_paper_model(best.params),
     )
     write_table(FIGURES / "tuning_on_ground.csv", FIELDS, rows)
-    show_table(
-        "studies/double_support.md",
-        FIGURES / "tuning_on_ground.csv",
-        "experiments.tuning.on_ground",
-        ("scene", "damping", "natural_length", "ending", "dls_fraction", "speed", "slip"),
-    )
 
 
 if __name__ == "__main__":

@@ -2,24 +2,21 @@
 
     python -m experiments.web.speed
 
-The command writes its table into docs/explore.md. It needs `node`, `chromium` and playwright
-(`.[web]`).
+The command prints a table. It needs `node`, `chromium` and playwright (`.[web]`).
 """
 
 import json
-import os
 import shutil
 import subprocess
 import tempfile
 from typing import Any
 
 from experiments.shared.command import make_parser, parse_and_start_jax, require_extra
-from experiments.shared.tables import describe_run, format_markdown, replace_block
+from experiments.shared.tables import describe_run, format_markdown
 from experiments.web.build import (
     CODE,
     FACTS,
     PAGE,
-    ROOT,
     SHARED_MODULE_NAME,
     SOURCES,
     read_page_content,
@@ -164,13 +161,7 @@ def main() -> None:
         ("unilateral contact: a map of 33 × 33 gaits", "", f"{wide:.0f} s"),
     ]  # fmt: skip
     table = format_markdown(("", "Node, CPU time", "Chromium, wall time, with drawing"), rows)
-    load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
-    replace_block(
-        ROOT / "docs" / "explore.md",
-        "speed",
-        f"{table}\n\n{load[0].upper()}{load[1:]}.",
-        describe_run("experiments.web.speed"),
-    )
+    print(table, describe_run("experiments.web.speed"), sep="\n\n")
 
 
 if __name__ == "__main__":
