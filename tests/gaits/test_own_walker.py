@@ -368,6 +368,13 @@ def test_tuning_ends_at_the_limit_of_a_measure_with_its_multiplier():
 
 KICKED_SYSTEM = dataclasses.replace(BALL_SYSTEM, ground={"slope": "kick"})
 KICKS = BALL_PARAMS | {"kick": np.ones(2)}
+
+
+def follow_kicked_system():
+    gait = vrw.limit_cycle(BALL_PARAMS, model=KICKED_SYSTEM)
+    return vrw.continue_branch(BALL_PARAMS, "kick", (0.9, 1.1), model=KICKED_SYSTEM, cycle=gait)
+
+
 CALLS = {
     "walker.step": lambda: BALL_SYSTEM.step(BALL_PARAMS, [2.0]),
     "step_batch": lambda: BALL_SYSTEM.step_batch(BALL_PARAMS, [[2.0]]),
@@ -427,6 +434,12 @@ CALLS = {
     ),
     "vrw.gait_sensitivity": lambda: vrw.gait_sensitivity(
         BALL_PARAMS, "height", model=KICKED_SYSTEM
+    ),
+    "vrw.measure_basins": lambda: vrw.measure_basins(
+        follow_kicked_system(), {"velocity": (1.0, 5.0)}, model=KICKED_SYSTEM, n_points=1
+    ),
+    "vrw.measure_gait_sensitivity": lambda: vrw.measure_gait_sensitivity(
+        follow_kicked_system(), "period", model=KICKED_SYSTEM, n_points=1
     ),
     "vrw.smallest_disturbance": lambda: vrw.smallest_disturbance(
         BALL_PARAMS, model=BALL_SYSTEM, coordinate="velocity"

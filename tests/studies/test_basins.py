@@ -11,7 +11,13 @@ from reference_code import five_coordinates
 from reference_code import five_coordinates_equations as equations
 from reference_code.constrained_wheel import Wheel, run_phase
 from support.slow_variants import mark_slow
-from support.walkers import BALL_PARAMS, BALL_SYSTEM, RIMLESS_WHEEL, SPOKE_HALF_ANGLE
+from support.walkers import (
+    BALL_PARAMS,
+    BALL_SYSTEM,
+    RIMLESS_WHEEL,
+    SPOKE_HALF_ANGLE,
+    JuggledBall,
+)
 
 import vrw_jax as vrw
 from vrw_jax.studies.basins import compute_share_error
@@ -312,6 +318,54 @@ def test_basins_along_a_branch_are_those_of_its_wheels():
         assert abs(float(basins.smallest_disturbance[i]) / size - 1.0) < 1e-5
     with pytest.raises(ValueError, match="give the model of the branch"):
         vrw.measure_basins(branch, model=vrw.RigidWheel())
+
+
+def test_disturbances_along_a_branch_of_an_own_walker_are_their_closed_forms():
+    """The pushed wheel has to reach the vertical."""
+    gait = vrw.limit_cycle({"slope": 0.2}, model=RIMLESS_WHEEL)
+    branch = vrw.continue_branch(
+        {"slope": 0.2}, "slope", (0.18, 0.22), model=RIMLESS_WHEEL, cycle=gait
+    )
+    basins = vrw.measure_basins(branch, model=RIMLESS_WHEEL, n_points=2, coordinate="rate")
+    slope = basins.slope.values
+    assert slope.tolist() == [0.18, 0.22]
+    lowest = np.sqrt(2.0 * GRAVITY * (1.0 - np.cos(slope - SPOKE_HALF_ANGLE)))
+    c = np.cos(2.0 * SPOKE_HALF_ANGLE)
+    # In a step, gravity adds to the square of the rate, of which the impact leaves the share c^2.
+    gain = 2.0 * GRAVITY * (np.cos(slope - SPOKE_HALF_ANGLE) - np.cos(slope + SPOKE_HALF_ANGLE))
+    rate = np.sqrt(c**2 * gain / (1.0 - c**2))
+    np.testing.assert_allclose(basins.smallest_disturbance, rate - lowest, atol=1e-7)
+    assert basins.smallest_disturbance.attrs["units"] == "rad/s"
+
+
+def test_shares_along_a_branch_of_an_own_walker_are_their_closed_forms():
+    """v' = e v + k is positive from v = -k / e on, and walks need log(1e-6) / log(e) steps."""
+    walker, box = JuggledBall(), {"velocity": (-3.0, 5.0)}
+    branch = vrw.continue_branch(
+        BALL_PARAMS, "ball.restitution", (0.5, 0.94), model=walker,
+        cycle=vrw.limit_cycle(BALL_PARAMS, model=walker),
+    )  # fmt: skip
+    basins = vrw.measure_basins(branch, box, model=walker, n_points=3, n_starts=256)
+    restitution = basins["ball.restitution"].values
+    assert restitution[[0, -1]].tolist() == [0.5, 0.94]
+    expected = (5.0 + 1.0 / restitution[:2]) / 8.0
+    # Points of a Sobol' sequence are distributed evenly.
+    np.testing.assert_allclose(basins.basin_share[:2], expected, atol=1.0 / 256)
+    assert np.isnan(basins.basin_share[2])
+    measure = functools.partial(vrw.measure_basins, branch, n_points=1)
+    with pytest.raises(ValueError, match="there is nothing to measure: give a box"):
+        measure(model=walker)
+    with pytest.raises(ValueError, match="JuggledBall cannot begin within a step"):
+        measure(model=walker, coordinate="velocity")
+    with pytest.raises(ValueError, match=r"a walker of yours, but model is Viscoelastic.*branch"):
+        measure(box)
+
+    class OtherBall(JuggledBall):
+        def advance(self, params, x, options):
+            return super().advance(params | {"kick": 2.0}, x, options)
+
+    with pytest.raises(ValueError, match="does not repeat after 1 step with OtherBall"):
+        measure(box, model=OtherBall())
 
 
 @pytest.mark.parametrize(

@@ -143,6 +143,29 @@ def test_norms_of_an_own_walker_are_those_of_a_geometric_series(ground):
     assert ("s per rad" if ground == "slope" else "s per m") in repr(result)
 
 
+def test_norms_along_a_branch_of_an_own_walker_are_those_of_a_geometric_series():
+    """Changes of the period by 2 / g times 1, e, e^2, ... have the norm 2 / g / sqrt(1 - e^2)."""
+    walker = type("Ball", (JuggledBall,), {"ground": {"slope": "kick"}})()
+    branch = vrw.continue_branch(
+        BALL_PARAMS, "ball.restitution", (0.2, 0.9), model=walker,
+        cycle=vrw.limit_cycle(BALL_PARAMS, model=walker),
+    )  # fmt: skip
+    norms = vrw.measure_gait_sensitivity(branch, "period", model=walker, n_points=3)
+    expected = 2.0 / GRAVITY / np.sqrt(1.0 - norms["ball.restitution"] ** 2)
+    np.testing.assert_allclose(norms.gait_sensitivity_period, expected, rtol=1e-12)
+    assert norms.gait_sensitivity_period.attrs["units"] == "s per rad"
+    with pytest.raises(ValueError, match="does not declare where the ground enters"):
+        vrw.measure_gait_sensitivity(branch, "period", model=JuggledBall())
+    with pytest.raises(ValueError, match="'speed' is no measure of a step of this walker"):
+        vrw.measure_gait_sensitivity(branch, "speed", model=walker)
+    two_steps = vrw.continue_branch(
+        BALL_PARAMS, "kick", (0.9, 1.1), model=walker, period_n=2,
+        cycle=vrw.limit_cycle(BALL_PARAMS, model=walker),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"repeat after 2 steps.*period_n=1"):
+        vrw.measure_gait_sensitivity(two_steps, "period", model=walker)
+
+
 NORM_NAMES = ["gait_sensitivity_period", "gait_sensitivity_speed"]
 
 

@@ -101,6 +101,10 @@ class AbstractWalker(abc.ABC):
         """Return all results of one step: those of `advance`, if there are no others."""
         return self.advance(params, x, options)
 
+    def with_parameter(self, params: Any, name: str, value: Any) -> tuple[Any, Any]:
+        """Return the walker and its parameters with a new value of one of them."""
+        return self, replace_tree_parameter(params, name, value)
+
     def with_step_ground(self, params: Any, step_parameters: Any) -> tuple[Any, Any]:
         """Return the walker and all its parameters in one step of a walk.
 

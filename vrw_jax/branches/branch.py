@@ -259,7 +259,9 @@ class Branch:
     - `special_points`: bifurcations, border collisions and ends;
     - `ends`: reasons for which the branch ends at its first and at its last point, or for which it
       has no point;
-    - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait from which a branch starts.
+    - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait from which a branch starts;
+    - `params`: parameters of the walker at the start of the branch, None for the branch of a map;
+    - `period_n`: number of steps after which the gaits of the branch repeat.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
@@ -273,6 +275,8 @@ class Branch:
     special_points: tuple[SpecialPoint, ...]
     ends: tuple[str, str]
     outcome: Outcome
+    params: Any = None
+    period_n: int = 1
 
     @property
     def values(self) -> np.ndarray:
@@ -286,6 +290,12 @@ class Branch:
         The multipliers of a point are in the order of decreasing modulus.
         """
         return self.dataset.multiplier_real.values + 1j * self.dataset.multiplier_imag.values
+
+    @property
+    def section_states(self) -> np.ndarray:
+        """Return the section state at which the gait at each point begins, shape (points, n)."""
+        dataset = self.dataset
+        return dataset["x" if "x" in dataset else "section_state"].values
 
     @property
     def stable(self) -> np.ndarray:

@@ -512,6 +512,7 @@ def continue_branches(
             step_options,
             outcome,
             problem_fields["own_measures"],
+            period_n,
         )
         for i, (data, outcome) in enumerate(
             zip(branch_data[:n_wheels], start_outcomes.tolist(), strict=False)
@@ -627,6 +628,7 @@ def _make_labeled_gait_branch(
     step_options: StepOptions,
     start_outcome: int,
     own_measures: tuple[Measure, ...],
+    period_n: int,
 ) -> Branch:
     start_provenance = collect_provenance_attributes(params, model, step_options)
     start_provenance.pop(f"parameter_{parameter_name}", None)
@@ -687,4 +689,7 @@ def _make_labeled_gait_branch(
         branch_coordinates,
         branch_attrs,
     )
-    return Branch(parameter_name, branch_dataset, special_points, end_reasons, Outcome.STEPPED)
+    return Branch(
+        parameter_name, branch_dataset, special_points, end_reasons, Outcome.STEPPED,
+        params.attach_laws(None), period_n,
+    )  # fmt: skip

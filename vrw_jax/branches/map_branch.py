@@ -578,7 +578,7 @@ def continue_hybrid_branch(
             x = take_step(x)
         return x
 
-    return trace_map_branch(
+    branch = trace_map_branch(
         functools.partial(
             HybridContinuation, walker=walker, name=name, period_n=n_periods * period_n,
             step_options=step_options, margins=own_margins, measures=measures,
@@ -587,3 +587,4 @@ def continue_hybrid_branch(
         map_section_state, gait.section_state, start_value, bounds, params, name, None, options,
         switch_at,
     )  # fmt: skip
+    return dataclasses.replace(branch, params=params, period_n=n_periods * period_n)

@@ -340,17 +340,13 @@ class StableGait(NamedTuple):
         else:
             model = convert_model_argument(model).fallback_model  # valid for any start
             require_single_wheel(params, f"call {caller_name} for one wheel after the other")
-        if changes_within_step and not model.can_start_within_gait_step:
-            raise ValueError(
-                f"{type(model).__name__} cannot begin within a step, so that {changes_within_step} "
-                "within a step are not available: take ViscoelasticWheel(), RigidWheel() or a "
-                "HybridSystem, or disturb starts by vrw.basin_share."
-            )
+        if changes_within_step:
+            require_start_within_step(model, changes_within_step)
         options = convert_step_options(options)
         options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
-        leg_models = [model] if is_own else model.list_models_of_legs()
         if cycle is None:
-            cycle = limit_cycle(params, model=model, period_n=len(leg_models))
+            leg_period = getattr(model, "leg_period", 1)
+            cycle = limit_cycle(params, model=model, period_n=leg_period)
         cycle_type: Any = HybridGait if is_own else AbstractCycle
         check_type("cycle", cycle, cycle_type, "give vrw.limit_cycle(params, model=...)")
         if int(cycle.outcome) != Outcome.STEPPED:
@@ -372,20 +368,39 @@ class StableGait(NamedTuple):
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable: "
                 "take parameters whose gait has a spectral radius below 1."
             )
-        section_states = [np.asarray(cycle.section_state)[None]]
+        return cls.from_section_state(
+            params, model, options, cycle.section_state, period_n, spectral_radius
+        )
+
+    @classmethod
+    def from_section_state(
+        cls,
+        params: Any,
+        model: Any,
+        options: StepOptions,
+        section_state: Any,
+        period_n: int,
+        spectral_radius: float = np.nan,
+    ) -> "StableGait":
+        """Return the gait that begins at a section state, or raise an error if it does not repeat
+        after `period_n` steps.
+        """
+        leg_models = [model] if is_own_walker(model) else model.list_models_of_legs()
+        section_states = [np.asarray(section_state)[None]]
         for k in range(period_n):
             leg_model = leg_models[k % len(leg_models)]
             steps = step_batch(params, section_states[-1], model=leg_model, options=options)
             section_states.append(steps.section_state)
-        stable_gait = cls(
+        gait = cls(
             params, model, options, np.concatenate(section_states[:-1]), np.array(spectral_radius)
         )
-        if not stable_gait.is_on_gait(section_states[-1])[0]:
+        if not gait.is_on_gait(section_states[-1])[0]:
             raise ValueError(
-                f"cycle does not repeat after {period_n} step{'s' * (period_n > 1)} with "
-                f"{type(model).__name__}: give a cycle of the same parameters and model."
+                f"the gait does not repeat after {period_n} step{'s' * (period_n > 1)} with "
+                f"{type(model).__name__}: give a cycle of the same parameters and model, or the "
+                "model of the branch."
             )
-        return stable_gait
+        return gait
 
     def is_on_gait(self, section_states: np.ndarray, n_steps: int = 0) -> np.ndarray:
         """Return whether each section state agrees with a section state of the gait, shape
@@ -406,6 +421,16 @@ class StableGait(NamedTuple):
         gait_states = self.section_states[n_steps % leg_period :: leg_period, :n_entries]
         differences = section_states[:, None, :n_entries] - gait_states
         return np.abs(differences / units).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
+
+
+def require_start_within_step(model: Any, changes: str) -> None:
+    """Raise an error if a model cannot begin within a step, as `changes` there need."""
+    if not model.can_start_within_gait_step:
+        raise ValueError(
+            f"{type(model).__name__} cannot begin within a step, so that {changes} within a step "
+            "are not available: take ViscoelasticWheel(), RigidWheel() or a HybridSystem, or "
+            "disturb starts by vrw.basin_share."
+        )
 
 
 # Number of gait steps between two tests, chosen because more frequent tests need many calls, and

@@ -5,10 +5,11 @@ The gait sensitivity norm is the variation of a gait's measures on slightly unev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -34,13 +35,19 @@ from vrw_jax.gaits.finder_selection import UserCycleGuess, resolve_finder
 from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.slope_response import compute_sensitivity_norms
-from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.measures import MEASURES, make_measure_attributes
-from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import ModelLike, convert_model_argument, convert_step_options
-from vrw_jax.studies.basins import StableGait, StartBox, compute_basin_share, parse_start_box
-from vrw_jax.studies.stride_pushes import compute_smallest_disturbance
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.studies.basins import (
+    MAX_ARRIVAL_DISTANCE,
+    StableGait,
+    StartBox,
+    compute_basin_share,
+    parse_start_box,
+)
+from vrw_jax.studies.stride_pushes import (
+    check_pushed_coordinate,
+    compute_smallest_disturbance,
+    find_coordinate_unit,
+)
 
 
 class GaitSensitivity(AbstractPrintable):
@@ -227,15 +234,6 @@ def compute_gait_sensitivity(
     )
 
 
-BASIN_VARIABLE_ATTRS = {
-    "basin_share": ("1", "share of the box of starts that ends up on the gait"),
-    "basin_share_error": ("1", "standard error of that share"),
-    "smallest_disturbance": ("rad/s", "smallest change of dtheta that leaves the basin"),
-    "smallest_disturbance_error": ("rad/s", "error of that change"),
-}
-"""Unit and meaning of each variable in the dataset that `measure_basins` returns."""
-
-
 @announce_wait("gaits and walks", "20 s")
 def measure_basins(
     branch: Branch,
@@ -246,23 +244,26 @@ def measure_basins(
     n_points: int = 16,
     n_starts: int = 1024,
     max_steps: int = 200,
+    coordinate: str | None = None,
 ) -> xr.Dataset:
     """Return the sizes of the basins of attraction of the stable gaits on a branch.
 
     The result has at most `n_points` points, evenly spaced over the points of the branch, both ends
     included. Its coordinate is the parameter of the branch. Variables are NaN at points of unstable
-    gaits. With a `box`, the variables include `basin_share` and `basin_share_error` (see
-    `basin_share`). For models that can start within a step, the variables include
-    `smallest_disturbance` and `smallest_disturbance_error`, rad/s (see `smallest_disturbance`).
+    gaits, and of gaits so slow that walks do not arrive within `max_steps`. With a `box`, the
+    variables include `basin_share` and `basin_share_error` (see `basin_share`). For models of the
+    wheel that can start within a step, and for a `HybridSystem` with a `coordinate`, the variables
+    include `smallest_disturbance` and `smallest_disturbance_error` (see `smallest_disturbance`).
 
     Args:
-        branch: a branch of gaits of one step, from `continue_branch`.
+        branch: a branch of gaits, from `continue_branch`.
         box: bounds of the starts, as in `basin_share`; without a box, no shares are computed.
-        model: the model of the branch, if it is not the paper's.
+        model: the model of the branch, if it is not the paper's. A walker of yours may be given.
         options: numerical options of the gait steps.
         n_points: largest number of points.
         n_starts: number of start states at each point.
         max_steps: largest number of gait steps of a walk.
+        coordinate: for a `HybridSystem`, name of the coordinate that disturbances change.
 
     Returns:
         A dataset with the dimension `point`.
@@ -275,35 +276,47 @@ def measure_basins(
         >>> vrw.measure_basins(branch, n_points=2).smallest_disturbance.values.round(3).tolist()
         [0.126, 0.109]
     """
-    checked_model = convert_model_argument(model)
+    checked_model = _check_branch_model(branch, model)
     checked_step_options = convert_step_options(options)
     n_starts, max_steps = check_int("n_starts", n_starts), check_int("max_steps", max_steps)
     box_bounds = None if box is None else parse_start_box(box, checked_model)
-    can_start_within_step = checked_model.can_start_within_gait_step
-    names = ["basin_share", "basin_share_error"] if box_bounds else []
-    if can_start_within_step:
-        names += ["smallest_disturbance", "smallest_disturbance_error"]
+    variables = {}
+    if box_bounds:
+        variables["basin_share"] = ("1", "share of the box of starts that ends up on the gait")
+        variables["basin_share_error"] = ("1", "standard error of that share")
+    if coordinate is not None or (
+        checked_model.is_wheel and checked_model.can_start_within_gait_step
+    ):
+        coordinate = check_pushed_coordinate(checked_model, coordinate)
+        unit = find_coordinate_unit(checked_model, coordinate)
+        meaning = f"smallest change of {coordinate} that leaves the basin"
+        variables["smallest_disturbance"] = (unit, meaning)
+        variables["smallest_disturbance_error"] = (unit, "error of that change")
+    if not variables:
+        raise ValueError(
+            "box and coordinate are None, so that there is nothing to measure: give a box of "
+            "starts, or for a HybridSystem the coordinate that disturbances change."
+        )
 
     def measure_gait(gait: StableGait) -> list[float]:
         values: list[float] = []
         if box_bounds:
             share = compute_basin_share(gait, box_bounds, n_starts, max_steps)
             values += [share.share, share.share_error]
-        if can_start_within_step:
-            disturbance = compute_smallest_disturbance(gait, None, max_steps)
+        if coordinate is not None:
+            disturbance = compute_smallest_disturbance(gait, None, max_steps, coordinate)
             values += [disturbance.size, disturbance.size_error]
         return values
 
-    return _measure_along_branch(
-        branch,
-        checked_model,
-        checked_step_options,
-        n_points,
-        measure_gait,
-        lambda: {name: BASIN_VARIABLE_ATTRS[name] for name in names},
-        "Basins of the gaits",
-        has_unstable_gaits=False,
-    )
+    points = _space_branch_points(branch, n_points)
+    distances_left = branch.dataset.spectral_radius.values**max_steps
+    rows = [
+        measure_gait(_load_branch_gait(branch, i, checked_model, checked_step_options))
+        if distances_left[i] <= MAX_ARRIVAL_DISTANCE
+        else [np.nan] * len(variables)
+        for i in points
+    ]
+    return _make_branch_dataset(branch, points, rows, variables, "Basins of the gaits")
 
 
 @announce_wait("gaits and their response to slopes", "20 s")
@@ -319,14 +332,15 @@ def measure_gait_sensitivity(
 
     The result has at most `n_points` points, evenly spaced over the points of the branch, both ends
     included. Its coordinate is the parameter of the branch. The variable
-    `gait_sensitivity_<measure>` contains the norm of one measure, in the measure's unit per rad
-    (see `gait_sensitivity`). The norm is infinite at points of unstable gaits. Next to a fold two
-    gaits may be too close for `limit_cycle` to separate. The norm is then NaN.
+    `gait_sensitivity_<measure>` contains the norm of one measure, in the measure's unit per rad, or
+    per m (see `gait_sensitivity`). The norm is infinite at points of unstable gaits. Next to a fold
+    two gaits may be too close for `limit_cycle` to separate. The norm is then NaN.
 
     Args:
         branch: a branch of gaits of one step, from `continue_branch`.
         measures: names of measures of a gait step, such as "period", "speed" or a margin.
-        model: the model of the branch, if it is not the paper's.
+        model: the model of the branch, if it is not the paper's. A walker of yours may be given,
+            whose `ground` is declared.
         options: as in `limit_cycle`.
         n_points: largest number of points; by default all points of the branch.
 
@@ -342,124 +356,94 @@ def measure_gait_sensitivity(
         >>> norms.gait_sensitivity_period.values.round(3).tolist()
         [3.365, 3.509]
     """
-    checked_model = convert_model_argument(model)
-    measure_names = check_names("measures", measures)
-
-    def measure_gait(gait: StableGait) -> Any:
-        cycle_finder = resolve_finder(gait.params, gait.model, options)
-        parse_sensitivity_measures(cycle_finder, measure_names)
-        cycle: Any = limit_cycle(
-            gait.params, guess=gait.section_states[0], model=gait.model, options=options
+    checked_model = _check_branch_model(branch, model)
+    if branch.period_n > 1:
+        raise ValueError(
+            f"the gaits of the branch repeat after {branch.period_n} steps, but the norm is that "
+            "of gaits of one step: continue a branch with period_n=1."
         )
+    measure_names, rows = check_names("measures", measures), []
+    points = _space_branch_points(branch, n_points)
+    for i in points:
+        gait = _load_branch_gait(branch, i, checked_model, StepOptions())
+        guess = gait.section_states[0]
+        cycle_finder = resolve_finder(gait.params, gait.model, options, guess=guess)
+        parse_sensitivity_measures(cycle_finder, measure_names)
+        cycle: Any = limit_cycle(gait.params, guess=guess, model=gait.model, options=options)
         is_same_gait = (
             int(cycle.outcome) == Outcome.STEPPED
             and gait.is_on_gait(np.asarray(cycle.section_state)[None])[0]
         )
-        if not is_same_gait:
-            return [np.nan] * len(measure_names)
-        return compute_gait_sensitivity(cycle_finder, gait.params, cycle, measure_names).norm
-
-    return _measure_along_branch(
-        branch,
-        checked_model,
-        StepOptions(),
-        n_points,
-        measure_gait,
-        lambda: {
-            f"gait_sensitivity_{name}": (
-                f"{MEASURES[name].unit} per rad",
-                f"gait sensitivity norm of {MEASURES[name].long_name}",
-            )
-            for name in measure_names
-        },
-        "Gait sensitivity norms",
-    )
-
-
-def _measure_along_branch(
-    branch: Branch,
-    model: AbstractWheel,
-    options: StepOptions,
-    n_points: int | None,
-    measure_gait: Callable[[StableGait], Any],
-    describe_variables: Callable[[], dict[str, tuple[str, str]]],
-    title: str,
-    has_unstable_gaits: bool = True,
-) -> xr.Dataset:
-    """Return a dataset of variables at points of a branch, with the parameter as coordinate.
-
-    The points are evenly spaced, and both ends are included. Raise TypeError or ValueError if an
-    argument is invalid, or if the branch has another model or no point.
-
-    - `n_points`: largest number of points, or None for all points;
-    - `measure_gait`: function of a gait that returns all variables;
-    - `describe_variables`: function that returns unit and meaning of each variable;
-    - `has_unstable_gaits`: whether unstable gaits are measured too. Otherwise they have NaN.
-    """
-    check_type("branch", branch, Branch, "give the result of vrw.continue_branch")
-    branch_attrs = branch.dataset.attrs
-    if branch_attrs.get("model") != repr(model):
-        raise ValueError(
-            f"the branch is one of {branch_attrs.get('model', 'a map')}, but model is "
-            f"{model!r}: give the model of the branch."
+        row: Any = [np.nan] * len(measure_names)
+        if is_same_gait:
+            row = compute_gait_sensitivity(cycle_finder, gait.params, cycle, measure_names).norm
+        rows.append(row)
+    variables = {
+        f"gait_sensitivity_{measure.name}": (
+            f"{measure.unit} per {cycle_finder.disturbance_unit}",
+            f"gait sensitivity norm of {measure.long_name}",
         )
+        for measure in map(cycle_finder.get_measure, measure_names)
+    }
+    return _make_branch_dataset(branch, points, rows, variables, "Gait sensitivity norms")
+
+
+def _check_branch_model(branch: Branch, model: ModelLike | None) -> Any:
+    """Return the model, or raise an error if the branch has another one."""
+    check_type("branch", branch, Branch, "give the result of vrw.continue_branch")
+    is_own, branch_model = is_own_walker(model), branch.dataset.attrs.get("model")
+    checked_model: Any = model if is_own else convert_model_argument(model)
+    if is_own and branch_model is None and branch.params is not None:
+        return model
+    if is_own or branch_model != repr(checked_model):
+        raise ValueError(
+            f"the branch is one of {branch_model or 'a map or a walker of yours'}, but model is "
+            f"{checked_model!r}: give the model of the branch."
+        )
+    return checked_model
+
+
+def _space_branch_points(branch: Branch, n_points: int | None) -> list[int]:
+    """Return the indices of evenly spaced points of a branch, of all if `n_points` is None."""
     n_branch_points = len(branch.values)
     if not n_branch_points:
         raise ValueError(
-            f"the branch has no gait: {branch.ending} Take a wheel for which vrw.limit_cycle finds "
-            "a gait."
+            f"the branch has no gait: {branch.ending} Take a walker for which vrw.limit_cycle "
+            "finds a gait."
         )
     if n_points is not None:
         n_points = min(check_int("n_points", n_points), n_branch_points)
     spaced_points = np.linspace(0, n_branch_points - 1, n_points or n_branch_points)
-    indices = np.unique(spaced_points.round().astype(int)).tolist()
-    rows = [
-        measure_gait(_load_branch_gait(branch, i, model, options))
-        if has_unstable_gaits or branch.stable[i]
-        else [np.nan] * len(describe_variables())
-        for i in indices
-    ]
-    variables = {
-        name: xr.Variable("point", values, {"units": unit, "long_name": meaning})
-        for (name, (unit, meaning)), values in zip(
-            describe_variables().items(), np.array(rows, float).T, strict=True
-        )
-    }
-    parameter = xr.Variable(
-        "point", branch.values[indices], make_measure_attributes(branch.parameter)
-    )
-    return xr.Dataset(
-        variables,
-        {branch.parameter: parameter},
-        branch_attrs | {"title": f"{title} along {branch.parameter}"},
-    )
+    return np.unique(spaced_points.round().astype(int)).tolist()
 
 
-def _load_branch_gait(
-    branch: Branch, point_index: int, model: AbstractWheel, options: StepOptions
-) -> StableGait:
-    """Return the gait of one step at point `point_index` of a branch, stable or not.
+def _load_branch_gait(branch: Branch, point: int, model: Any, options: StepOptions) -> StableGait:
+    """Return the gait at a point of a branch, stable or not."""
+    value = jnp.asarray(branch.values[point], jnp.result_type(*jax.tree.leaves(branch.params)))
+    model, params = model.with_parameter(branch.params, branch.parameter, value)
+    section_state = branch.section_states[point]
+    return StableGait.from_section_state(params, model, options, section_state, branch.period_n)
 
-    Raise ValueError if the gait does not repeat after one step.
+
+def _make_branch_dataset(
+    branch: Branch,
+    points: list[int],
+    rows: list[Any],
+    variables: Mapping[str, tuple[str, str]],
+    title: str,
+) -> xr.Dataset:
+    """Return a dataset over points of a branch.
+
+    - `rows`: values of all variables at each point;
+    - `variables`: unit and meaning of each variable.
     """
-    branch_attrs, float_dtype = branch.dataset.attrs, branch.dataset.attrs["dtype"]
-    parameter_values = {
-        parameter_name: jnp.asarray(branch_attrs[f"parameter_{parameter_name}"], float_dtype)
-        for parameter_name in PARAMETER_NAMES
-        if f"parameter_{parameter_name}" in branch_attrs
-    }
-    params = WheelParams(**parameter_values, n_legs=branch_attrs["parameter_n_legs"])
-    point_model, params = model.with_parameter(
-        params, branch.parameter, jnp.asarray(branch.values[point_index], float_dtype)
+    parameter = branch.dataset[branch.parameter]
+    columns = np.array(rows, float).T
+    return xr.Dataset(
+        {
+            name: ("point", values, {"units": unit, "long_name": meaning})
+            for (name, (unit, meaning)), values in zip(variables.items(), columns, strict=True)
+        },
+        {branch.parameter: ("point", branch.values[points], parameter.attrs)},
+        branch.dataset.attrs | {"title": f"{title} along {branch.parameter}"},
     )
-    section_state = np.asarray(branch.dataset.section_state.values[point_index])[None]
-    stable_gait = StableGait(params, point_model, options, section_state)
-    next_section_state = step_batch(
-        params, section_state, model=point_model, options=options
-    ).section_state
-    if not stable_gait.is_on_gait(next_section_state)[0]:
-        raise ValueError(
-            "a gait of the branch does not repeat after one step, but robustness along branches is "
-            "that of gaits of one step: continue a branch with period_n=1."
-        )
-    return stable_gait

@@ -28,7 +28,12 @@ from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.models.stepping import ModelLike
-from vrw_jax.studies.basins import MAX_ARRIVAL_DISTANCE, StableGait, walk_until_on_gait
+from vrw_jax.studies.basins import (
+    MAX_ARRIVAL_DISTANCE,
+    StableGait,
+    require_start_within_step,
+    walk_until_on_gait,
+)
 
 DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
 """Signs of the change in backward and forward disturbances, in this order."""
@@ -165,7 +170,14 @@ def smallest_disturbance(
             f"max_steps is {max_steps}, but the gait has spectral radius {spectral_radius:.6g}, so "
             f"that walks need {n_steps} steps to arrive: give max_steps={2 * n_steps}."
         )
-    names = tuple(stable_gait.model.state) if _is_system(stable_gait) else ("dtheta",)
+    coordinate = check_pushed_coordinate(stable_gait.model, coordinate)
+    return compute_smallest_disturbance(stable_gait, max_size, max_steps, coordinate)
+
+
+def check_pushed_coordinate(model: Any, coordinate: str | None) -> str:
+    """Return the name of the coordinate that disturbances change, or raise an error."""
+    require_start_within_step(model, "disturbances")
+    names = tuple(model.state) if isinstance(model, HybridSystem) else ("dtheta",)
     if coordinate is None and len(names) > 1:
         raise ValueError(
             f"coordinate is None, but the disturbance changes one coordinate of the state: name "
@@ -173,7 +185,12 @@ def smallest_disturbance(
         )
     coordinate = names[0] if coordinate is None else coordinate
     require_known_name(coordinate, names, "coordinate")
-    return compute_smallest_disturbance(stable_gait, max_size, max_steps, coordinate)
+    return coordinate
+
+
+def find_coordinate_unit(model: Any, coordinate: str) -> str:
+    """Return the unit of a coordinate that disturbances change, "" if it is not declared."""
+    return model.state_units.get(coordinate, "") if isinstance(model, HybridSystem) else "rad/s"
 
 
 def _is_system(gait: StableGait) -> bool:
@@ -322,7 +339,7 @@ def compute_smallest_disturbance(
         max_size=max_size,
         phase_names=tuple(system.modes) if system else WHEEL_PHASE_NAMES,
         coordinate=coordinate,
-        unit=system.state_units.get(coordinate, "") if system else "rad/s",
+        unit=find_coordinate_unit(stable_gait.model, coordinate),
     )
 
 
