@@ -14,6 +14,9 @@ from support.slow_variants import mark_slow
 from support.walkers import (
     BALL_PARAMS,
     BALL_SYSTEM,
+    LOGISTIC_A,
+    LOGISTIC_BALL,
+    LOGISTIC_CYCLE,
     RIMLESS_WHEEL,
     SPOKE_HALF_ANGLE,
     JuggledBall,
@@ -172,6 +175,20 @@ def test_the_smallest_disturbance_of_an_own_walker_is_its_closed_form():
         find(coordinate="rate", max_steps=10)
     with pytest.raises(ValueError, match="angle"):
         find(coordinate="speed")
+
+
+def test_the_smallest_disturbance_of_a_gait_of_two_steps_is_in_its_faster_step():
+    """The ball does not fly again after an impact at a speed of 1."""
+    gait = vrw.limit_cycle({"a": LOGISTIC_A}, model=LOGISTIC_BALL, guess=[0.5], period_n=2)
+    result = vrw.smallest_disturbance(
+        {"a": LOGISTIC_A}, model=LOGISTIC_BALL, cycle=gait, coordinate="velocity",
+        max_size=0.25, max_steps=80,
+    )  # fmt: skip
+    slow, fast = LOGISTIC_CYCLE
+    assert abs(result.size - (1.0 - fast)) < max(result.size_error, 1e-8)
+    ends = 2.0 / GRAVITY * np.array([slow, slow + fast])
+    assert np.abs(result.time - ends).min() < 1e-9
+    assert result.direction == (1 if result.time < ends.mean() else -1)
 
 
 def test_a_change_beyond_the_guard_of_a_mode_is_no_disturbance():

@@ -3,7 +3,15 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.walkers import BALL_SYSTEM, RIMLESS_WHEEL, SIMPLEST_WALKER
+from support.walkers import (
+    BALL_SYSTEM,
+    GRAVITY,
+    LOGISTIC_A,
+    LOGISTIC_BALL,
+    LOGISTIC_CYCLE,
+    RIMLESS_WHEEL,
+    SIMPLEST_WALKER,
+)
 
 import vrw_jax as vrw
 
@@ -89,6 +97,67 @@ def test_a_pushed_simplest_walker_strikes_as_much_earlier_as_its_response_says()
     flow = SIMPLEST_WALKER.modes["swing"].field(jnp.asarray(response.states[instant]), params)
     # A push along the flow is a shift in time.
     assert response.delay[instant] @ np.asarray(flow) == pytest.approx(-1.0, abs=1e-8)
+
+
+def test_a_gait_of_two_steps_has_the_closed_form_of_its_response():
+    """A push changes the impact speed s by ds, and the steps after it by a (1 - 2 s) ds, ..."""
+    params = {"a": LOGISTIC_A}
+    gait = vrw.limit_cycle(params, model=LOGISTIC_BALL, guess=[0.5], period_n=2, options=TIGHT)
+    np.testing.assert_allclose(gait.section_state, LOGISTIC_CYCLE[:1], rtol=1e-9)
+    response = vrw.phase_response(params, model=LOGISTIC_BALL, cycle=gait, n_samples=3)
+    assert response.period == pytest.approx(2.0 * LOGISTIC_CYCLE.sum() / GRAVITY, rel=1e-10)
+    assert response.step_indices.tolist() == [0, 0, 0, 1, 1, 1]
+    height, velocity = response.states.T
+    speed = np.sqrt(velocity**2 + 2.0 * GRAVITY * height)
+    by_state = np.stack([GRAVITY / speed, velocity / speed], 1)
+    remaining = by_state / GRAVITY + np.stack([0.0 * speed, 0.0 * speed + 1.0 / GRAVITY], 1)
+    slopes = LOGISTIC_A * (1.0 - 2.0 * LOGISTIC_CYCLE)
+    adjoints = 2.0 / GRAVITY * (1.0 + slopes) / (1.0 - slopes.prod())
+    own = np.repeat(slopes, 3)[:, None] * by_state  # at the end of this step
+    other = np.repeat(slopes[::-1], 3)[:, None]
+    np.testing.assert_allclose(response.section_states[0, ..., 0], own, rtol=1e-6)
+    np.testing.assert_allclose(response.section_states[1, ..., 0], other * own, rtol=1e-6)
+    periods = 2.0 / GRAVITY * own
+    np.testing.assert_allclose(response.measures["period"][0], periods, rtol=1e-6)
+    delay = remaining + np.repeat(adjoints[::-1], 3)[:, None] * own
+    np.testing.assert_allclose(response.delay, delay, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_legs_in_turn_have_the_responses_of_walks(wheel_response):
+    """Equal legs have the response of one step twice, and others that of differences of walks."""
+    params, push = vrw.WheelParams(), 1e-4
+    make_wheel = lambda **second: vrw.ViscoelasticWheel(
+        leg_force=vrw.AlternatingLegs(vrw.SpringDamper(), vrw.SpringDamper(**second))
+    )
+    equal = vrw.phase_response(params, model=make_wheel(), n_samples=3)
+    for half in np.split(equal.delay, 2):
+        np.testing.assert_allclose(half, wheel_response.delay, atol=1e-9)
+    model = make_wheel(damping=185.0)
+    response = vrw.phase_response(params, model=model, n_samples=3)
+    instant = int(np.flatnonzero((response.step_indices == 1) & (response.phase_indices == 1))[1])
+    gait = vrw.limit_cycle(params, model=model, period_n=2, options=vrw.CycleOptions.tight())
+    model_1 = model.with_laws(model.laws.exchange_legs(1))
+    x_1 = vrw.step(params, gait.section_state, model=model, options=TIGHT).section_state
+    distance = vrw.step(params, x_1, model=model_1, options=TIGHT).step_length
+    times = []
+    for sign in (1.0, -1.0):
+        state = response.states[instant].copy()
+        state[3] += sign * push
+        rest = model_1.finish_step(params, 1, distance, jnp.asarray(state), TIGHT)
+        walk = vrw.walk(params, rest.section_state, N_STEPS, model=model, options=TIGHT)
+        times.append(float(np.sum(rest.durations) + np.sum(walk.steps.durations)))
+    delay = (times[0] - times[1]) / (2.0 * push)
+    assert abs(delay - response.delay[instant, 3]) < 2e-6
+
+
+@pytest.mark.slow
+def test_pushes_just_before_a_landing_move_the_landing(wheel_response):
+    """A push of positions along their rates changes the time of the landing, but not its angle."""
+    rates = wheel_response.states[-1, 3:]
+    angle_by_positions = wheel_response.section_states[0, -1, :3, 0]
+    assert abs(rates @ angle_by_positions) < 1e-9
+    assert (np.abs(rates * angle_by_positions)[:2] > 0.01).all()
 
 
 def test_an_unstable_gait_is_refused():

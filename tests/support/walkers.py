@@ -111,6 +111,29 @@ BALL_SYSTEM = HybridSystem(
 """Ball that a racket kicks: v' = e v + k, so that a gait has v = k / (1 - e)."""
 
 
+def return_by_logistic_map(y, p):
+    speed = -y[1]
+    return jnp.stack([0.0 * y[0], p["a"] * speed * (1.0 - speed)])
+
+
+LOGISTIC_BALL = HybridSystem(
+    modes={
+        "flight": Mode(
+            BALL_SYSTEM.modes["flight"].field,
+            {"bounce": Guard(lambda y, p: y[0], return_by_logistic_map)},
+        )
+    },
+    section="bounce",
+    state={"height": "m", "velocity": "m/s"},
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([jnp.where(x[0] > 0.0, 0.0, -1.0), x[0]]),  # or below the ground
+)
+"""Ball with the return map v' = a v (1 - v), whose gait of two steps is stable for a = 3.25."""
+LOGISTIC_A = 3.25
+LOGISTIC_CYCLE = (LOGISTIC_A + 1.0 + np.array([-1.0, 1.0]) * np.sqrt(
+    (LOGISTIC_A - 3.0) * (LOGISTIC_A + 1.0))) / (2.0 * LOGISTIC_A)  # fmt: skip
+
+
 class Henon(vrw.AbstractWalker):
     """x -> 1 - a x^2 + y, y -> b x."""
 

@@ -304,6 +304,11 @@ def _make_orbit_variables(
 MAX_ARRIVAL_DISTANCE = 1e-6
 
 
+# Largest number of steps after which a gait of unknown period has to repeat. The value is chosen as
+# the default `max_period` of `basin`.
+MAX_GAIT_STEPS = 16
+
+
 class StableGait(NamedTuple):
     """Stable gait of one walker, with its parameters, the model and the step options."""
 
@@ -329,7 +334,7 @@ class StableGait(NamedTuple):
         messages contain `caller_name`, the name of the public function.
 
         - `changes_within_step`: plural noun for disturbances within a step, such as "pushes". They
-          need a gait of one step, and a model that can start within it. "" if there are none.
+          need a model that can start within it. "" if there are none.
         """
         require_untraced_arguments(
             caller_name, "map vrw.walk over the starts", params, options, cycle
@@ -357,17 +362,12 @@ class StableGait(NamedTuple):
         spectral_radius = float(cycle.spectral_radius_value)
         if is_own and model.invariants:  # Each has a multiplier of 1, which round-off may reduce.
             spectral_radius = max(spectral_radius, 1.0)
-        period_n = getattr(cycle, "period_n", 1)
-        if changes_within_step and period_n > 1:
-            raise ValueError(
-                f"cycle repeats after {period_n} steps, but {changes_within_step} within a step "
-                "need a gait of one step: give a cycle with period_n=1, and one law for all legs."
-            )
         if not spectral_radius < 1.0:
             raise ValueError(
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable: "
                 "take parameters whose gait has a spectral radius below 1."
             )
+        period_n = getattr(cycle, "period_n", None)
         return cls.from_section_state(
             params, model, options, cycle.section_state, period_n, spectral_radius
         )
@@ -379,28 +379,37 @@ class StableGait(NamedTuple):
         model: Any,
         options: StepOptions,
         section_state: Any,
-        period_n: int,
+        period_n: int | None,
         spectral_radius: float = np.nan,
     ) -> "StableGait":
         """Return the gait that begins at a section state, or raise an error if it does not repeat
-        after `period_n` steps.
+        after `period_n` steps; None means the number after which it first repeats.
         """
-        leg_models = [model] if is_own_walker(model) else model.list_models_of_legs()
-        section_states = [np.asarray(section_state)[None]]
-        for k in range(period_n):
-            leg_model = leg_models[k % len(leg_models)]
-            steps = step_batch(params, section_states[-1], model=leg_model, options=options)
-            section_states.append(steps.section_state)
-        gait = cls(
-            params, model, options, np.concatenate(section_states[:-1]), np.array(spectral_radius)
-        )
-        if not gait.is_on_gait(section_states[-1])[0]:
+        x, states = np.asarray(section_state)[None], np.zeros((0, np.size(section_state)))
+        gait = cls(params, model, options, states, np.array(spectral_radius))
+        for k in range(period_n or MAX_GAIT_STEPS):
+            gait = gait._replace(section_states=np.concatenate([gait.section_states, x]))
+            leg_model = gait.begin_after(k).model
+            x = step_batch(params, x, model=leg_model, options=options).section_state
+            if k + 1 == period_n or (period_n is None and gait.is_on_gait(x)[0]):
+                break
+        if not gait.is_on_gait(x)[0]:
+            after = f"after {period_n} step{'s' * (period_n != 1)}"
             raise ValueError(
-                f"the gait does not repeat after {period_n} step{'s' * (period_n > 1)} with "
+                f"the gait does not repeat {after if period_n else f'within {k + 1} steps'} with "
                 f"{type(model).__name__}: give a cycle of the same parameters and model, or the "
                 "model of the branch."
             )
         return gait
+
+    def begin_after(self, n_steps: int) -> "StableGait":
+        """Return the gait that begins some steps later, with the legs in their roles there."""
+        model = self.model
+        if not is_own_walker(model):
+            leg_models = model.list_models_of_legs()
+            model = leg_models[n_steps % len(leg_models)]
+        states = np.roll(self.section_states, -n_steps, 0)
+        return self._replace(model=model, section_states=states)
 
     def is_on_gait(self, section_states: np.ndarray, n_steps: int = 0) -> np.ndarray:
         """Return whether each section state agrees with a section state of the gait, shape
@@ -569,8 +578,7 @@ def basin_share(
             BAD_INPUT. For a walker of yours, the names are those of its section coordinates.
         model: model of the wheel; by default that of the paper, `ViscoelasticWheel()`. "auto" means
             unilateral contact, which is valid for all starts. A walker of yours may be given too.
-        cycle: the gait; by default the result of `limit_cycle`. For a walker of yours, a gait of
-            one step.
+        cycle: the gait; by default the result of `limit_cycle`.
         options: numerical options of the gait steps.
         n_starts: number of starts, best a power of 2.
         max_steps: largest number of gait steps of a walk.

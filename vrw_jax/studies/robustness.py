@@ -309,7 +309,7 @@ def measure_basins(
         return values
 
     points = _space_branch_points(branch, n_points)
-    distances_left = branch.dataset.spectral_radius.values**max_steps
+    distances_left = branch.dataset.spectral_radius.values ** (max_steps / branch.period_n)
     rows = [
         measure_gait(_load_branch_gait(branch, i, checked_model, checked_step_options))
         if distances_left[i] <= MAX_ARRIVAL_DISTANCE

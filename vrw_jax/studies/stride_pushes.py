@@ -49,7 +49,7 @@ class SmallestDisturbance(AbstractPrintable):
     - `size`: smallest change; infinite if no change up to `max_size` suffices;
     - `size_error`: error estimate of `size`;
     - `direction`: 1 if the change increases the coordinate, -1 if it decreases it;
-    - `time`: instant of the disturbance after the start of the step, s;
+    - `time`: instant of the disturbance after the start of the gait, s;
     - `phase_index`: index of the phase or mode of that instant in `phase_names`;
     - `outcome`: Outcome that ends the walk after a slightly larger disturbance; STEPPED if the walk
       continues, but not on this gait;
@@ -100,7 +100,7 @@ class SmallestDisturbance(AbstractPrintable):
         phase_name = self.phase_names[self.phase_index]
         return [
             (f"smallest {change} of {self.coordinate}", size_text),
-            ("instant", f"{self.time:.6g} s after the start of the step, {phase_name}"),
+            ("instant", f"{self.time:.6g} s after the start of the gait, {phase_name}"),
             ("ending", self.ending),
         ]
 
@@ -118,8 +118,8 @@ def smallest_disturbance(
 ) -> SmallestDisturbance:
     """Return the smallest disturbance within a step that takes a walker out of its gait's basin.
 
-    A disturbance of the wheel is a sudden change of the angular velocity dtheta at one instant of
-    the gait's step. The instant lies between a landing and the next landing. The size of the
+    A disturbance of the wheel is a sudden change of the angular velocity dtheta at one instant in
+    a step of the gait. The instant lies between a landing and the next landing. The size of the
     disturbance is the modulus of the change, rad/s. Positions do not change. In double support the
     two feet stay on the ground, so that dtheta determines the rates of the legs. In single support
     the rates of the legs do not change. For a `HybridSystem`, name the `coordinate` of its state
@@ -140,7 +140,7 @@ def smallest_disturbance(
         params: parameters of the wheel, or of a `HybridSystem`.
         model: `ViscoelasticWheel()`, the paper's wheel and the default, `RigidWheel()`, or a
             `HybridSystem`.
-        cycle: a gait of one step; by default the result of `limit_cycle`.
+        cycle: a gait; by default the result of `limit_cycle`.
         options: numerical options of the gait steps.
         max_size: largest change that the search tries; by default twice the largest modulus of the
             coordinate in the gait.
@@ -164,8 +164,9 @@ def smallest_disturbance(
     )
     max_size = None if max_size is None else check_positive("max_size", max_size)
     spectral_radius = float(stable_gait.spectral_radius)
-    if spectral_radius**max_steps > MAX_ARRIVAL_DISTANCE:
-        n_steps = math.ceil(math.log(MAX_ARRIVAL_DISTANCE) / math.log(spectral_radius))
+    period_n = len(stable_gait.section_states)
+    if spectral_radius ** (max_steps / period_n) > MAX_ARRIVAL_DISTANCE:
+        n_steps = math.ceil(period_n * math.log(MAX_ARRIVAL_DISTANCE) / math.log(spectral_radius))
         raise ValueError(
             f"max_steps is {max_steps}, but the gait has spectral radius {spectral_radius:.6g}, so "
             f"that walks need {n_steps} steps to arrive: give max_steps={2 * n_steps}."
@@ -198,16 +199,18 @@ def _is_system(gait: StableGait) -> bool:
 
 
 class _SampledStride(NamedTuple):
-    """States of a gait at instants of the phases of its step."""
+    """States of a gait at instants of the phases of its steps."""
 
-    phase_indices: np.ndarray  # phase or mode of each interval between events, (intervals,)
-    times: np.ndarray  # after the start of the step, s, (intervals, samples)
+    step_indices: np.ndarray  # step of each interval between events, (intervals,)
+    phase_indices: np.ndarray  # phase or mode of each interval, (intervals,)
+    times: np.ndarray  # after the start of the gait, s, (intervals, samples)
     states: np.ndarray  # (intervals, samples, dim)
-    foot_distance: Array | None  # of a wheel, between the feet in double support, m
+    # of a wheel, between the feet in double support of each step, m
+    foot_distances: tuple[Array | None, ...]
 
 
 class _DisturbedGait(NamedTuple):
-    """Gait of one step, sampled within the step, and the limits of the search."""
+    """Gait, sampled within its steps, and the limits of the search."""
 
     stable_gait: StableGait
     stride: _SampledStride
@@ -217,7 +220,7 @@ class _DisturbedGait(NamedTuple):
 
 
 class _DirectedInstants(NamedTuple):
-    """Instants of a gait step, each with the direction of a disturbance, as arrays of shape
+    """Instants of a gait, each with the direction of a disturbance, as arrays of shape
     (instants,).
     """
 
@@ -246,8 +249,9 @@ class _ExitSizeBrackets(NamedTuple):
 # The values are chosen because each pass then covers two intervals of the previous pass. The last
 # pass resolves a ten-thousandth of a phase.
 SAMPLE_STRIDES = (512, 64, 8, 1)
-# Fraction of the duration of a walker's phase at its last sample. The value is chosen because the
-# guard that ends the phase is positive there, up to an error of the state of 1e-10.
+# Fraction of the duration of a phase at its last sample, so that a push there is one before the
+# event. The value is chosen because the guard that ends the phase is positive there, up to an error
+# of the state of 1e-10.
 LAST_SAMPLE_FRACTION = 1.0 - 1e-9
 # Number of intervals between the instants that one pass considers in a phase.
 N_INTERVALS_PER_PASS = 16
@@ -262,14 +266,14 @@ EARLY_DISTURBANCE_TOLERANCE = 1e-5
 def compute_smallest_disturbance(
     stable_gait: StableGait, max_size: float | None, max_steps: int, coordinate: str = "dtheta"
 ) -> SmallestDisturbance:
-    """Return the `SmallestDisturbance` for a gait of one step and for checked arguments.
+    """Return the `SmallestDisturbance` for a gait and for checked arguments.
 
     Each pass of the search considers instants that are closer to each other than in the pass
     before.
     """
     system = stable_gait.model if _is_system(stable_gait) else None
     n_phase_samples = N_INTERVALS_PER_PASS * SAMPLE_STRIDES[0] + 1  # both ends included
-    stride = _sample_stride(stable_gait, n_phase_samples, LAST_SAMPLE_FRACTION)
+    stride = _sample_stride(stable_gait, n_phase_samples)
     coordinates = tuple(system.state) if system else WHEEL_COORDINATES
     index = coordinates.index(coordinate)
     if max_size is None:
@@ -393,7 +397,10 @@ def _walk_after_disturbance(
     The two arrays have the shape of `disturbance_sizes`, (instants, sizes).
     """
     stable_gait, stride, n_sizes = gait.stable_gait, gait.stride, disturbance_sizes.shape[1]
-    phase_indices = np.repeat(stride.phase_indices[instants.interval_indices], n_sizes)
+    step_indices, phase_indices = (
+        np.repeat(indices[instants.interval_indices], n_sizes)
+        for indices in (stride.step_indices, stride.phase_indices)
+    )
     disturbed_states = np.repeat(
         stride.states[instants.interval_indices, instants.sample_indices], n_sizes, 0
     )
@@ -402,13 +409,13 @@ def _walk_after_disturbance(
     ).ravel()
     walk_outcomes = np.empty(len(phase_indices), int)
     section_states = np.empty((len(phase_indices), stable_gait.section_states.shape[1]))
-    for phase_index in np.unique(phase_indices):
-        is_in_phase = phase_indices == phase_index
+    for k, phase_index in sorted({*zip(step_indices, phase_indices, strict=True)}):
+        is_in_phase = (step_indices == k) & (phase_indices == phase_index)
         finish_disturbed_batch = functools.partial(
             _finish_steps,
-            stable_gait,
+            stable_gait.begin_after(k),
             _convert_phase_index(stable_gait, phase_index),
-            stride.foot_distance,
+            stride.foot_distances[k],
         )
         section_states[is_in_phase], walk_outcomes[is_in_phase] = map_in_batches(
             finish_disturbed_batch,
@@ -417,12 +424,13 @@ def _walk_after_disturbance(
         )
     # A change that crosses a guard of the mode, such as that of a speed at an apex, is skipped.
     leaves_basin = walk_outcomes != NOT_IN_PHASE
-    has_stepped = np.flatnonzero(walk_outcomes == Outcome.STEPPED)
-    if len(has_stepped):
-        has_arrived, walk_outcomes[has_stepped], _ = walk_until_on_gait(
-            stable_gait, section_states[has_stepped], gait.max_steps
-        )
-        leaves_basin[has_stepped] = ~has_arrived
+    for k in range(len(stable_gait.section_states)):
+        has_stepped = np.flatnonzero((walk_outcomes == Outcome.STEPPED) & (step_indices == k))
+        if len(has_stepped):
+            has_arrived, walk_outcomes[has_stepped], _ = walk_until_on_gait(
+                stable_gait.begin_after(k + 1), section_states[has_stepped], gait.max_steps
+            )
+            leaves_basin[has_stepped] = ~has_arrived
     shape = disturbance_sizes.shape
     return leaves_basin.reshape(shape), walk_outcomes.reshape(shape)
 
@@ -477,12 +485,13 @@ def _differentiate_step_rest(
 
 
 class PhaseResponse(AbstractPrintable):
-    """Response of a gait of one step to small changes of its state, at instants of the stride.
+    """Response of a gait to small changes of its state, at instants of its steps.
 
     All changes are per unit of the pushed coordinate, to first order.
 
-    - `times`: instants after the start of the step, s, shape (instants,). An event has two
+    - `times`: instants after the start of the gait, s, shape (instants,). An event has two
       instants, before and after it;
+    - `step_indices`: step of the gait at each instant;
     - `phase_indices`: phase or mode of the walker at each instant;
     - `states`: state at each instant, whose coordinates are pushed, shape (instants, dim). For the
       wheel, the state is (theta, L1, L2) with their rates. A push does not move a planted foot, so
@@ -503,6 +512,7 @@ class PhaseResponse(AbstractPrintable):
     """
 
     times: Float[np.ndarray, " instants"]
+    step_indices: Int[np.ndarray, " instants"]
     phase_indices: Int[np.ndarray, " instants"]
     states: Float[np.ndarray, "instants dim"]
     phase_advance: Float[np.ndarray, "instants dim"]
@@ -536,7 +546,7 @@ def phase_response(
     n_steps: int = 3,
     options: StepOptions | None = None,
 ) -> PhaseResponse:
-    """Return the response of a gait to small pushes at each instant of the stride.
+    """Return the response of a gait to small pushes at each instant of its steps.
 
     A push changes the state at one instant. After many steps, the walker is on its gait again, and
     ahead of or behind the unpushed walker by a constant fraction of the period: the asymptotic
@@ -545,7 +555,7 @@ def phase_response(
 
     Args:
         params: one wheel, or the parameters of a `HybridSystem`.
-        cycle: a stable gait of one step, by default the result of `limit_cycle`.
+        cycle: a stable gait, by default the result of `limit_cycle`.
         model: model of the wheel, the paper's by default, or a `HybridSystem`.
         n_samples: number of instants in each phase or mode, both ends included.
         n_steps: number of steps whose changes are returned.
@@ -555,8 +565,8 @@ def phase_response(
         A `PhaseResponse` for all coordinates of the state.
 
     Raises:
-        TypeError, ValueError: if an argument is invalid, or if the gait is unstable or has several
-            steps; the message names the remedy.
+        TypeError, ValueError: if an argument is invalid, or if the gait is unstable; the message
+            names the remedy.
 
     Examples:
         >>> response = vrw.phase_response(vrw.WheelParams(), n_samples=5)
@@ -569,45 +579,59 @@ def phase_response(
     gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options, "pushes")
     coordinates = tuple(gait.model.state) if _is_system(gait) else WHEEL_COORDINATES
     stride = _sample_stride(gait, n_samples)
-    remaining_jacobians = np.concatenate(
-        [
-            _differentiate_step_rest(
-                gait, _convert_phase_index(gait, index), stride.foot_distance, jnp.asarray(states)
-            )
-            for index, states in zip(stride.phase_indices, stride.states, strict=True)
-        ]
-    )
-    period, jacobian, measure_jacobians = _differentiate_stride(gait)
-    # The adjoint vector: derivative of the sum of all later durations by the section state.
-    adjoint = np.linalg.solve((np.eye(len(jacobian)) - jacobian).T, measure_jacobians["period"])
-    by_section, by_time = np.split(remaining_jacobians, [len(jacobian)], 1)
-    delay = by_time[:, 0] + np.einsum("j,ijd->id", adjoint, by_section)
-    section_changes = [by_section]
-    for _ in range(n_steps - 1):
-        section_changes.append(jacobian @ section_changes[-1])
-    changes = np.stack(section_changes)
+    n = len(gait.section_states)
+    period, jacobians, gradients = _differentiate_gait(gait)
+    # The adjoint vector at each section is the derivative of the sum of all later durations.
+    matrix, later = np.eye(len(jacobians[0])), np.zeros(len(jacobians[0]))
+    for jacobian, gradient in zip(jacobians[::-1], gradients["period"][::-1], strict=True):
+        matrix, later = matrix @ jacobian, gradient + jacobian.T @ later
+    adjoints = [np.linalg.solve((np.eye(len(matrix)) - matrix).T, later)]
+    for k in range(n - 1, 0, -1):
+        adjoints.insert(0, gradients["period"][k] + jacobians[k].T @ adjoints[0])
+    delays: list[np.ndarray] = []
+    changes: list[np.ndarray] = []
+    measures: dict[str, list[np.ndarray]] = {name: [] for name in gradients}
+    for k, index, states in zip(
+        stride.step_indices, stride.phase_indices, stride.states, strict=True
+    ):
+        remaining = _differentiate_step_rest(
+            gait.begin_after(k),
+            _convert_phase_index(gait, index),
+            stride.foot_distances[k],
+            jnp.asarray(states),
+        )
+        by_section, by_time = np.split(np.asarray(remaining), [len(matrix)], 1)
+        # The adjoint vectors begin at the second section and end at the first one.
+        delays.append(by_time[:, 0] + np.einsum("j,ijd->id", adjoints[k], by_section))
+        section_changes = [by_section]
+        for m in range(k + 1, k + n_steps):
+            section_changes.append(jacobians[m % n] @ section_changes[-1])
+        changes.append(np.stack(section_changes))
+        for name, of_steps in gradients.items():
+            of_next = np.stack([of_steps[m % n] for m in range(k + 1, k + 1 + n_steps)])
+            measures[name].append(np.einsum("kj,kijd->kid", of_next, changes[-1]))
     return PhaseResponse(
         stride.times.ravel(),
+        np.repeat(stride.step_indices, n_samples),
         np.repeat(stride.phase_indices, n_samples),
         np.concatenate(stride.states),
-        -delay / period,
+        -np.concatenate(delays) / period,
         period,
-        np.swapaxes(changes, 2, 3),
-        {
-            name: np.einsum("j,kijd->kid", gradient, changes)
-            for name, gradient in measure_jacobians.items()
-        },
+        np.swapaxes(np.concatenate(changes, 1), 2, 3),
+        {name: np.concatenate(values, 1) for name, values in measures.items()},
         coordinates,
     )
 
 
-def _differentiate_stride(gait: StableGait) -> tuple[float, np.ndarray, dict[str, np.ndarray]]:
-    """Return the period, and the derivatives of the return map and of measures by the section
-    state.
+def _differentiate_gait(
+    gait: StableGait,
+) -> tuple[float, list[np.ndarray], dict[str, list[np.ndarray]]]:
+    """Return the period, and the derivatives of the section state after each step, and of the
+    measures of each step, by the section state at its start.
     """
-    params, model, options, section_states, _ = gait
+    params, _, options, section_states, _ = gait
 
-    def measure(x: Array) -> tuple[Array, dict[str, Array]]:
+    def measure(model: Any, x: Array) -> tuple[Array, dict[str, Array]]:
         if _is_system(gait):
             step = compile_step(model)(params, x, options)
             return step.section_state, {"period": step.duration}
@@ -617,43 +641,61 @@ def _differentiate_stride(gait: StableGait) -> tuple[float, np.ndarray, dict[str
         measures = {"period": period, "step_length": length, "speed": length / period}
         return result.section_state, measures | dict(zip(names, result.durations, strict=True))
 
-    x = jnp.asarray(section_states[0])
-    (_, measures), jacobians = evaluate_with_jacobian(measure, x)
-    return float(measures["period"]), *jax.tree.map(np.asarray, jacobians)
+    period, jacobians, gradients = 0.0, [], []
+    for k, x in enumerate(section_states):
+        evaluate = functools.partial(measure, gait.begin_after(k).model)
+        (_, values), derivatives = evaluate_with_jacobian(evaluate, jnp.asarray(x))
+        period += float(values["period"])
+        jacobian, gradient = jax.tree.map(np.asarray, derivatives)
+        jacobians.append(jacobian)
+        gradients.append(gradient)
+    return period, jacobians, {name: [row[name] for row in gradients] for name in gradients[0]}
 
 
-def _sample_stride(
-    gait: StableGait, n_samples: int, last_sample_fraction: float = 1.0
-) -> _SampledStride:
-    """Return samples of each phase that takes time in the step of a gait, both ends included.
+def _sample_stride(gait: StableGait, n_samples: int) -> _SampledStride:
+    """Return samples of each phase that takes time in the steps of a gait, both ends included."""
+    intervals, foot_distances, start_time = [], [], 0.0
+    for k in range(len(gait.section_states)):
+        phase_indices, times, states, foot_distance = _sample_first_step(
+            gait.begin_after(k), n_samples
+        )
+        intervals.append((np.full(len(times), k), phase_indices, start_time + times, states))
+        foot_distances.append(foot_distance)
+        start_time += times[-1, -1]
+    steps, phases, times, states = map(np.concatenate, zip(*intervals, strict=True))
+    return _SampledStride(steps, phases, times, states, tuple(foot_distances))
 
-    - `last_sample_fraction`: for a `HybridSystem`, fraction of a phase at its last sample.
-    """
+
+def _sample_first_step(
+    gait: StableGait, n_samples: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Array | None]:
+    """Return phases, times, states and foot distance of `_SampledStride` in the first step."""
     params, model, options, section_states, _ = gait
     x = jnp.asarray(section_states[0])
     if not _is_system(gait):
         trajectory = model.sample_step(params, x, options, n_samples)
-        phase_indices = np.flatnonzero(np.asarray(trajectory.durations) > 0.0)
-        return _SampledStride(
-            phase_indices,
-            np.asarray(trajectory.time)[phase_indices],
-            np.asarray(trajectory.state)[phase_indices],
-            model.compute_foot_distance(params, x),
-        )
+        durations = np.asarray(trajectory.durations)
+        phase_indices = np.flatnonzero(durations > 0.0)
+        states = np.array(trajectory.state)[phase_indices]
+        # Guards of positions end the phases in which positions can be pushed.
+        time_left = (1.0 - LAST_SAMPLE_FRACTION) * durations[phase_indices, None]
+        states[:, -1, :3] -= time_left * states[:, -1, 3:]
+        times = np.asarray(trajectory.time)[phase_indices]
+        return phase_indices, times, states, model.compute_foot_distance(params, x)
     start, n_events = model.embed(x, params), int(model.step(params, x, options).n_events)
     simulation = model.simulate(params, start, events=n_events, options=options)
     starts, durations = simulation.find_phases(start)
     times = np.concatenate([[0.0], np.asarray(simulation.times)])
     intervals = np.flatnonzero(np.asarray(durations) > 0.0)
-    modes, states = tuple(model.modes.values()), []
+    modes, samples = tuple(model.modes.values()), []
     for i in intervals:
         field: Any = modes[int(simulation.modes[i])].field
         rates = functools.partial(lambda field, y: field(y, params), field)
-        duration = last_sample_fraction * durations[i]
-        states.append(sample_phase(rates, starts[i], duration, n_samples, options))
-    return _SampledStride(
+        duration = LAST_SAMPLE_FRACTION * durations[i]
+        samples.append(sample_phase(rates, starts[i], duration, n_samples, options))
+    return (
         np.asarray(simulation.modes)[intervals],
         np.stack([np.linspace(times[i], times[i + 1], n_samples) for i in intervals]),
-        np.stack(states),
+        np.stack(samples),
         None,
     )
