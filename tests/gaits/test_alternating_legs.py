@@ -1,5 +1,7 @@
 """Gaits of a wheel with two different legs in turn, against a five-coordinate code."""
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -176,6 +178,42 @@ def test_equal_legs_have_the_smallest_disturbance_of_the_wheel():
     assert vrw.smallest_disturbance(PARAMS, model=make_wheel()).size < 0.6 * expected
 
 
+GUESSED_WHEEL = make_wheel({"damping": 155.0}, SECOND | {"damping": 162.0})
+DAMPINGS = ["leg.first.damping", "leg.second.damping"]
+
+
+def test_a_fit_to_steps_of_five_coordinates_finds_the_damping_of_each_leg():
+    x, durations = np.array(vrw.paper_start()), []
+    for k in range(4):
+        laws = (FIRST, SECOND) if k % 2 == 0 else (SECOND, FIRST)
+        step = five_coordinates.step(make_reference_params(*laws), x)
+        x = step["section_state"]
+        durations.append(step["durations"])
+    data = {
+        "step": range(4), "period": np.sum(durations, 1), "period_error": [1e-4],
+        "duration_dls": np.array(durations)[:, 0], "duration_dls_error": [1e-4],
+    }  # fmt: skip
+    fit = vrw.fit(data, PARAMS, DAMPINGS, model=GUESSED_WHEEL, start=vrw.paper_start(), n_starts=1)
+    np.testing.assert_allclose(fit.values, [150.0, 170.0], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_fits_to_gaits_and_series_of_two_legs_find_both(cycle):
+    find = functools.partial(vrw.fit, params=PARAMS, free=DAMPINGS, model=GUESSED_WHEEL, n_starts=1)
+    gait = {name: [float(cycle.measure(name))] for name in ("period", "dls_fraction")}
+    fit = find(gait | {f"{name}_error": [1e-4] for name in gait})
+    np.testing.assert_allclose(fit.values, [150.0, 170.0], rtol=2e-6)
+    walk = vrw.simulate(PARAMS, cycle.section_state, 4, model=make_wheel(), n_samples=400)
+    times = np.arange(0.02, 2.5, 0.01)
+    landings = np.cumsum(np.tile(np.sum(cycle.durations, 1), 2))
+    times = times[np.abs(times[:, None] - landings).min(1) > 0.02]
+    theta = np.interp(times, np.asarray(walk.time), np.asarray(walk.theta))
+    series = {"time": times, "theta": theta, "theta_error": [1e-3]}
+    # The samples are interpolated linearly.
+    fit = find(series, start="gait", window=0)
+    np.testing.assert_allclose(fit.values, [150.0, 170.0], rtol=2e-6)
+
+
 def test_what_two_legs_cannot_do_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="a gait repeats after an even number of steps"):
         vrw.limit_cycle(PARAMS, model=make_wheel())
@@ -183,6 +221,8 @@ def test_what_two_legs_cannot_do_is_refused_in_one_sentence():
     contact = vrw.UnilateralWheel(leg_force=make_wheel().leg_force)
     with pytest.raises(ValueError, match=r"with a UnilateralWheel vrw.scan takes gaits of one"):
         vrw.scan(design, ["period"], model=contact)
+    with pytest.raises(ValueError, match="with a UnilateralWheel the data of gaits are of one"):
+        vrw.fit({"period": [1.4], "period_error": [0.1]}, PARAMS, ["slope"], model=contact)
     with pytest.raises(ValueError, match="slope_sd is given and the legs alternate"):
         vrw.scan(design, ["period"], model=make_wheel(), slope_sd=0.01)
     with pytest.raises(ValueError, match="n_legs is 7, but legs alternate only if"):

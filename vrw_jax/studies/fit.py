@@ -138,7 +138,8 @@ def fit(
         units = {"period": "s"} | {name: unit for name, unit in own_units if unit != "1"}
         entries = finder.coordinates
     else:
-        finder = resolve_finder(params, resolve_model(params, model), None)
+        model = resolve_model(params, model)
+        finder = resolve_finder(params, model, None, getattr(model, "leg_period", 1))
         time_unit = math.sqrt(float(params.locked_length) / float(params.gravity))
         units = finder.model.units
         # The landing on both feet of the paper's wheel leaves two of the three entries.
@@ -146,6 +147,11 @@ def fit(
     model = finder.model
     domains, parameter_names = model.parameter_domains, model.parameter_names
     table = fit_data.read_data(data, covariance, units, parameter_names, time_unit)
+    if table.kind == "gaits" and finder.leg_period > 1 and finder.is_multistable:
+        raise ValueError(
+            f"the legs alternate, but with a {type(model).__name__} the data of gaits are of one "
+            "step only: fit steps, or give vrw.ViscoelasticWheel(leg_force=...)."
+        )
     if table.kind == "series" and not model.is_compliant:
         raise ValueError(
             "data have a column 'time', but series need legs with springs: fit the steps or gaits."
@@ -184,6 +190,8 @@ def fit(
                 )
             last_time = float(times.max()) + window
             n_steps = max(n_steps, _count_steps(finder, params, first_states, last_time, options))
+        else:
+            n_steps = finder.leg_period
     offset_names = [f"{name}{fit_problem.OFFSET_SUFFIX}" for name in parameter_names]
     if table.kind == "series":
         offset_names.append(fit_problem.TIME_OFFSET)
@@ -291,7 +299,7 @@ def _find_first_states(
     elif finder.model.is_wheel:
         if kind == "gaits" and finder.supports_cold_start:
             return None
-        cycle: Any = limit_cycle(params, model=finder.model)
+        cycle: Any = limit_cycle(params, model=finder.model, period_n=finder.leg_period)
         default_start = finder.model.compute_default_start(params)
         states = np.asarray(cycle.section_state if bool(cycle.found) else default_start)[None]
     else:

@@ -113,7 +113,7 @@ class _GaitMeasures(dict):
         model = self.finder.model
         start = self.cycle.section_state
         return (
-            model.take_step(self.params, start, self.finder.step_options)
+            model.take_step_of_gait(self.params, start, self.finder.step_options)
             if model.is_wheel
             else None  # Measures of other walkers are known to the gait.
         )
