@@ -70,6 +70,42 @@ def test_the_call_after_an_error_has_a_notice_of_its_own(brief_silence, capsys):
     assert capsys.readouterr().err.count("wait_for") == 1
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked on Linux and macOS")
+def test_a_child_that_is_forked_while_a_notice_is_printed_can_call():
+    program = """
+import io, os, sys, time, warnings
+from vrw_jax.base import progress
+
+class SlowStream(io.StringIO):
+    def write(self, text):
+        time.sleep(0.5)
+        return len(text)
+
+@progress.announce_wait("a slow program", "40 s")
+def wait_and_fork(seconds):
+    time.sleep(seconds)
+    return os.fork() if seconds else 0
+
+progress.SILENT_SECONDS, progress.UPDATE_INTERVAL = 0.1, 0.05
+warnings.simplefilter("ignore")
+sys.stderr = SlowStream()
+child = wait_and_fork(0.4)
+if child == 0:
+    wait_and_fork(0.0)
+    os._exit(0)
+end = time.monotonic() + 10.0
+while not (ended := os.waitpid(child, os.WNOHANG)[0]) and time.monotonic() < end:
+    time.sleep(0.01)
+if not ended:
+    os.kill(child, 9)
+print("ended" if ended else "hangs")
+"""
+    environment = {**os.environ, "VRW_PROGRESS": ""}
+    command = [sys.executable, "-c", program]
+    result = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+    assert result.stdout == "ended\n"
+
+
 def test_every_public_function_that_may_last_long_announces_this():
     functions = {name for name in vrw.__all__ if type(getattr(vrw, name)).__name__ == "function"}
     announcing = {name for name in functions if hasattr(getattr(vrw, name), "announces_wait")}

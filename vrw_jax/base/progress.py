@@ -90,6 +90,7 @@ def announce_wait(
                     public_call = _current_call = _PublicCall(expectation)
                     # A forked process has no watcher.
                     if _watcher is None or not _watcher.is_alive():
+                        _hold_lock_during_forks()
                         _watcher = threading.Thread(target=_watch_calls, daemon=True)
                         _watcher.start()
             if public_call is None:
@@ -105,6 +106,18 @@ def announce_wait(
         return with_default_jax_settings(call_with_notice)  # type: ignore[return-value]
 
     return decorate
+
+
+@functools.cache
+def _hold_lock_during_forks() -> None:
+    """Prevent that a child is forked while the watcher holds the lock, as it prints.
+
+    The child has no watcher, so that nothing in it would release the lock.
+    """
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(
+            before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release
+        )
 
 
 def report_progress(text: str) -> None:
