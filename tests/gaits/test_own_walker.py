@@ -281,6 +281,36 @@ def test_figures_show_the_results_of_any_walker():
     assert vrw.plot.basin_figure([basin], [""]).axes[0].get_ylabel() == "theta [m/s]"
 
 
+@vrw.measure("height", unit="m", symbol="h")
+def height_with_symbol(step, params):
+    return GRAVITY / 8.0 * step.duration**2
+
+
+def test_figures_show_declared_symbols():
+    class SymbolBall(DampedBall):
+        class Params(DampedBall.Params):
+            stiffness: float = vrw.parameter(1.0, unit="m/s", symbol="k_1")
+
+        measures = (height_with_symbol,)
+
+    walker, params = SymbolBall(), SymbolBall.Params()
+    label = "stiffness $k_{1}$ [m/s]"
+    scan = vrw.scan(vrw.grid(stiffness=[0.5, 1.0, 1.5]), ["height"], base=params, model=walker)
+    (figure,) = vrw.plot.scan_figures(scan).values()
+    assert figure.axes[-1].get_xlabel() == label
+    branch = vrw.continue_branch(
+        params, "stiffness", (0.5, 1.5), model=walker, measures=["height"],
+        cycle=vrw.limit_cycle(params, model=walker),
+    )  # fmt: skip
+    panels = vrw.plot.branch_figure(branch).axes
+    assert panels[-1].get_xlabel() == label
+    assert panels[-1].get_ylabel() == "$h$ [m]"
+    bounds = {"stiffness": (0.5, 1.5)}
+    tuned = vrw.tune(params, "height", ["stiffness"], bounds, model=walker)
+    paths = vrw.plot.tuning_figure(tuned).axes[-1]
+    assert paths.get_legend_handles_labels()[1] == ["$k_{1}$"]
+
+
 def test_the_figure_of_a_branch_shows_the_limit_of_stability_and_measures():
     walker, params = DampedBall(), DampedBall.Params()
     branch = vrw.continue_branch(

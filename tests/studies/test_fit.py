@@ -415,7 +415,13 @@ BAD_DATA = {
 
 def test_the_figure_shows_measured_numbers_residuals_and_the_ellipse(small_fit):
     """The references are the fit, and the ends of the ellipse: 2.448 standard errors for 95 %."""
-    *columns, residuals, ellipse = vrw.plot.fit_figure(small_fit).axes
+    figure = vrw.plot.fit_figure(small_fit)
+    *columns, residuals, ellipse = figure.axes
+    figure.canvas.draw()
+    for axes in (columns[-1], residuals):  # Legends cover no points.
+        legend = axes.get_legend().get_window_extent()
+        assert legend.y0 > axes.get_window_extent().y1
+        assert 0.0 < legend.x0 < legend.x1 < figure.bbox.x1
     assert [axes.get_ylabel() for axes in columns] == [
         "$T$ [s]",
         r"$T_{\mathrm{DLS}}/T$",

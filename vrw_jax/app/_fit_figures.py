@@ -17,6 +17,7 @@ from vrw_jax.app.figure_style import (
     PAGE_FIGURE_WIDTH_INCHES,
     FigureWidth,
     StyledFigure,
+    add_wrapped_legend,
     declare_own_units,
     figure_style,
     find_width_inches,
@@ -102,13 +103,16 @@ def fit_figure(result: FitResult, *, level: float = 0.95, width: FigureWidth = N
         axes.set(xlabel=position_label, ylabel=ylabel)
         axes.xaxis.set_major_locator(MaxNLocator(4, integer=position_name != "time"))
     if columns:
-        axes.legend(fontsize=7.0)
+        # Above the panels, legends cover no points.
+        legend_settings = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 7.0}
+        legend_width = 0.8 * figure.get_figwidth() / n_columns
+        add_wrapped_legend(axes, 2, legend_width, **legend_settings)
         axes = next(panels)
         axes.axhspan(-2.0, 2.0, color=LIGHT_GRAY_COLOR, zorder=0)
         for name in columns:
             axes.plot(positions, table[f"{name}_residual"], ".", label=name)
         axes.set(xlabel=position_label, ylabel="residual [standard errors]")
-        axes.legend(fontsize=7.0)
+        add_wrapped_legend(axes, len(columns), legend_width, **legend_settings)
     for i, j in pairs:
         _draw_ellipse(next(panels), result, i, j, level, own_units)
     for axes in panels:
@@ -121,13 +125,16 @@ def _find_own_units(result: FitResult) -> xr.Dataset:
     that the library does not have.
     """
     units = dict(zip(result.names, result.units, strict=True))
+    finder = result.problem.finder
+    symbols = {name: domain.symbol for name, domain in finder.model.parameter_domains.items()}
     if not is_own_walker(result.model):
         own_names = [name for name in result.names if name not in MEASURES]
-        return declare_own_units(own_names, [units[name] for name in own_names])
-    measures = {measure.name: measure.unit for measure in result.problem.finder.described_measures}
+        return declare_own_units(own_names, [units[name] for name in own_names], symbols)
+    measures = {measure.name: measure.unit for measure in finder.described_measures}
+    symbols |= {measure.name: measure.symbol for measure in finder.described_measures}
     units = getattr(result.model, "state_units", {}) | measures | units
     units = dict.fromkeys(result.data.names, "1") | units
-    return declare_own_units(units, units.values())
+    return declare_own_units(units, units.values(), symbols)
 
 
 def _draw_ellipse(

@@ -8,7 +8,7 @@ import io
 import math
 import re
 import textwrap
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -324,7 +324,7 @@ def describe_quantity(quantity_name: str, dataset: xr.Dataset | None = None) -> 
     """Return the measure with a name, which a variable of `dataset` may be.
 
     A walker of the user may give another meaning to a name of the library. Its variables then have
-    units, but not the unit and symbol of the library.
+    units and symbols, but not the unit and symbol of the library.
     """
     measure = MEASURES[quantity_name]
     if dataset is None or quantity_name not in dataset.variables:
@@ -333,14 +333,37 @@ def describe_quantity(quantity_name: str, dataset: xr.Dataset | None = None) -> 
     unit_and_symbol = attributes.get("units"), attributes.get("symbol")
     if unit_and_symbol in ((None, None), (measure.unit, measure.symbol)):
         return measure
-    own_symbol = quantity_name.rpartition(".")[2]
-    return Measure(quantity_name, unit_and_symbol[0] or "1", own_symbol, quantity_name, "")
+    unit, symbol = unit_and_symbol
+    if not symbol or "∂" in symbol:  # A derivative has a name that says as much.
+        symbol = quantity_name.rpartition(".")[2]
+    return Measure(quantity_name, unit or "1", symbol, quantity_name, "")
 
 
-def declare_own_units(quantity_names: Iterable[Hashable], units: Iterable[Hashable]) -> xr.Dataset:
-    """Return a dataset from which labels of quantities of a walker of the user get their units."""
-    named_units = zip(map(str, quantity_names), map(str, units), strict=True)
-    return xr.Dataset({name: ((), np.nan, {"units": unit}) for name, unit in named_units})
+def _has_symbol(measure: Measure) -> bool:
+    """Return whether a measure is one of the library, or has a symbol that is not its name."""
+    is_in_library = measure is MEASURES.get(measure.name)
+    return is_in_library or measure.symbol not in (measure.name, measure.name.rpartition(".")[2])
+
+
+def declare_own_units(
+    quantity_names: Iterable[Hashable],
+    units: Iterable[Hashable],
+    symbols: Mapping[str, str] | None = None,
+) -> xr.Dataset:
+    """Return a dataset from which labels of quantities of a walker of the user get their units.
+
+    - `symbols`: symbols of some of the quantities by name.
+    """
+    named_units, symbols = (
+        zip(map(str, quantity_names), map(str, units), strict=True),
+        symbols or {},
+    )
+    return xr.Dataset(
+        {
+            name: ((), np.nan, {"units": unit, "symbol": symbols.get(name, "")})
+            for name, unit in named_units
+        }
+    )
 
 
 def _format_figure_unit(unit: str) -> str:
@@ -353,12 +376,12 @@ def format_axis_label(
 ) -> str:
     """Return an axis label for a quantity, with its unit, formatted with `label_format`.
 
-    A quantity of the user has its name in place of a symbol, and the unit of its variable in
-    `dataset`.
+    A quantity of the user has the unit and the symbol of its variable in `dataset`, or its name in
+    place of a symbol.
     """
     measure = describe_quantity(quantity_name, dataset)
     name_text, symbol_text = typeset_greek_symbols(measure.long_name), f"${measure.mathtext}$"
-    if measure is not MEASURES.get(quantity_name):
+    if not _has_symbol(measure):
         symbol_text = "" if "{name}" in label_format else name_text
     label_text = label_format.format(name=name_text, symbol=symbol_text).strip()
     unit_text = _format_figure_unit(measure.display_unit)
@@ -373,8 +396,7 @@ def format_value_label(
 ) -> str:
     """Return the symbol of a quantity with its value and unit, as in "c = 50 N·s/m"."""
     measure = describe_quantity(quantity_name, dataset)
-    is_in_library = measure is MEASURES.get(quantity_name)
-    symbol_text = f"${measure.mathtext}$" if is_in_library else quantity_name
+    symbol_text = f"${measure.mathtext}$" if _has_symbol(measure) else quantity_name
     unit_text = _format_figure_unit(measure.display_unit)
     return f"{symbol_text} = {quantity_value:.{n_significant_digits}g} {unit_text}".rstrip()
 

@@ -144,7 +144,8 @@ class AbstractMapContinuation(AbstractContinuation):
     """Attributes of the quantities that the dataset of the branch contains, by name."""
     component_units: ClassVar[tuple[tuple[str, str], ...]] = ()
     """Names and units of the components of the state, if they have names."""
-    unit_of_parameter: ClassVar[str] = "1"  # SI unit of the continued parameter
+    parameter_attributes: ClassVar[Mapping[str, str]] = {"units": "1"}
+    """Attributes of the continued parameter in the dataset of the branch."""
 
     @property
     def parameter_unit(self) -> float:
@@ -406,7 +407,7 @@ def trace_map_branch(
             },
         }
         | make_stability_variables(branch_data.points.return_map_jacobian),
-        {name: ("point", branch_data.points.p, {"units": continuation.unit_of_parameter})}
+        {name: ("point", branch_data.points.p, continuation.parameter_attributes)}
         | (components if units else {}),
         {"title": f"Branch of fixed points along {name}"},
     )
@@ -453,9 +454,9 @@ class HybridContinuation(AbstractMapContinuation):
         }
 
     @property
-    def unit_of_parameter(self) -> str:  # type: ignore[override]
-        parameters = {x.name: x for x in list_tree_parameters(self.wheels)}
-        return parameters[self.name].domain.unit
+    def parameter_attributes(self) -> dict[str, str]:  # type: ignore[override]
+        domain = {x.name: x.domain for x in list_tree_parameters(self.wheels)}[self.name]
+        return {"units": domain.unit, "symbol": domain.symbol}
 
     def make_point_reader(self, owner: int, point: ContinuationPoint) -> Callable:
         params = replace_tree_parameter(

@@ -179,7 +179,11 @@ def follow_optimum(
         xr.Dataset(
             {
                 **{
-                    free: ("point", column, {"units": domains[free].unit})
+                    free: (
+                        "point",
+                        column,
+                        {"units": domains[free].unit, "symbol": domains[free].symbol},
+                    )
                     for free, column in zip(
                         problem.free_parameters,
                         np.array([x.parameters for x in optima]).T,
@@ -193,7 +197,11 @@ def follow_optimum(
                 ),
             },
             {
-                name: ("point", np.array([x.value for x in optima]), {"units": domains[name].unit}),
+                name: (
+                    "point",
+                    np.array([x.value for x in optima]),
+                    {"units": domains[name].unit, "symbol": domains[name].symbol},
+                ),
                 "limit": np.array(ever_active, dtype=str),
             },
             {"title": f"Optima of {problem.objective_label} along {name}"},
