@@ -618,7 +618,7 @@ def continue_and_locate_special_points(
 
     for owner, _, _ in admissible_ranges:
         roots = [root for root in inner_roots if root.beside.owners[0] == owner]
-        roots.sort(key=lambda root: root.pair[0] + root.fraction)
+        roots.sort(key=lambda root: root.pair[0] + root.fraction * np.ptp(root.pair))
         special_points = [make_special_point(root, False) for root in roots]
         end_reasons = []
         for end, status in enumerate(statuses[owner]):
