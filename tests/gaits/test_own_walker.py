@@ -223,8 +223,14 @@ def test_parameters_outside_their_domain_have_a_code():
     gait = vrw.limit_cycle(Mass(kick=-1.0), model=BALL_SYSTEM)
     assert gait.outcome == vrw.Outcome.BAD_INPUT
     assert "outside its domain" in gait.why
-    walk = vrw.walk(Mass(kick=-1.0), [2.0], 2, model=BALL_SYSTEM)
-    assert walk.steps.outcome.tolist() == [vrw.Outcome.BAD_INPUT] * 2
+    for walker in (BALL_SYSTEM, JuggledBall()):
+        walk = vrw.walk(Mass(kick=-1.0), [2.0], 2, model=walker)
+        assert walk.steps.outcome.tolist() == [vrw.Outcome.BAD_INPUT] * 2
+        batch = vrw.step_batch(Mass(kick=np.array([-1.0, 1.0])), np.ones((2, 1)), 2, model=walker)
+        assert batch.outcome.tolist() == [vrw.Outcome.BAD_INPUT, vrw.Outcome.STEPPED]
+        assert batch.n_stepped.tolist() == [0, 2]
+        with pytest.raises(ValueError, match=r"kick is -1, but it must lie in \[0, inf\) m/s"):
+            vrw.basin_share(Mass(kick=-1.0), {"velocity": (0.0, 1.0)}, model=walker)
 
 
 class DampedBall(JuggledBall):

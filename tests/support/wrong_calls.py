@@ -4,6 +4,7 @@ As a program the module makes all calls in a process without the annotation chec
 prints {name: [error type, message, file that raised it]}.
 """
 
+import functools
 import json
 import math
 import sys
@@ -338,6 +339,23 @@ def register_wrong_calls() -> None:
         "ValueError",
         "did you mean 'lanes'",
     )
+
+    class RestingWalker(vrw.AbstractWalker):
+        def advance(self, params, x, options):
+            return vrw.AdvanceResult(x, np.ones(1))
+
+    for name, call in {
+        "step": functools.partial(vrw.step, {}, [1.0]),
+        "walk": functools.partial(vrw.walk, {}, [1.0], 2),
+        "simulate": functools.partial(vrw.simulate, {}, [1.0], 2),
+        "step_batch": functools.partial(vrw.step_batch, {}, np.ones((2, 1))),
+    }.items():
+        add_wrong_call(
+            f"{name} of an own walker by an engine",
+            functools.partial(call, model=RestingWalker(), engine="lane"),
+            "ValueError",
+            "did you mean 'lanes'",
+        )
     add_wrong_call(
         "step_batch engine none",
         lambda: vrw.step_batch(table_1, ones, engine=None),

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
-from vrw_jax.base.checks import check_real, require_known_name
+from vrw_jax.base.checks import check_real, has_traced_leaf, require_known_name
 
 
 class ParameterDomain(NamedTuple):
@@ -139,11 +138,21 @@ def list_tree_parameters(params: Any) -> list[ModuleParameter]:
 
 
 def is_tree_in_domain(params: Any) -> Any:
-    """Return whether all parameters in a tree are finite and within their domains."""
-    is_inside: Any = jnp.asarray(True)
+    """Return whether all parameters in a tree are finite and within their domains.
+
+    The result has the axis of a batch if parameters have it.
+    """
+    is_inside: Any = True
     for parameter in list_tree_parameters(params):
-        is_inside &= jnp.all(parameter.domain.contains_parameter_value(parameter.value))
+        is_inside &= parameter.domain.contains_parameter_value(parameter.value)
     return is_inside
+
+
+def require_tree_in_domain(params: Any) -> None:
+    """Raise an error that names the first parameter outside its domain; traced ones pass."""
+    for parameter in list_tree_parameters(params):
+        if not has_traced_leaf(parameter.value):
+            parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))
 
 
 def find_tree_parameter(params: Any, name: str) -> int:

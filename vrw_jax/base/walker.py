@@ -2,6 +2,7 @@
 
 import abc
 import contextlib
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, TypeGuard
@@ -17,7 +18,11 @@ from vrw_jax.base.checks import check_reals, check_type
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import list_tree_parameters, replace_tree_parameter
+from vrw_jax.base.parameters import (
+    is_tree_in_domain,
+    list_tree_parameters,
+    replace_tree_parameter,
+)
 
 
 class AdvanceResult(eqx.Module):
@@ -97,9 +102,17 @@ class AbstractWalker(abc.ABC):
     def advance(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
         """Return the end of one step of one element from section coordinates `x`."""
 
+    def advance_in_domain(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
+        """Return the end of one step, with BAD_INPUT if a parameter is outside its domain."""
+        result = self.advance(params, x, options)
+        if self.is_wheel:  # Steps of wheels contain this check.
+            return result
+        outcome = jnp.where(is_tree_in_domain(params), result.outcome, Outcome.BAD_INPUT)
+        return dataclasses.replace(result, outcome=outcome)
+
     def take_step(self, params: Any, x: Any, options: StepOptions) -> Any:
         """Return all results of one step: those of `advance`, if there are no others."""
-        return self.advance(params, x, options)
+        return self.advance_in_domain(params, x, options)
 
     def with_parameter(self, params: Any, name: str, value: Any) -> tuple[Any, Any]:
         """Return the walker and its parameters with a new value of one of them."""
@@ -311,7 +324,7 @@ def make_return_map(
     """
 
     def map_section_state(x: Array) -> Array:
-        step = walker.advance(params, x, options)
+        step = walker.advance_in_domain(params, x, options)
         return step.section_state * jnp.where(step.outcome == Outcome.STEPPED, 1.0, jnp.nan)
 
     return map_section_state

@@ -29,7 +29,6 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import is_tree_in_domain
 from vrw_jax.base.printing import (
     format_each_batch_element,
     format_heading_and_rows,
@@ -499,8 +498,9 @@ class HybridSystem(AbstractWalker):
     def advance(self, params: Any, x: Array, options: StepOptions) -> AdvanceResult:
         """Return the end of one step of one element."""
         step = compile_step(self)(params, x, options)
-        outcome = jnp.where(is_tree_in_domain(params), step.outcome, Outcome.BAD_INPUT)
-        return AdvanceResult(step.section_state, step.mode_durations, outcome, step.solver_steps)
+        return AdvanceResult(
+            step.section_state, step.mode_durations, step.outcome, step.solver_steps
+        )
 
     def simulate(
         self,

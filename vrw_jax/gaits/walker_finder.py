@@ -24,6 +24,7 @@ from vrw_jax.base.parameters import (
     is_tree_in_domain,
     list_tree_parameters,
     replace_tree_parameter,
+    require_tree_in_domain,
 )
 from vrw_jax.base.printing import (
     format_each_batch_element,
@@ -587,9 +588,8 @@ def make_walker_finder(
                 f"{parameter.name} has shape {parameter.value.shape}, but this function is for one "
                 "walker whose parameters are numbers: give one number."
             )
-        if not has_traced_leaf(parameter.value):
-            parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))
         named_domains.append((parameter.name, parameter.domain))
+    require_tree_in_domain(params)
     if walker.starts is None and guess is None:
         raise ValueError(
             "this walker has no starts, but the search for its gaits begins there: give a function "

@@ -311,6 +311,7 @@ def step(
         0.714 s, STEPPED
     """
     if is_own_walker(model):
+        options = convert_step_options(options).with_engine(engine)
         return compile_step(model)(*check_arguments(model, params, x, options, 1))
     params, section_state, model, options = _convert_single_step_arguments(
         params, x, model, options, engine
@@ -435,7 +436,8 @@ def _simulate_walk_by_scan(
         step_model, step_params = (
             (model, params) if step_ground is None else model.with_step_ground(params, step_ground)
         )
-        step_result = step_model.advance(step_params, jnp.where(is_walking, x, jnp.nan), options)
+        x_or_nan = jnp.where(is_walking, x, jnp.nan)
+        step_result = step_model.advance_in_domain(step_params, x_or_nan, options)
         outcome = jnp.where(is_walking, step_result.outcome, outcome)
         step_result = dataclasses.replace(
             step_result,
@@ -532,6 +534,7 @@ def convert_own_walk_arguments(
 
     The ground of the steps consists of the parameters that are arrays.
     """
+    options = convert_step_options(options).with_engine(engine)
     params = check_parameters(params)
     if heights is not None:
         params = model.put_on_heights(params, heights, n_steps)

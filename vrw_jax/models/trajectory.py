@@ -42,6 +42,7 @@ from vrw_jax.models.stepping import (
     ModelLike,
     SectionStateLike,
     convert_own_walk_arguments,
+    convert_step_options,
     convert_walk_arguments,
 )
 from vrw_jax.models.unilateral_wheel import UnilateralTrajectory
@@ -109,6 +110,7 @@ def simulate(
     require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x, heights)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
     if is_own_walker(model):
+        options = convert_step_options(options).with_engine(engine)
         return _simulate_own_walker(params, x, n_steps, model, options, n_samples, heights)
     given_params = params
     params, x, model, options, stepwise_ground = convert_walk_arguments(

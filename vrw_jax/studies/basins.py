@@ -24,6 +24,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import require_tree_in_domain
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
@@ -342,6 +343,7 @@ class StableGait(NamedTuple):
         is_own = is_own_walker(model)
         if is_own:
             params = check_parameters(params)
+            require_tree_in_domain(params)
         else:
             model = convert_model_argument(model).fallback_model  # valid for any start
             require_single_wheel(params, f"call {caller_name} for one wheel after the other")

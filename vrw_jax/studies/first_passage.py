@@ -20,6 +20,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import require_tree_in_domain
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
@@ -448,6 +449,7 @@ def first_passage(
         _check_walker_on_random_ground(model, params, ground_sd, sd_name)
         resolved_model: Any = model
         params = check_parameters(params)
+        require_tree_in_domain(params)
     else:
         resolved_model = convert_model_argument(resolve_model(params, model))
     if resolved_model.is_wheel and resolved_model.make_vertical_rate_map(params) is not None:
