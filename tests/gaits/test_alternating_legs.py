@@ -214,6 +214,35 @@ def test_fits_to_gaits_and_series_of_two_legs_find_both(cycle):
     np.testing.assert_allclose(fit.values, [150.0, 170.0], rtol=2e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("turn", [0.0, 1.0])
+def test_first_passages_of_two_legs_are_those_of_counted_walks(turn):
+    """60,000 walks of at most 100 steps, of which none survives.
+
+    Survivors of six steps have forgotten the gait, and the same leg has its turn again.
+    """
+    slope_sd, n, n_steps = 0.03, 60_000, 100
+    model = make_wheel({"damping": 185.0}, {"damping": 205.0}, turn=turn)
+    passage = vrw.first_passage(PARAMS, slope_sd, model=model)
+    assert int(passage.status) == 0
+    gait = vrw.limit_cycle(PARAMS, model=model, period_n=2)
+    random = np.random.default_rng(7)
+    slopes = 0.3 + slope_sd * random.standard_normal((n, n_steps + 1))
+    slopes[:, 0] = 0.3
+    starts = np.tile(gait.section_state, (n, 1))
+    wheels = vrw.WheelParams(slope=slopes)
+    n_stepped = vrw.step_batch(wheels, starts, n_steps, model=model).n_stepped
+    assert n_stepped.max() < n_steps
+    counted_error = 2.58 * np.std(n_stepped) / np.sqrt(n)
+    difference = float(passage.mean_steps_from_gait) - np.mean(n_stepped)
+    assert abs(difference) < counted_error + 1.5 * float(passage.error)
+    lives = n_stepped[n_stepped >= 6] - 5  # with the step that fails
+    counted_error = 2.58 * np.std(lives) / np.sqrt(len(lives))
+    assert abs(float(passage.mean_steps) - np.mean(lives)) < counted_error + float(passage.error)
+    with pytest.raises(ValueError, match="the legs alternate, but derivatives of sampled means"):
+        jax.grad(lambda sd: vrw.first_passage(PARAMS, sd, model=model).mean_steps)(slope_sd)
+
+
 def test_what_two_legs_cannot_do_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="a gait repeats after an even number of steps"):
         vrw.limit_cycle(PARAMS, model=make_wheel())

@@ -399,6 +399,9 @@ def first_passage(
     from concrete values, so `jit` and `vmap` do not accept sampled means. A `WheelObjective` passes
     them to `tune`.
 
+    If legs alternate, walks begin with the leg that `leg.turn` selects, and the failure probability
+    is the mean over steps. Their means have no derivatives.
+
     A walker of yours declares by `ground` which of its parameters is the slope of a step or the
     rise of a foothold, see `AbstractWalker`. Its walks are sampled, and its means have no
     derivatives.
@@ -475,6 +478,11 @@ def first_passage(
         relative_tolerance=tol or 0.02,
         max_steps=max_steps,
     )
+    if has_traced_leaf(params, ground_sd) and getattr(resolved_model, "leg_period", 1) > 1:
+        raise ValueError(
+            "the legs alternate, but derivatives of sampled means are those of legs with one law: "
+            "take differences of means."
+        )
     if not has_traced_leaf(params, ground_sd):
         return estimate_passage(params, float(ground_sd))[0]
     return _estimate_differentiable_passage(estimate_passage, params, ground_sd)
@@ -670,7 +678,8 @@ def _estimate_passage_by_sampling(
     the names of the parameters. Raise ValueError if the wheel has no gait, or if hardly any step
     succeeds.
     """
-    limit_cycle_result: Any = limit_cycle(params, model=model)
+    period_n = getattr(model, "leg_period", 1)
+    limit_cycle_result: Any = limit_cycle(params, model=model, period_n=period_n)
     kind = "wheel" if model.is_wheel else "walker"
     if int(limit_cycle_result.outcome) != Outcome.STEPPED:
         raise ValueError(

@@ -10,6 +10,7 @@ between groups gives the error.
 
 import collections
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -131,7 +132,7 @@ class ExtinctGroupError(ValueError):
 class SampledPassage(NamedTuple):
     """Results of `sample_passage`: first-passage times, estimated from sampled walks."""
 
-    failure_probability: float  # of one step from the quasi-stationary distribution
+    failure_probability: float  # mean of a step from the quasi-stationary distribution
     relative_error: float  # of the mean; half a confidence interval plus `start_effect`
     start_effect: float  # relative effect of the start of the walks on the mean
     mean_steps_from_gait: float
@@ -146,12 +147,17 @@ class SampledPassage(NamedTuple):
 
 
 class StepTransition(NamedTuple):
-    """States of all walkers before and after one gait step, see `stack_states_and_ground`."""
+    """States of all walkers before and after the steps in which all legs have their turn.
+
+    The states are those of `stack_states_and_ground`.
+    """
 
     states_before_step: np.ndarray
     is_walker_alive: np.ndarray
-    ground_deviations: np.ndarray  # of the slopes or heights on which the step ends
+    ground_deviations: np.ndarray  # of the slopes or heights on which the steps end
     states_after_step: np.ndarray
+    step_distances: np.ndarray  # mean distance of each step along the mean slope, m
+    n_stepped: np.ndarray  # number of completed steps
 
 
 @dataclass
@@ -203,6 +209,14 @@ class WalkerGroups:
         return self.sd_name == "height_sd"
 
     @property
+    def leg_period(self) -> int:
+        """Return the number of steps after which the legs are in the same roles again.
+
+        So many steps are one step of the survival operator.
+        """
+        return getattr(self.model, "leg_period", 1)
+
+    @property
     def n_continuous_entries(self) -> int:
         """Return the number of components of a section state that are no codes."""
         if not self.model.is_wheel:
@@ -213,7 +227,8 @@ class WalkerGroups:
         self.n_walkers_per_group = 1 << (-(-self.n_walkers // self.n_groups) - 1).bit_length()
         self.n_walkers = self.n_groups * self.n_walkers_per_group
         self.n_steps = 0
-        self.weight_by_outcome: Any = collections.Counter()  # total weight of walks that failed
+        # total weight of walks that failed, by outcome and number of legs that had their turn
+        self.weight_by_outcome: Any = collections.Counter()
         self.restart_at_gait()
 
     def run_walks(
@@ -233,7 +248,7 @@ class WalkerGroups:
         )
         has_failed = walk_results.outcome != Outcome.STEPPED
         self.n_steps += int(np.sum(walk_results.n_stepped) + np.sum(has_failed))
-        is_in_last_step = walk_results.n_stepped == ground_deviations.shape[1] - 1
+        is_in_last_step = walk_results.n_stepped >= ground_deviations.shape[1] - self.leg_period
         return has_failed & is_in_last_step, has_failed, walk_results
 
     def run_walks_with_changes(
@@ -285,14 +300,23 @@ class WalkerGroups:
             - walk_density.compute_log_density(slope_deviations)
         )
         failure_importance_weights = np.where(has_failed_in_last_step, likelihood_ratios, 0.0)
-        self.add_failure_weights(walk_results.outcome, failure_importance_weights)
+        self.add_failure_weights(walk_results, failure_importance_weights)
         return failure_importance_weights
 
-    def add_failure_weights(self, walk_outcomes: np.ndarray, walk_weights: np.ndarray) -> None:
-        """Add the weights of failed walks to `weight_by_outcome`, the total for each outcome."""
-        for outcome_code in np.unique(walk_outcomes[walk_weights > 0.0]):
-            outcome_weight = float(np.sum(walk_weights[walk_outcomes == outcome_code]))
-            self.weight_by_outcome[int(outcome_code)] += outcome_weight
+    def add_failure_weights(self, walk_results: StepBatchResult, walk_weights: np.ndarray) -> None:
+        """Add the weights of failed walks to `weight_by_outcome`."""
+        turns = walk_results.n_stepped % self.leg_period
+        for turn in range(self.leg_period):
+            weights = np.where(turns == turn, walk_weights, 0.0)
+            for outcome_code in np.unique(walk_results.outcome[weights > 0.0]):
+                outcome_weight = float(np.sum(weights[walk_results.outcome == outcome_code]))
+                self.weight_by_outcome[int(outcome_code), turn] += outcome_weight
+
+    def compute_mean_last_turn(self) -> float:
+        """Return the mean number of steps without failure since the legs began their turns."""
+        total = self.weight_by_outcome.total()
+        turns = (turn * weight for (_, turn), weight in self.weight_by_outcome.items())
+        return sum(turns) / total if total else 0.0
 
     def restart_at_gait(self) -> None:
         """Reset all walkers to the section state of the gait, on a line of the mean slope, or from
@@ -334,9 +358,12 @@ class WalkerGroups:
         Raise `ExtinctGroupError` if no walker of a group survived.
         """
         states_before_step = self.stack_states_and_ground()
-        ground_deviations = self.random.standard_normal((self.n_walkers, 1))
+        ground_deviations = self.random.standard_normal((self.n_walkers, self.leg_period))
         _, has_failed, walk_results = self.run_walks(ground_deviations)
-        self.add_failure_weights(walk_results.outcome, has_failed.astype(float))
+        self.add_failure_weights(walk_results, has_failed.astype(float))
+        step_distances = self.measure_step_distances(
+            ground_deviations, walk_results.section_state, ~has_failed
+        )
         source_indices = np.arange(self.n_walkers).reshape(self.n_groups, -1)
         for indices_of_group, has_walk_failed in zip(
             source_indices, has_failed.reshape(source_indices.shape), strict=True
@@ -350,10 +377,33 @@ class WalkerGroups:
         ground = np.concatenate(
             [self.ground, self.compute_ground(self.params, ground_deviations)], 1
         )
-        self.ground = ground[source_indices.ravel(), 1:]
+        self.ground = ground[source_indices.ravel(), self.leg_period :]
         return StepTransition(
-            states_before_step, ~has_failed, ground_deviations[:, 0], self.stack_states_and_ground()
+            states_before_step,
+            ~has_failed,
+            ground_deviations,
+            self.stack_states_and_ground(),
+            step_distances,
+            walk_results.n_stepped,
         )
+
+    def measure_step_distances(
+        self, ground_deviations: np.ndarray, end_states: np.ndarray, is_alive: np.ndarray
+    ) -> np.ndarray:
+        """Return the mean distance of the steps of each walker, 0 for those that fail, m."""
+        start, ground = (self.states[is_alive], self.ground[is_alive])
+        deviations = ground_deviations[is_alive]
+        distances = np.zeros(len(is_alive))
+        for k in range(1, self.leg_period + 1):
+            states = end_states[is_alive]
+            if k < self.leg_period:
+                walks = self.run_walks_with_changes(self.params, start, ground, deviations[:, :k])
+                states = walks.section_state
+            walked = np.concatenate(
+                [states, ground, self.compute_ground(self.params, deviations[:, :k])], 1
+            )
+            distances[is_alive] += self.compute_step_distances(walked)
+        return distances / self.leg_period
 
     def advance_without_counting(self, n_steps: int = 1) -> collections.Counter:
         """Advance all walkers by `n_steps` gait steps, and return their failures by outcome.
@@ -389,10 +439,12 @@ def sample_passage(
     count_decay_steps = lambda remaining_start_effect, decay_factor: int(
         np.ceil(np.log(remaining_start_effect) / np.log(np.clip(decay_factor, 0.01, 0.99)))
     )
-    n_biased_ground_lines = min(
+    leg_period = walker_groups.leg_period
+    n_biased_steps = min(
         count_decay_steps(walker_groups.negligible_ground_line_effect, spectral_radius),
-        MAX_BIASED_GROUND_LINES,
+        MAX_BIASED_GROUND_LINES // leg_period,
     )
+    n_biased_ground_lines = leg_period * n_biased_steps
     max_start_effect = MAX_START_EFFECT_PER_TOL * relative_tolerance
     n_forgetting_steps = int(
         np.clip(
@@ -401,7 +453,7 @@ def sample_passage(
             MAX_FORGETTING_STEPS,
         )
     )
-    surviving_fractions, step_transitions = _step_until_start_is_forgotten(
+    surviving_fraction, n_completed_steps, step_transitions = _step_until_start_is_forgotten(
         walker_groups, n_forgetting_steps, relative_tolerance
     )
     while True:
@@ -418,7 +470,7 @@ def sample_passage(
         n_decay_steps = count_decay_steps(max_start_effect, start_effect_factor) + 1
         # The number of steps is at most doubled, because more transitions improve kappa_2.
         n_required_steps = min(
-            n_decay_steps - n_biased_ground_lines,
+            n_decay_steps - n_biased_steps,
             MAX_FORGETTING_STEPS,
             2 * n_forgetting_steps,
         )
@@ -426,10 +478,8 @@ def sample_passage(
             break
         for _ in range(n_required_steps - n_forgetting_steps):
             step_transitions.append(walker_groups.step_and_replace_failures())
-            surviving_fractions = np.append(
-                surviving_fractions,
-                surviving_fractions[-1] * np.mean(step_transitions[-1].is_walker_alive),
-            )
+            n_completed_steps += surviving_fraction * np.mean(step_transitions[-1].n_stepped)
+            surviving_fraction *= np.mean(step_transitions[-1].is_walker_alive)
     walker_groups.weight_by_outcome.clear()
     walk_density = GaussianMixture.make_isotropic_gaussian(n_biased_ground_lines, 1.0)
     estimate_probability = functools.partial(
@@ -459,7 +509,7 @@ def sample_passage(
             walk_density = failure_density
             failure_probability, relative_error, start_effect = estimate_probability(
                 _make_weight_sampler(walker_groups, walk_density),
-                n_biased_ground_lines,
+                n_biased_steps,
                 advance_walkers=walker_groups.advance_without_counting,
             )
             if np.isfinite(relative_error) and _has_missed_failures(
@@ -481,11 +531,17 @@ def sample_passage(
     mean_step_distance, step_distance_error = _estimate_step_distance(
         walker_groups, late_transitions
     )
+    # Steps after a failure, before all legs have had their turn, are not taken.
+    n_missing_steps = leg_period - 1.0 - walker_groups.compute_mean_last_turn()
+    failure_probability /= leg_period - failure_probability * n_missing_steps
     mean_steps_from_gait = np.inf
     if failure_probability > 0.0:
         mean_steps_from_gait = float(
-            np.sum(surviving_fractions[1:-1]) + surviving_fractions[-1] / failure_probability
+            n_completed_steps + surviving_fraction * (1.0 / failure_probability - 1.0)
         )
+    outcome_weights: Any = collections.Counter()
+    for (outcome_code, _), weight in walker_groups.weight_by_outcome.items():
+        outcome_weights[outcome_code] += weight
     return SampledPassage(
         failure_probability=failure_probability,
         relative_error=relative_error,
@@ -493,11 +549,11 @@ def sample_passage(
         mean_steps_from_gait=mean_steps_from_gait,
         mean_step_distance=mean_step_distance,
         step_distance_error=step_distance_error,
-        kappa_2=kappa_2,
+        kappa_2=kappa_2 ** (1.0 / leg_period),
         quasi_stationary_states=walker_groups.stack_states_and_ground(),
         fraction_by_outcome={
-            Outcome(outcome_code).name: outcome_weight / walker_groups.weight_by_outcome.total()
-            for outcome_code, outcome_weight in walker_groups.weight_by_outcome.most_common()
+            Outcome(outcome_code).name: outcome_weight / outcome_weights.total()
+            for outcome_code, outcome_weight in outcome_weights.most_common()
         },
         n_sampled_steps=walker_groups.n_steps,
         walk_density=walk_density,
@@ -628,21 +684,21 @@ def _step_until_start_is_forgotten(
     walker_groups: WalkerGroups,
     n_steps: int,
     relative_tolerance: float,
-) -> tuple[np.ndarray, list[StepTransition]]:
-    """Return the fractions of walks from the gait that survive 0, 1, ..., `n_steps` gait steps, and
-    the transitions of the walkers in each of these steps.
+) -> tuple[float, float, list[StepTransition]]:
+    """Return the fraction of walks from the gait that survive, the mean number of steps that they
+    complete, and the transitions of the walkers.
 
-    The fractions have the shape (n_steps + 1,). All walkers start on the gait and take `n_steps`
-    steps. These rounds are repeated until the last fraction is accurate. The product of the
-    surviving fractions of successive steps has no bias, although survivors replace failed walkers
-    (Del Moral 2004).
+    All walkers start on the gait and take `n_steps` steps, or so many turns of all legs. These
+    rounds are repeated until the last fraction is accurate. The product of the surviving fractions
+    of successive steps has no bias, although survivors replace failed walkers (Del Moral 2004).
     """
     from scipy import stats  # This import is slow.
 
     max_relative_variance = (
         relative_tolerance / stats.norm.isf(0.5 * (1.0 - CONFIDENCE_LEVEL))
     ) ** 2
-    fractions_by_round: list[np.ndarray] = []
+    fractions_by_round: list[float] = []
+    n_completed_by_round: list[float] = []
     relative_variance_sum = 0.0
     while not fractions_by_round or (
         len(fractions_by_round) < MAX_ROUNDS_FROM_GAIT
@@ -653,11 +709,18 @@ def _step_until_start_is_forgotten(
         alive_fractions = np.array(
             [np.mean(transition.is_walker_alive) for transition in step_transitions]
         )
-        fractions_by_round.append(np.cumprod([1.0, *alive_fractions]))
+        fractions = np.cumprod([1.0, *alive_fractions])
+        mean_completed = [np.mean(transition.n_stepped) for transition in step_transitions]
+        fractions_by_round.append(float(fractions[-1]))
+        n_completed_by_round.append(float(fractions[:-1] @ mean_completed))
         relative_variance_sum += float(
             np.sum((1.0 - alive_fractions) / alive_fractions) / walker_groups.n_walkers
         )
-    return np.mean(fractions_by_round, 0), step_transitions
+    return (
+        float(np.mean(fractions_by_round)),
+        float(np.mean(n_completed_by_round)),
+        step_transitions,
+    )
 
 
 def _estimate_step_distance(
@@ -670,11 +733,7 @@ def _estimate_step_distance(
     distance_sums, n_completed = np.zeros((2, n_groups))
     for transition in step_transitions:
         is_alive = transition.is_walker_alive
-        distances = np.zeros(len(is_alive))
-        distances[is_alive] = walker_groups.compute_step_distances(
-            transition.states_after_step[is_alive]
-        )
-        distance_sums += distances.reshape(n_groups, -1).sum(1)
+        distance_sums += transition.step_distances.reshape(n_groups, -1).sum(1)
         n_completed += is_alive.reshape(n_groups, -1).sum(1)
     quantile = stats.t.isf(0.5 * (1.0 - CONFIDENCE_LEVEL), n_groups - 1)
     group_means = distance_sums / n_completed
@@ -781,7 +840,8 @@ def _estimate_kappa_2(
     - `n_ground_entries`: number of components of the ground, which are the last ones.
     """
     states_before_step, is_walker_alive, landing_deviations, states_after_step = (
-        np.concatenate(arrays_by_step) for arrays_by_step in zip(*step_transitions, strict=True)
+        np.concatenate(arrays_by_step)
+        for arrays_by_step in itertools.islice(zip(*step_transitions, strict=True), 4)
     )
     varying_components = [
         i
@@ -803,10 +863,8 @@ def _estimate_kappa_2(
         / singular_values[is_direction_resolved, None]
     )
     first_coordinate_indices, second_coordinate_indices = np.triu_indices(len(principal_directions))
-    landing_hermite_polynomials = (
-        landing_deviations[:, None],
-        landing_deviations[:, None] ** 2 - 1.0,
-    )
+    columns = landing_deviations.reshape(len(landing_deviations), -1, 1).swapaxes(0, 1)
+    landing_hermite_polynomials = (*columns, *(columns**2 - 1.0))
 
     def project_second_eigenvalue(has_quadratic_features: bool) -> float:
         """Return the modulus of the second eigenvalue, projected on polynomials of the state.
