@@ -224,6 +224,8 @@ def test_parameters_outside_their_domain_have_a_code():
     assert gait.outcome == vrw.Outcome.BAD_INPUT
     assert "outside its domain" in gait.why
     for walker in (BALL_SYSTEM, JuggledBall()):
+        step = vrw.step(Mass(kick=-1.0), [2.0], model=walker)
+        assert int(step.outcome) == vrw.Outcome.BAD_INPUT
         walk = vrw.walk(Mass(kick=-1.0), [2.0], 2, model=walker)
         assert walk.steps.outcome.tolist() == [vrw.Outcome.BAD_INPUT] * 2
         batch = vrw.step_batch(Mass(kick=np.array([-1.0, 1.0])), np.ones((2, 1)), 2, model=walker)

@@ -385,6 +385,15 @@ def test_shares_along_a_branch_of_an_own_walker_are_their_closed_forms():
         measure(box, model=OtherBall())
 
 
+def test_a_cycle_of_other_parameters_is_refused_also_where_walks_arrive_at_once():
+    params = {"ball": {"restitution": 0.01}, "kick": 1.0}
+    cycle = vrw.limit_cycle(params, model=JuggledBall())
+    with pytest.raises(ValueError, match="does not repeat after 1 step with JuggledBall"):
+        vrw.basin_share(
+            params | {"kick": 2.0}, {"velocity": (0.0, 8.0)}, model=JuggledBall(), cycle=cycle
+        )
+
+
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [

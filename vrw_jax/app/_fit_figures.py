@@ -18,7 +18,7 @@ from vrw_jax.app.figure_style import (
     FigureWidth,
     StyledFigure,
     add_wrapped_legend,
-    declare_own_units,
+    declare_own_quantities,
     figure_style,
     find_width_inches,
     format_axis_label,
@@ -129,12 +129,12 @@ def _find_own_units(result: FitResult) -> xr.Dataset:
     symbols = {name: domain.symbol for name, domain in finder.model.parameter_domains.items()}
     if not is_own_walker(result.model):
         own_names = [name for name in result.names if name not in MEASURES]
-        return declare_own_units(own_names, [units[name] for name in own_names], symbols)
+        return declare_own_quantities(own_names, [units[name] for name in own_names], symbols)
     measures = {measure.name: measure.unit for measure in finder.described_measures}
     symbols |= {measure.name: measure.symbol for measure in finder.described_measures}
     units = getattr(result.model, "state_units", {}) | measures | units
     units = dict.fromkeys(result.data.names, "1") | units
-    return declare_own_units(units, units.values(), symbols)
+    return declare_own_quantities(units, units.values(), symbols)
 
 
 def _draw_ellipse(

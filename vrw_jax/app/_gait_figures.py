@@ -29,7 +29,7 @@ from vrw_jax.app.figure_style import (
     add_side_legend,
     add_wrapped_legend,
     count_panel_columns,
-    declare_own_units,
+    declare_own_quantities,
     describe_quantity,
     draw_markers,
     draw_outcome_cells,
@@ -436,7 +436,7 @@ def tuning_figure(tuned: TuneResult, *, width: FigureWidth = None) -> Figure:
     if not tuned.model.is_wheel:
         names = [str(x).removeprefix(UPPER_BOUND_PREFIX) for x in path_dataset.constraint.values]
         objective_unit = path_dataset.objective.attrs.get("units", "1")
-        own_units = declare_own_units(
+        own_units = declare_own_quantities(
             [*names, tuned.objective], [*path_dataset.constraint_unit.values, objective_unit]
         )
     legend_width_inches = (0.4 if has_two_columns else 0.65) * width_inches
@@ -670,7 +670,7 @@ def tornado_figure(
     width_inches = find_width_inches(width, width_fraction * PAGE_FIGURE_WIDTH_INCHES)
     own_units = None
     if "rung" not in table.attrs:  # The library's symbols are those of wheels.
-        own_units = declare_own_units(table.measure.values, table.measure_unit.values)
+        own_units = declare_own_quantities(table.measure.values, table.measure_unit.values)
     figure, panel_axes = make_bar_panels(width_inches, measure_names, panel_height, 0.3, own_units)
     parameter_change_text = "1 %" if spreads is None else "by its spread"
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):

@@ -334,7 +334,7 @@ def describe_quantity(quantity_name: str, dataset: xr.Dataset | None = None) -> 
     if unit_and_symbol in ((None, None), (measure.unit, measure.symbol)):
         return measure
     unit, symbol = unit_and_symbol
-    if not symbol or "∂" in symbol:  # A derivative has a name that says as much.
+    if not symbol or "∂" in symbol:  # The name of a derivative already shows it.
         symbol = quantity_name.rpartition(".")[2]
     return Measure(quantity_name, unit or "1", symbol, quantity_name, "")
 
@@ -345,7 +345,7 @@ def _has_symbol(measure: Measure) -> bool:
     return is_in_library or measure.symbol not in (measure.name, measure.name.rpartition(".")[2])
 
 
-def declare_own_units(
+def declare_own_quantities(
     quantity_names: Iterable[Hashable],
     units: Iterable[Hashable],
     symbols: Mapping[str, str] | None = None,
@@ -354,10 +354,8 @@ def declare_own_units(
 
     - `symbols`: symbols of some of the quantities by name.
     """
-    named_units, symbols = (
-        zip(map(str, quantity_names), map(str, units), strict=True),
-        symbols or {},
-    )
+    named_units = zip(map(str, quantity_names), map(str, units), strict=True)
+    symbols = symbols or {}
     return xr.Dataset(
         {
             name: ((), np.nan, {"units": unit, "symbol": symbols.get(name, "")})

@@ -140,7 +140,7 @@ def list_tree_parameters(params: Any) -> list[ModuleParameter]:
 def is_tree_in_domain(params: Any) -> Any:
     """Return whether all parameters in a tree are finite and within their domains.
 
-    The result has the axis of a batch if parameters have it.
+    If parameters have a batch axis, the result has it too.
     """
     is_inside: Any = True
     for parameter in list_tree_parameters(params):
@@ -149,7 +149,10 @@ def is_tree_in_domain(params: Any) -> Any:
 
 
 def require_tree_in_domain(params: Any) -> None:
-    """Raise an error that names the first parameter outside its domain; traced ones pass."""
+    """Raise an error that names the first parameter outside its domain.
+
+    Traced parameters are not checked.
+    """
     for parameter in list_tree_parameters(params):
         if not has_traced_leaf(parameter.value):
             parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))

@@ -110,7 +110,7 @@ def announce_wait(
 
 @functools.cache
 def _hold_lock_during_forks() -> None:
-    """Prevent that a child is forked while the watcher holds the lock, as it prints.
+    """Prevent forks while the watcher holds the lock, because it prints.
 
     The child has no watcher, so that nothing in it would release the lock.
     """

@@ -102,7 +102,7 @@ class AbstractWalker(abc.ABC):
     def advance(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
         """Return the end of one step of one element from section coordinates `x`."""
 
-    def advance_in_domain(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
+    def advance_checked(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
         """Return the end of one step, with BAD_INPUT if a parameter is outside its domain."""
         result = self.advance(params, x, options)
         if self.is_wheel:  # Steps of wheels contain this check.
@@ -112,7 +112,7 @@ class AbstractWalker(abc.ABC):
 
     def take_step(self, params: Any, x: Any, options: StepOptions) -> Any:
         """Return all results of one step: those of `advance`, if there are no others."""
-        return self.advance_in_domain(params, x, options)
+        return self.advance_checked(params, x, options)
 
     def with_parameter(self, params: Any, name: str, value: Any) -> tuple[Any, Any]:
         """Return the walker and its parameters with a new value of one of them."""
@@ -324,7 +324,7 @@ def make_return_map(
     """
 
     def map_section_state(x: Array) -> Array:
-        step = walker.advance_in_domain(params, x, options)
+        step = walker.advance_checked(params, x, options)
         return step.section_state * jnp.where(step.outcome == Outcome.STEPPED, 1.0, jnp.nan)
 
     return map_section_state

@@ -260,7 +260,8 @@ class Branch:
     - `ends`: reasons for which the branch ends at its first and at its last point, or for which it
       has no point;
     - `outcome`: NO_CYCLE_FOUND or BAD_INPUT if there is no gait from which a branch starts;
-    - `params`: parameters of the walker at the start of the branch, None for the branch of a map;
+    - `params`: parameters of the walker at the start of the branch; None for a map, or without a
+      gait;
     - `period_n`: number of steps after which the gaits of the branch repeat.
 
     Examples:
@@ -295,7 +296,7 @@ class Branch:
     def section_states(self) -> np.ndarray:
         """Return the section state at which the gait at each point begins, shape (points, n)."""
         dataset = self.dataset
-        return dataset["x" if "x" in dataset else "section_state"].values
+        return dataset["section_state" if "section_state" in dataset else "x"].values
 
     @property
     def stable(self) -> np.ndarray:

@@ -29,6 +29,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.parameters import is_tree_in_domain
 from vrw_jax.base.printing import (
     format_each_batch_element,
     format_heading_and_rows,
@@ -73,6 +74,7 @@ OUTCOME_BY_TERMINATION = np.array(
         Outcome.SOLVER_FAILED,
         Outcome.STEPPED,
         Outcome.ENDED_BY_GUARD,
+        Outcome.BAD_INPUT,
     ],
     np.int32,
 )
@@ -128,7 +130,7 @@ class HybridStep(eqx.Module):
 
         def describe(termination: int, mode: int, guard: int) -> str:
             ending, (mode_name, guards) = Termination(int(termination)), self.guard_names[mode]
-            if ending == Termination.SECTION_REACHED:
+            if ending in (Termination.SECTION_REACHED, Termination.BAD_INPUT):
                 return ending.meaning
             place = f"guard {guards[guard]!r} of mode" if guard >= 0 else "mode"
             return f"{ending.meaning} This is {place} {mode_name!r}."
@@ -371,7 +373,10 @@ class HybridSystem(AbstractWalker):
     def take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
         """Return one step of one element; `compile_step` compiles this function."""
         mode_index = jnp.asarray(self._find_mode(None), jnp.int32)
-        return self.finish_step(params, self.embed(x, params), mode_index, options)
+        step = self.finish_step(params, self.embed(x, params), mode_index, options)
+        bad_input = jnp.asarray(Termination.BAD_INPUT, step.termination.dtype)
+        termination = jnp.where(is_tree_in_domain(params), step.termination, bad_input)
+        return dataclasses.replace(step, termination=termination)
 
     def finish_step(
         self, params: Any, start: StateArray, mode_index: Array, options: StepOptions

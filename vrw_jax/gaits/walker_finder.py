@@ -21,7 +21,6 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import (
     ParameterDomain,
     find_tree_parameter,
-    is_tree_in_domain,
     list_tree_parameters,
     replace_tree_parameter,
     require_tree_in_domain,
@@ -72,7 +71,8 @@ class HybridGait(NamedTuple):
     - `fixed_point`: the fixed point, with the Jacobian and the status of Newton's method;
     - `outcome`: STEPPED if a gait was found, or the `Outcome` that states why not. All numbers of
       the gait are then zero, except for the codes of `last_step`, the first step that failed;
-    - `values`: the walker's measures by name, as means over the steps of the gait.
+    - `values`: the walker's measures by name, as means over the steps of the gait;
+    - `period_n`: number of its steps.
 
     Examples:
         >>> decay = lambda y, p: jnp.stack([-p["rate"] * y[0], 1.0 + 0.0 * y[1]])
@@ -96,6 +96,7 @@ class HybridGait(NamedTuple):
     fixed_point: FixedPointResult
     outcome: Int[Array, ""]
     values: dict[str, Scalar]
+    period_n: Int[Array, ""]
 
     @property
     def converged(self) -> Bool[Array, "..."]:
@@ -375,7 +376,7 @@ def _search_from_guess(
     )
     x, period, values = fixed_point.x, jnp.zeros((), fixed_point.x.dtype), []
     numbers = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((params, guess))])
-    is_valid = jnp.all(jnp.isfinite(numbers)) & is_tree_in_domain(params)
+    is_valid = jnp.all(jnp.isfinite(numbers))
     outcome = jnp.where(is_valid, Outcome.STEPPED, Outcome.BAD_INPUT)
     last_step: Any = None
     for _ in range(period_n):
@@ -404,7 +405,8 @@ def _search_from_guess(
         jacobian=make_finite(fixed_point.jacobian),
         residual=make_finite(fixed_point.residual),
     )
-    return HybridGait(x, period, last_step, fixed_point, outcome.astype(jnp.int32), means)
+    n_steps = jnp.asarray(period_n, jnp.int32)
+    return HybridGait(x, period, last_step, fixed_point, outcome.astype(jnp.int32), means, n_steps)
 
 
 class ParameterizedWalker(eqx.Module):

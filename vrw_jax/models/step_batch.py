@@ -33,7 +33,6 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.options import SolverName, StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import is_tree_in_domain
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     AbstractWalker,
@@ -239,9 +238,9 @@ def _step_batch_of_own_walker(
         of_step = jax.tree.map(lambda leaf: leaf[:, k] if leaf.ndim > 1 else leaf, arrays)
         rows = eqx.combine(select_tree_rows(of_step, walking), numbers)
         step = step_batch_of_walker(walker, rows, x.T, options)
-        outcome = np.where(is_tree_in_domain(rows), step.outcome, np.int32(Outcome.BAD_INPUT))
-        section_state = np.where((outcome == Outcome.STEPPED)[:, None], step.section_state, 0.0)
-        return section_state.T, step.durations.T, outcome, step.solver_steps
+        has_stepped = (step.outcome == Outcome.STEPPED)[:, None]
+        section_state = np.where(has_stepped, step.section_state, 0.0)
+        return section_state.T, step.durations.T, step.outcome, step.solver_steps
 
     batch.take_steps(n_steps, step_lanes)
     result = batch.make_batch_result("lanes", (options.solver,))

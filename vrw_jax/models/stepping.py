@@ -437,7 +437,7 @@ def _simulate_walk_by_scan(
             (model, params) if step_ground is None else model.with_step_ground(params, step_ground)
         )
         x_or_nan = jnp.where(is_walking, x, jnp.nan)
-        step_result = step_model.advance_in_domain(step_params, x_or_nan, options)
+        step_result = step_model.advance_checked(step_params, x_or_nan, options)
         outcome = jnp.where(is_walking, step_result.outcome, outcome)
         step_result = dataclasses.replace(
             step_result,

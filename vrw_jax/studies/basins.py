@@ -305,11 +305,6 @@ def _make_orbit_variables(
 MAX_ARRIVAL_DISTANCE = 1e-6
 
 
-# Largest number of steps after which a gait of unknown period has to repeat. The value is chosen as
-# the default `max_period` of `basin`.
-MAX_GAIT_STEPS = 16
-
-
 class StableGait(NamedTuple):
     """Stable gait of one walker, with its parameters, the model and the step options."""
 
@@ -348,7 +343,7 @@ class StableGait(NamedTuple):
             model = convert_model_argument(model).fallback_model  # valid for any start
             require_single_wheel(params, f"call {caller_name} for one wheel after the other")
         if changes_within_step:
-            require_start_within_step(model, changes_within_step)
+            require_can_start_within_step(model, changes_within_step)
         options = convert_step_options(options)
         options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
         if cycle is None:
@@ -369,7 +364,7 @@ class StableGait(NamedTuple):
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable: "
                 "take parameters whose gait has a spectral radius below 1."
             )
-        period_n = getattr(cycle, "period_n", None)
+        period_n = int(cycle.period_n)
         return cls.from_section_state(
             params, model, options, cycle.section_state, period_n, spectral_radius
         )
@@ -381,30 +376,26 @@ class StableGait(NamedTuple):
         model: Any,
         options: StepOptions,
         section_state: Any,
-        period_n: int | None,
+        period_n: int,
         spectral_radius: float = np.nan,
     ) -> "StableGait":
         """Return the gait that begins at a section state, or raise an error if it does not repeat
-        after `period_n` steps; None means the number after which it first repeats.
+        after `period_n` steps.
         """
         x, states = np.asarray(section_state)[None], np.zeros((0, np.size(section_state)))
         gait = cls(params, model, options, states, np.array(spectral_radius))
-        for k in range(period_n or MAX_GAIT_STEPS):
+        for k in range(period_n):
             gait = gait._replace(section_states=np.concatenate([gait.section_states, x]))
-            leg_model = gait.begin_after(k).model
+            leg_model = gait.start_at_step(k).model
             x = step_batch(params, x, model=leg_model, options=options).section_state
-            if k + 1 == period_n or (period_n is None and gait.is_on_gait(x)[0]):
-                break
-        if not gait.is_on_gait(x)[0]:
-            after = f"after {period_n} step{'s' * (period_n != 1)}"
+        if not gait._replace(section_states=gait.section_states[:1]).is_on_gait(x)[0]:
             raise ValueError(
-                f"the gait does not repeat {after if period_n else f'within {k + 1} steps'} with "
-                f"{type(model).__name__}: give a cycle of the same parameters and model, or the "
-                "model of the branch."
+                f"the gait does not repeat after {period_n} step{'s' * (period_n > 1)} with "
+                f"{type(model).__name__}: give a cycle of the same parameters and model."
             )
         return gait
 
-    def begin_after(self, n_steps: int) -> "StableGait":
+    def start_at_step(self, n_steps: int) -> "StableGait":
         """Return the gait that begins some steps later, with the legs in their roles there."""
         model = self.model
         if not is_own_walker(model):
@@ -434,7 +425,7 @@ class StableGait(NamedTuple):
         return np.abs(differences / units).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE
 
 
-def require_start_within_step(model: Any, changes: str) -> None:
+def require_can_start_within_step(model: Any, changes: str) -> None:
     """Raise an error if a model cannot begin within a step, as `changes` there need."""
     if not model.can_start_within_gait_step:
         raise ValueError(

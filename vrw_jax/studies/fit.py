@@ -150,7 +150,8 @@ def fit(
     if table.kind == "gaits" and finder.leg_period > 1 and finder.is_multistable:
         raise ValueError(
             f"the legs alternate, but with a {type(model).__name__} the data of gaits are of one "
-            "step only: fit steps, or give vrw.ViscoelasticWheel(leg_force=...)."
+            "step only: fit steps, or give vrw.ViscoelasticWheel(leg_force=...), or one law for "
+            "all legs."
         )
     if table.kind == "series" and not model.is_compliant:
         raise ValueError(

@@ -44,7 +44,7 @@ from vrw_jax.studies.basins import (
     parse_start_box,
 )
 from vrw_jax.studies.stride_pushes import (
-    check_pushed_coordinate,
+    check_disturbed_coordinate,
     compute_smallest_disturbance,
     find_coordinate_unit,
 )
@@ -287,7 +287,7 @@ def measure_basins(
     if coordinate is not None or (
         checked_model.is_wheel and checked_model.can_start_within_gait_step
     ):
-        coordinate = check_pushed_coordinate(checked_model, coordinate)
+        coordinate = check_disturbed_coordinate(checked_model, coordinate)
         unit = find_coordinate_unit(checked_model, coordinate)
         meaning = f"smallest change of {coordinate} that leaves the basin"
         variables["smallest_disturbance"] = (unit, meaning)
@@ -308,11 +308,11 @@ def measure_basins(
             values += [disturbance.size, disturbance.size_error]
         return values
 
-    points = _space_branch_points(branch, n_points)
-    distances_left = branch.dataset.spectral_radius.values ** (max_steps / branch.period_n)
+    points = _select_branch_points(branch, n_points)
+    remaining_distances = branch.dataset.spectral_radius.values ** (max_steps / branch.period_n)
     rows = [
-        measure_gait(_load_branch_gait(branch, i, checked_model, checked_step_options))
-        if distances_left[i] <= MAX_ARRIVAL_DISTANCE
+        measure_gait(_make_branch_gait(branch, i, checked_model, checked_step_options))
+        if remaining_distances[i] <= MAX_ARRIVAL_DISTANCE
         else [np.nan] * len(variables)
         for i in points
     ]
@@ -360,12 +360,12 @@ def measure_gait_sensitivity(
     if branch.period_n > 1:
         raise ValueError(
             f"the gaits of the branch repeat after {branch.period_n} steps, but the norm is that "
-            "of gaits of one step: continue a branch with period_n=1."
+            "of gaits of one step: continue a branch with period_n=1, and one law for all legs."
         )
     measure_names, rows = check_names("measures", measures), []
-    points = _space_branch_points(branch, n_points)
+    points = _select_branch_points(branch, n_points)
     for i in points:
-        gait = _load_branch_gait(branch, i, checked_model, StepOptions())
+        gait = _make_branch_gait(branch, i, checked_model, StepOptions())
         guess = gait.section_states[0]
         cycle_finder = resolve_finder(gait.params, gait.model, options, guess=guess)
         parse_sensitivity_measures(cycle_finder, measure_names)
@@ -395,15 +395,20 @@ def _check_branch_model(branch: Branch, model: ModelLike | None) -> Any:
     checked_model: Any = model if is_own else convert_model_argument(model)
     if is_own and branch_model is None and branch.params is not None:
         return model
+    if branch_model is None and branch.params is None:
+        raise ValueError(
+            "the branch is one of a map or without gaits, but basins and norms are those of gaits: "
+            "give the result of vrw.continue_branch for a walker with a gait."
+        )
     if is_own or branch_model != repr(checked_model):
         raise ValueError(
-            f"the branch is one of {branch_model or 'a map or a walker of yours'}, but model is "
+            f"the branch is one of {branch_model or 'a walker of yours'}, but model is "
             f"{checked_model!r}: give the model of the branch."
         )
     return checked_model
 
 
-def _space_branch_points(branch: Branch, n_points: int | None) -> list[int]:
+def _select_branch_points(branch: Branch, n_points: int | None) -> list[int]:
     """Return the indices of evenly spaced points of a branch, of all if `n_points` is None."""
     n_branch_points = len(branch.values)
     if not n_branch_points:
@@ -417,7 +422,7 @@ def _space_branch_points(branch: Branch, n_points: int | None) -> list[int]:
     return np.unique(spaced_points.round().astype(int)).tolist()
 
 
-def _load_branch_gait(branch: Branch, point: int, model: Any, options: StepOptions) -> StableGait:
+def _make_branch_gait(branch: Branch, point: int, model: Any, options: StepOptions) -> StableGait:
     """Return the gait at a point of a branch, stable or not."""
     value = jnp.asarray(branch.values[point], jnp.result_type(*jax.tree.leaves(branch.params)))
     model, params = model.with_parameter(branch.params, branch.parameter, value)

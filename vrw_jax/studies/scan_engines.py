@@ -219,6 +219,7 @@ class CollocationScanEngine:
         can_refine_mesh = finder.cycle_options == default_finder.cycle_options
         searched, params = np.arange(len(rows)), model.attach_laws(params)
         outcomes, max_mesh_error = cycle_outcomes, MAX_UNREFINED_MESH_ERROR
+        steps: Any = ()
         for is_last_round in (not can_refine_mesh, True):
             for _, indices, mesh_search in search_further(
                 find_from_starts,
@@ -232,9 +233,10 @@ class CollocationScanEngine:
                 cycle_outcomes[searched[indices]] = mesh_search.outcome
                 gaits = replace_rows(gaits, searched[indices], mesh_search.gaits)
             section_states, measures = gaits
-            step_outcomes, end_states, step_measures = self._run(
-                "steps", size, rows, section_states, shared=(step_options,)
-            )
+            starts = select_tree_rows((rows, section_states), searched)
+            new_steps = self._run("steps", size, *starts, shared=(step_options,))
+            steps = replace_rows(steps, searched, new_steps) if steps else new_steps
+            step_outcomes, end_states, step_measures = steps
             outcomes = confirm_outcome_by_step(
                 cycle_outcomes, section_states, step_outcomes, end_states
             )

@@ -31,7 +31,7 @@ from vrw_jax.models.stepping import ModelLike
 from vrw_jax.studies.basins import (
     MAX_ARRIVAL_DISTANCE,
     StableGait,
-    require_start_within_step,
+    require_can_start_within_step,
     walk_until_on_gait,
 )
 
@@ -171,13 +171,13 @@ def smallest_disturbance(
             f"max_steps is {max_steps}, but the gait has spectral radius {spectral_radius:.6g}, so "
             f"that walks need {n_steps} steps to arrive: give max_steps={2 * n_steps}."
         )
-    coordinate = check_pushed_coordinate(stable_gait.model, coordinate)
+    coordinate = check_disturbed_coordinate(stable_gait.model, coordinate)
     return compute_smallest_disturbance(stable_gait, max_size, max_steps, coordinate)
 
 
-def check_pushed_coordinate(model: Any, coordinate: str | None) -> str:
+def check_disturbed_coordinate(model: Any, coordinate: str | None) -> str:
     """Return the name of the coordinate that disturbances change, or raise an error."""
-    require_start_within_step(model, "disturbances")
+    require_can_start_within_step(model, "disturbances")
     names = tuple(model.state) if isinstance(model, HybridSystem) else ("dtheta",)
     if coordinate is None and len(names) > 1:
         raise ValueError(
@@ -198,7 +198,7 @@ def _is_system(gait: StableGait) -> bool:
     return isinstance(gait.model, HybridSystem)
 
 
-class _SampledStride(NamedTuple):
+class _SampledGait(NamedTuple):
     """States of a gait at instants of the phases of its steps."""
 
     step_indices: np.ndarray  # step of each interval between events, (intervals,)
@@ -213,7 +213,7 @@ class _DisturbedGait(NamedTuple):
     """Gait, sampled within its steps, and the limits of the search."""
 
     stable_gait: StableGait
-    stride: _SampledStride
+    stride: _SampledGait
     coordinate_index: int  # of the coordinate that changes
     max_size: float  # largest tried change
     max_steps: int  # largest number of gait steps after the disturbance
@@ -273,7 +273,7 @@ def compute_smallest_disturbance(
     """
     system = stable_gait.model if _is_system(stable_gait) else None
     n_phase_samples = N_INTERVALS_PER_PASS * SAMPLE_STRIDES[0] + 1  # both ends included
-    stride = _sample_stride(stable_gait, n_phase_samples)
+    stride = _sample_gait(stable_gait, n_phase_samples)
     coordinates = tuple(system.state) if system else WHEEL_COORDINATES
     index = coordinates.index(coordinate)
     if max_size is None:
@@ -413,7 +413,7 @@ def _walk_after_disturbance(
         is_in_phase = (step_indices == k) & (phase_indices == phase_index)
         finish_disturbed_batch = functools.partial(
             _finish_steps,
-            stable_gait.begin_after(k),
+            stable_gait.start_at_step(k),
             _convert_phase_index(stable_gait, phase_index),
             stride.foot_distances[k],
         )
@@ -428,7 +428,7 @@ def _walk_after_disturbance(
         has_stepped = np.flatnonzero((walk_outcomes == Outcome.STEPPED) & (step_indices == k))
         if len(has_stepped):
             has_arrived, walk_outcomes[has_stepped], _ = walk_until_on_gait(
-                stable_gait.begin_after(k + 1), section_states[has_stepped], gait.max_steps
+                stable_gait.start_at_step(k + 1), section_states[has_stepped], gait.max_steps
             )
             leaves_basin[has_stepped] = ~has_arrived
     shape = disturbance_sizes.shape
@@ -578,14 +578,15 @@ def phase_response(
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     gait = StableGait.from_cycle("vrw.phase_response", params, model, cycle, options, "pushes")
     coordinates = tuple(gait.model.state) if _is_system(gait) else WHEEL_COORDINATES
-    stride = _sample_stride(gait, n_samples)
+    stride = _sample_gait(gait, n_samples)
     n = len(gait.section_states)
     period, jacobians, gradients = _differentiate_gait(gait)
     # The adjoint vector at each section is the derivative of the sum of all later durations.
-    matrix, later = np.eye(len(jacobians[0])), np.zeros(len(jacobians[0]))
+    monodromy, delay_gradient = np.eye(len(jacobians[0])), np.zeros(len(jacobians[0]))
     for jacobian, gradient in zip(jacobians[::-1], gradients["period"][::-1], strict=True):
-        matrix, later = matrix @ jacobian, gradient + jacobian.T @ later
-    adjoints = [np.linalg.solve((np.eye(len(matrix)) - matrix).T, later)]
+        monodromy = monodromy @ jacobian
+        delay_gradient = gradient + jacobian.T @ delay_gradient
+    adjoints = [np.linalg.solve((np.eye(len(monodromy)) - monodromy).T, delay_gradient)]
     for k in range(n - 1, 0, -1):
         adjoints.insert(0, gradients["period"][k] + jacobians[k].T @ adjoints[0])
     delays: list[np.ndarray] = []
@@ -595,21 +596,22 @@ def phase_response(
         stride.step_indices, stride.phase_indices, stride.states, strict=True
     ):
         remaining = _differentiate_step_rest(
-            gait.begin_after(k),
+            gait.start_at_step(k),
             _convert_phase_index(gait, index),
             stride.foot_distances[k],
             jnp.asarray(states),
         )
-        by_section, by_time = np.split(np.asarray(remaining), [len(matrix)], 1)
+        by_section, by_time = np.split(np.asarray(remaining), [len(monodromy)], 1)
         # The adjoint vectors begin at the second section and end at the first one.
         delays.append(by_time[:, 0] + np.einsum("j,ijd->id", adjoints[k], by_section))
         section_changes = [by_section]
         for m in range(k + 1, k + n_steps):
             section_changes.append(jacobians[m % n] @ section_changes[-1])
         changes.append(np.stack(section_changes))
-        for name, of_steps in gradients.items():
-            of_next = np.stack([of_steps[m % n] for m in range(k + 1, k + 1 + n_steps)])
-            measures[name].append(np.einsum("kj,kijd->kid", of_next, changes[-1]))
+        for name, step_gradients in gradients.items():
+            next_steps = range(k + 1, k + 1 + n_steps)
+            next_gradients = np.stack([step_gradients[m % n] for m in next_steps])
+            measures[name].append(np.einsum("kj,kijd->kid", next_gradients, changes[-1]))
     return PhaseResponse(
         stride.times.ravel(),
         np.repeat(stride.step_indices, n_samples),
@@ -643,7 +645,7 @@ def _differentiate_gait(
 
     period, jacobians, gradients = 0.0, [], []
     for k, x in enumerate(section_states):
-        evaluate = functools.partial(measure, gait.begin_after(k).model)
+        evaluate = functools.partial(measure, gait.start_at_step(k).model)
         (_, values), derivatives = evaluate_with_jacobian(evaluate, jnp.asarray(x))
         period += float(values["period"])
         jacobian, gradient = jax.tree.map(np.asarray, derivatives)
@@ -652,24 +654,24 @@ def _differentiate_gait(
     return period, jacobians, {name: [row[name] for row in gradients] for name in gradients[0]}
 
 
-def _sample_stride(gait: StableGait, n_samples: int) -> _SampledStride:
+def _sample_gait(gait: StableGait, n_samples: int) -> _SampledGait:
     """Return samples of each phase that takes time in the steps of a gait, both ends included."""
     intervals, foot_distances, start_time = [], [], 0.0
     for k in range(len(gait.section_states)):
         phase_indices, times, states, foot_distance = _sample_first_step(
-            gait.begin_after(k), n_samples
+            gait.start_at_step(k), n_samples
         )
         intervals.append((np.full(len(times), k), phase_indices, start_time + times, states))
         foot_distances.append(foot_distance)
         start_time += times[-1, -1]
     steps, phases, times, states = map(np.concatenate, zip(*intervals, strict=True))
-    return _SampledStride(steps, phases, times, states, tuple(foot_distances))
+    return _SampledGait(steps, phases, times, states, tuple(foot_distances))
 
 
 def _sample_first_step(
     gait: StableGait, n_samples: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Array | None]:
-    """Return phases, times, states and foot distance of `_SampledStride` in the first step."""
+    """Return phases, times, states and foot distance of `_SampledGait` in the first step."""
     params, model, options, section_states, _ = gait
     x = jnp.asarray(section_states[0])
     if not _is_system(gait):
@@ -677,7 +679,8 @@ def _sample_first_step(
         durations = np.asarray(trajectory.durations)
         phase_indices = np.flatnonzero(durations > 0.0)
         states = np.array(trajectory.state)[phase_indices]
-        # Guards of positions end the phases in which positions can be pushed.
+        # Guards of positions end the phases in which positions can be pushed. The last sample is
+        # therefore shortly before the event, where a small push does not skip it.
         time_left = (1.0 - LAST_SAMPLE_FRACTION) * durations[phase_indices, None]
         states[:, -1, :3] -= time_left * states[:, -1, 3:]
         times = np.asarray(trajectory.time)[phase_indices]
