@@ -307,7 +307,8 @@ def test_measures_of_gaits_of_any_walker_are_fitted(walker):
     numbers = {"values": np.ones(2), "standard_errors": np.ones(2), "covariance": np.eye(2)}
     figure = vrw.plot.fit_figure(dataclasses.replace(result, **unknowns, **numbers))
     period, height, _, ellipse = figure.axes
-    assert [period.get_ylabel(), height.get_ylabel()] == ["period [s]", "height [m]"]
+    # The period of a gait has one symbol for all walkers.
+    assert [period.get_ylabel(), height.get_ylabel()] == ["$T$ [s]", "height [m]"]
     # Names of parameters of the wheel do not have its symbols and units here.
     assert [ellipse.get_xlabel(), ellipse.get_ylabel()] == ["damping [N·s/m²]", "stiffness"]
 
