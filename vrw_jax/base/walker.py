@@ -98,6 +98,11 @@ class AbstractWalker(abc.ABC):
     measures: Sequence[Measure] = ()
     ground: Mapping[str, str] = {}
 
+    @property
+    def leg_period(self) -> int:
+        """Return the number of steps after which the legs are in the same roles again."""
+        return 1
+
     @abc.abstractmethod
     def advance(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
         """Return the end of one step of one element from section coordinates `x`."""

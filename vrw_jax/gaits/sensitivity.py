@@ -71,7 +71,7 @@ def sensitivities(
     if not is_own_walker(model):
         model = convert_model_argument(resolve_model(params, model))  # type: ignore[arg-type]
         require_legs_in_turn_by_collocation(model, "vrw.sensitivities")
-    period_n = getattr(model, "leg_period", 1)
+    period_n = model.leg_period
     gait_finder = resolve_finder(params, model, options, period_n, guess)
     measure_names = (
         gait_finder.default_measures

@@ -347,7 +347,7 @@ class StableGait(NamedTuple):
         options = convert_step_options(options)
         options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
         if cycle is None:
-            leg_period = getattr(model, "leg_period", 1)
+            leg_period = model.leg_period
             cycle = limit_cycle(params, model=model, period_n=leg_period)
         cycle_type: Any = HybridGait if is_own else AbstractCycle
         check_type("cycle", cycle, cycle_type, "give vrw.limit_cycle(params, model=...)")
@@ -419,7 +419,7 @@ class StableGait(NamedTuple):
             n_entries = self.model.count_continuous_section_entries(self.params)
             units = self.model.collect_section_units(wheel_units, self.params.n_legs)
             units = np.asarray(units)[:n_entries]
-        leg_period = getattr(self.model, "leg_period", 1)
+        leg_period = self.model.leg_period
         gait_states = self.section_states[n_steps % leg_period :: leg_period, :n_entries]
         differences = section_states[:, None, :n_entries] - gait_states
         return np.abs(differences / units).max(-1).min(-1) <= MAX_ARRIVAL_DISTANCE

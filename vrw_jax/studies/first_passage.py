@@ -478,7 +478,7 @@ def first_passage(
         relative_tolerance=tol or 0.02,
         max_steps=max_steps,
     )
-    if has_traced_leaf(params, ground_sd) and getattr(resolved_model, "leg_period", 1) > 1:
+    if has_traced_leaf(params, ground_sd) and resolved_model.leg_period > 1:
         raise ValueError(
             "the legs alternate, but derivatives of sampled means are those of legs with one law: "
             "take differences of means."
@@ -678,7 +678,7 @@ def _estimate_passage_by_sampling(
     the names of the parameters. Raise ValueError if the wheel has no gait, or if hardly any step
     succeeds.
     """
-    period_n = getattr(model, "leg_period", 1)
+    period_n = model.leg_period
     limit_cycle_result: Any = limit_cycle(params, model=model, period_n=period_n)
     kind = "wheel" if model.is_wheel else "walker"
     if int(limit_cycle_result.outcome) != Outcome.STEPPED:

@@ -214,7 +214,7 @@ class WalkerGroups:
 
         So many steps are one step of the survival operator.
         """
-        return getattr(self.model, "leg_period", 1)
+        return self.model.leg_period
 
     @property
     def n_continuous_entries(self) -> int:

@@ -262,7 +262,7 @@ def plan_scan(
             )
     if slope_sd is not None:
         slope_sd = check_positive("slope_sd", slope_sd)
-        if getattr(model, "leg_period", 1) > 1:
+        if model.leg_period > 1:
             raise ValueError(
                 "slope_sd is given and the legs alternate, but walks over random slopes have equal "
                 "legs: give one law for all legs, or no slope_sd."
