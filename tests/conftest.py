@@ -21,7 +21,7 @@ PACKAGE_POSITIONS = [
     if place.is_dir() and place.name != UNCHECKED_PACKAGE
 ]
 
-MAX_MEMORY_BYTES = psutil.virtual_memory().total // 5
+MAX_MEMORY_BYTES = psutil.virtual_memory().total // 4
 """Memory of a test process above which JAX's caches are cleared.
 
 There are two test processes, and the caches of all tests need several gigabytes in each.

@@ -13,7 +13,6 @@ import inspect
 from collections.abc import Callable
 from types import CodeType
 from typing import Any
-from unittest.mock import patch
 
 import jaxtyping
 
@@ -62,14 +61,12 @@ def check_first_calls(
 
 def import_with_checks(packages: list[str]) -> None:
     """Import `vrw_jax` so that its functions check their signatures."""
-    with (
-        patch.object(jaxtyping, "jaxtyped", check_first_calls),
-        jaxtyping.install_import_hook(packages, "beartype.beartype"),
-    ):
+    # Functions inside others are decorated when these run.
+    jaxtyping.jaxtyped = check_first_calls
+    with jaxtyping.install_import_hook(packages, "beartype.beartype"):
         from vrw_jax.lanes import keys
 
-    # What a checked function computes is what the function itself computes. Functions inside others
-    # are decorated when these run, by jaxtyping itself.
+    # What a checked function computes is what the function itself computes.
     def compute_nothing() -> None: ...
 
     for decorate in (check_first_calls, _check_every_call):

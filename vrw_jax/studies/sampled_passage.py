@@ -24,6 +24,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.progress import report_progress
+from vrw_jax.lanes.batching import replace_rows
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.walk_batch import StepBatchResult
 from vrw_jax.studies.failure_density import GaussianMixture, fit_failure_density
@@ -391,18 +392,19 @@ class WalkerGroups:
         self, ground_deviations: np.ndarray, end_states: np.ndarray, is_alive: np.ndarray
     ) -> np.ndarray:
         """Return the mean distance of the steps of each walker, 0 for those that fail, m."""
-        start, ground = (self.states[is_alive], self.ground[is_alive])
-        deviations = ground_deviations[is_alive]
         distances = np.zeros(len(is_alive))
         for k in range(1, self.leg_period + 1):
-            states = end_states[is_alive]
+            # JAX compiles for each number of walkers, so that those that failed are included.
+            states, deviations = end_states, ground_deviations[:, :k]
             if k < self.leg_period:
-                walks = self.run_walks_with_changes(self.params, start, ground, deviations[:, :k])
-                states = walks.section_state
-            walked = np.concatenate(
-                [states, ground, self.compute_ground(self.params, deviations[:, :k])], 1
-            )
-            distances[is_alive] += self.compute_step_distances(walked)
+                walks = self.run_walks_with_changes(
+                    self.params, *(x[is_alive] for x in (self.states, self.ground, deviations))
+                )
+                states = replace_rows(end_states, is_alive, walks.section_state)
+            ground = np.concatenate([self.ground, self.compute_ground(self.params, deviations)], 1)
+            with np.errstate(invalid="ignore"):
+                walked = self.compute_step_distances(np.concatenate([states, ground], 1))
+            distances += np.where(is_alive, walked, 0.0)
         return distances / self.leg_period
 
     def advance_without_counting(self, n_steps: int = 1) -> collections.Counter:
