@@ -147,6 +147,27 @@ def test_derivatives_agree_with_differences():
     np.testing.assert_allclose(reverse, forward, rtol=1e-13)
 
 
+@pytest.mark.parametrize("slope", [-HALF_ANGLE, HALF_ANGLE])
+def test_a_motion_that_begins_or_ends_at_the_vertical_has_right_derivatives(slope):
+    def measure_period(slope):
+        params = vrw.WheelParams(slope=slope)
+        return vrw.step(params, [HALF_ANGLE, 5.0, 0.0], model=rigid_walks()).period
+
+    difference = (measure_period(slope + 1e-5) - measure_period(slope - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.grad(measure_period)(slope), difference, rtol=1e-8)
+
+
+def test_a_foothold_behind_the_start_is_touched_at_once():
+    walk = vrw.walk(
+        vrw.WheelParams(slope=0.15),
+        [HALF_ANGLE, 1.5, 0.0],
+        1,
+        model=vrw.RigidWheel(),
+        heights=[0.0, 0.7],
+    )
+    assert walk.outcome == vrw.Outcome.TOUCHDOWN_BEFORE_STOPPER
+
+
 @pytest.mark.slow
 def test_the_rigid_wheel_is_the_second_order_limit_of_the_viscoelastic_wheel():
     """k = k0/e^2, c = c0/e, L* - L0 = d e^2: preload and damping ratio stay, the leg stiffens.

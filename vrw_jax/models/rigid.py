@@ -258,13 +258,15 @@ class RigidWheel(AbstractWheel):
     ) -> tuple[AdvanceResult, Array]:
         """Return the end of a rolling motion, and the minima of its margins.
 
-        The step fails if the wheel falls back or lifts off.
+        The step fails if the wheel falls back or lifts off, or if the end lies behind the start.
         """
         margin_minima = rolling_motion.find_margin_minima()
         reaches_end = rolling_motion.reaches_end()
         lifts_off = (margin_minima[0] <= 0.0) & self.stop_at_lift_off
         outcome = jnp.where(reaches_end, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.FELL_BACK))
         outcome = jnp.where(reaches_end & lifts_off, jnp.int32(Outcome.LEG_1_LIFTED_OFF), outcome)
+        lands_at_once = rolling_motion.end_angle < rolling_motion.first_angle
+        outcome = jnp.where(lands_at_once, jnp.int32(Outcome.TOUCHDOWN_BEFORE_STOPPER), outcome)
         outcome = jnp.where(is_valid, outcome, jnp.int32(Outcome.BAD_INPUT))
         rate, duration = rolling_motion.compute_rate_and_time_at_end(reaches_end)
         zero = jnp.zeros_like(rolling_motion.initial_rate)
@@ -490,19 +492,21 @@ class RollingMotion(eqx.Module):
         # This is the squared rate at the vertical.
         min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * first_half_angle) - 1.0)
         has_passed_vertical = first_half_angle * last_half_angle < 0.0
-        first_squared, last_squared = first_half_angle**2, last_half_angle**2
-        zero_squared_angle = jnp.zeros_like(last_half_angle)
+        # The sides are told apart without squares, whose roots have no derivative at the vertical.
+        side = jnp.where(first_half_angle < 0.0, -1.0, 1.0)
+        first_distance, last_distance = side * first_half_angle, side * last_half_angle
+        zero_angle = jnp.zeros_like(last_half_angle)
         time_to_end = _compute_rolling_time(
+            jnp.where(has_passed_vertical, zero_angle, jnp.minimum(first_distance, last_distance)),
             jnp.where(
-                has_passed_vertical, zero_squared_angle, jnp.minimum(first_squared, last_squared)
+                has_passed_vertical, last_half_angle, jnp.maximum(first_distance, last_distance)
             ),
-            jnp.where(has_passed_vertical, last_squared, jnp.maximum(first_squared, last_squared)),
             min_rate_squared,
             kappa,
         )
         time_to_vertical = _compute_rolling_time(
-            zero_squared_angle,
-            jnp.where(has_passed_vertical, first_squared, 0.0),
+            zero_angle,
+            jnp.where(has_passed_vertical, first_distance, 0.0),
             min_rate_squared,
             kappa,
         )
@@ -659,21 +663,20 @@ def _rotate_to_vertical(s: Symbols, theta: Elementwise | float) -> dynamics.Sine
 
 
 def _compute_rolling_time(
-    first_half_angle_squared: Elementwise,
-    last_half_angle_squared: Elementwise,
+    smaller_half_angle: Elementwise,
+    larger_half_angle: Elementwise,
     min_rate_squared: Elementwise,
     kappa: Elementwise,
 ) -> Elementwise:
     """Return the time between two half-angles on one side of the vertical, s.
 
-    The arguments are the squares of the half-angles. With t = sin^2 of the half-angle, the time is
-    the integral of dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)). Its closed form is 2 R_F
-    (DLMF 19.29.4). The result is 0 if the two half-angles are equal.
+    The half-angles are not negative. With t = sin^2 of the half-angle, the time is the integral of
+    dt / sqrt(t (1 - t) (min_rate_squared + 2 kappa t)). Its closed form is 2 R_F (DLMF 19.29.4).
+    The result is 0 if the two half-angles are equal.
     """
-    has_nonzero_range = last_half_angle_squared > first_half_angle_squared
-    smaller_half_angle_squared = jnp.where(has_nonzero_range, first_half_angle_squared, 0.0)
-    smaller_half_angle = compute_square_root(smaller_half_angle_squared)
-    larger_half_angle = jnp.sqrt(jnp.where(has_nonzero_range, last_half_angle_squared, 1.0))
+    has_nonzero_range = larger_half_angle > smaller_half_angle
+    smaller_half_angle = jnp.where(has_nonzero_range, smaller_half_angle, 0.0)
+    larger_half_angle = jnp.where(has_nonzero_range, larger_half_angle, 1.0)
     y1, y2 = jnp.sin(smaller_half_angle), jnp.cos(smaller_half_angle)
     x1, x2 = jnp.sin(larger_half_angle), jnp.cos(larger_half_angle)
     # Where the wheel does not get, any rate keeps the masked derivatives finite.
