@@ -282,6 +282,20 @@ def test_the_product_of_multipliers_is_accurate_at_a_grazing_event(depth):
     assert (determinant_error > 1e-12) == (depth == 1e-6)
 
 
+def test_volumes_change_by_the_guard_that_arms_at_the_event():
+    oscillate = lambda y: jnp.stack([y[1], -y[0] - 0.1 * y[1]])
+    reset = lambda y: jnp.stack([y[0] + 0.3, 0.9 * y[1]])
+    guard = Guard(lambda y: y[0] - 0.5, reset, armed=lambda y: -y[1] - 0.3 * y[0] - 0.3)
+    start = jnp.array([0.3, 0.2])
+    determinants = []
+    for mode in Mode(oscillate, guard), Mode(oscillate, Guard(guard.evaluate, reset)):
+        result = simulate_hybrid(mode, start, events=1, options=TIGHT_OPTIONS)
+        assert result.state[0] < 0.8  # The value was below zero before the guard was armed.
+        determinants.append(flow_jacobian_determinant(mode, start, result, TIGHT_OPTIONS))
+    np.testing.assert_allclose(*determinants, rtol=1e-12)
+    assert abs(determinants[0] - 2.33252) < 1e-5  # central differences of SciPy's solution
+
+
 def test_newtons_method_finds_a_repeating_state_next_to_a_jump_of_the_map():
     """x to x^2, whose points are 0 and 1, with a hole around 0 in which x leads to 7."""
     leaps = lambda x: jnp.where(jnp.abs(x) < 1e-15, 7.0, x**2)

@@ -382,7 +382,7 @@ def _compute_event_determinant(
     # Otherwise the solver steps were exhausted.
     has_reached_end = jnp.abs(end_state[-1] - mode_duration) <= 1e-9 * mode_duration
     reset_jacobian = jax.jacfwd(guard.reset)(state_before_event)
-    guard_gradient = jax.jacfwd(guard.value)(state_before_event)
+    guard_gradient = jax.jacfwd(guard.evaluate)(state_before_event)
     field_before_event = mode.field(state_before_event)
     saltation_matrix = reset_jacobian + jnp.outer(
         field_after_event - reset_jacobian @ field_before_event, guard_gradient
