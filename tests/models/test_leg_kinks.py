@@ -207,6 +207,15 @@ def test_legs_in_turn_have_kinks_of_their_own():
         np.testing.assert_allclose(section_state, expected, atol=1e-10)
 
 
+def test_equal_legs_in_turn_have_the_energy_of_one_law():
+    """The law declares its potential, because Gauss's rule is inaccurate over a kink."""
+    law = KinkedLeg(k2=300.0)
+    alone, in_turn = (
+        vrw.step(PARAMS, START, model=make_wheel(x)) for x in (law, vrw.AlternatingLegs(law, law))
+    )
+    np.testing.assert_allclose(in_turn.energy.damping, alone.energy.damping, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "kinks",
     [

@@ -82,6 +82,10 @@ class AlternatingLegs(eqx.Module):
         forces = self.first(L, dL, params), self.second(L, dL, params)
         return jnp.where(self.turn < 0.5, *forces)
 
+    def potential(self, L: Elementwise, params: LawParameters) -> Elementwise:
+        energies = (_evaluate_potential(law, L, params) for law in (self.first, self.second))
+        return jnp.where(self.turn < 0.5, *energies)
+
     def kinks(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> tuple:
         is_first = self.turn < 0.5
         first, second = (evaluate_kinks(law, L, dL, params) for law in (self.first, self.second))
@@ -362,20 +366,25 @@ _POTENTIAL_NODES, _POTENTIAL_WEIGHTS = np.polynomial.legendre.leggauss(16)
 def compute_leg_potential(
     s: Symbols, L: Elementwise, leg_numbers: int | np.ndarray = 1
 ) -> Elementwise:
-    """Return the elastic energy of legs with a user's law, J.
+    """Return the elastic energy of legs with a user's law, J."""
+    params = _collect_law_parameters(s)
+    return _apply_to_legs(s, lambda law: _evaluate_potential(law, L, params), leg_numbers)
+
+
+def _evaluate_potential(law: Any, L: Elementwise, params: LawParameters) -> Elementwise:
+    """Return the elastic energy of a leg, J.
 
     If the law has no method `potential(L, params)`, the energy is the work that compresses the leg
     slowly from its locked length: the integral of the force at rest.
     """
-    if hasattr(s.leg_force, "potential"):
-        params = _collect_law_parameters(s)
-        return _apply_to_legs(s, lambda law: law.potential(L, params), leg_numbers)
-    half_compression = 0.5 * (s.L0 - L)
+    if hasattr(law, "potential"):
+        return law.potential(L, params)
+    half_compression = 0.5 * (params.locked_length - L)
     zero_rate = 0.0 * L
     energy = zero_rate
     for node, weight in zip(_POTENTIAL_NODES.tolist(), _POTENTIAL_WEIGHTS.tolist(), strict=True):
         length = L + half_compression * (1.0 + node)
-        energy = energy + weight * evaluate_leg_force(s, length, zero_rate, leg_numbers)
+        energy = energy + weight * law(length, zero_rate, params)
     return half_compression * energy
 
 
