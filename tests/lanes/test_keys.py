@@ -256,6 +256,7 @@ def set_global(x):
         (import_later, "it imports support.hostile"),
         (set_global, "it sets the global name GRAVITY"),
         (lambda x: np.random.standard_normal() * x, "random"),  # noqa: NPY002
+        (lambda x: np.loadtxt("gravity.txt") * x, "numpy.loadtxt"),
         (scale_by(operator.attrgetter("gravity")), "attrgetter"),
         (scale_by(moon), "the module moon as a value"),
         (scale_by(iter([1])), "list_iterator"),
