@@ -233,6 +233,9 @@ def test_parameters_outside_their_domain_have_a_code():
         assert batch.n_stepped.tolist() == [0, 2]
         with pytest.raises(ValueError, match=r"kick is -1, but it must lie in \[0, inf\) m/s"):
             vrw.basin_share(Mass(kick=-1.0), {"velocity": (0.0, 1.0)}, model=walker)
+    motion = vrw.simulate(Mass(kick=-1.0), [2.0], 1, model=BALL_SYSTEM)
+    assert (motion.outcome, motion.n_steps) == ("BAD_INPUT", 0)
+    assert "outside its domain" in motion.outcome_meaning
 
 
 class DampedBall(JuggledBall):

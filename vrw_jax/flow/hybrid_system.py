@@ -374,9 +374,7 @@ class HybridSystem(AbstractWalker):
         """Return one step of one element; `compile_step` compiles this function."""
         mode_index = jnp.asarray(self._find_mode(None), jnp.int32)
         step = self.finish_step(params, self.embed(x, params), mode_index, options)
-        bad_input = jnp.asarray(Termination.BAD_INPUT, step.termination.dtype)
-        termination = jnp.where(is_tree_in_domain(params), step.termination, bad_input)
-        return dataclasses.replace(step, termination=termination)
+        return dataclasses.replace(step, termination=_check_domains(params, step.termination))
 
     def finish_step(
         self, params: Any, start: StateArray, mode_index: Array, options: StepOptions
@@ -700,6 +698,14 @@ def _compile_sampling(system: HybridSystem, n_samples: int) -> Any:
 def _compile_simulation(system: HybridSystem, events: int, mode: int) -> Any:
     def simulate(params: Any, start: Array, options: StepOptions) -> HybridSolution:
         first_mode = jnp.asarray(mode, jnp.int32)
-        return simulate_modes((system._bind_modes(params), events), options, start, first_mode)
+        modes = system._bind_modes(params)
+        solution = simulate_modes((modes, events), options, start, first_mode)
+        return solution._replace(termination=_check_domains(params, solution.termination))
 
     return lanes.jit(simulate)
+
+
+def _check_domains(params: Any, termination: Array) -> Array:
+    """Return the reason why a simulation ended, or BAD_INPUT for parameters out of domain."""
+    bad_input = jnp.asarray(Termination.BAD_INPUT, termination.dtype)
+    return jnp.where(is_tree_in_domain(params), termination, bad_input)

@@ -44,7 +44,8 @@ def sample_walk_of_system(
             for mode, guard in zip(motion.modes, motion.guards, strict=True)
         ]
         ending, outcome = motion.ending, Outcome(int(OUTCOME_BY_TERMINATION[motion.termination]))
-        if system.section in guards[:n_events]:
+        is_valid = motion.termination != Termination.BAD_INPUT
+        if is_valid and system.section in guards[:n_events]:
             n_events = guards.index(system.section) + 1
             ending, outcome = Termination.SECTION_REACHED.meaning, Outcome.STEPPED
         end_times, modes = motion.times[:n_events], motion.modes[:n_events]
