@@ -209,8 +209,16 @@ def test_other_numbers_in_closures_trace_nothing_anew(monkeypatch, tmp_path):
     assert slope == pytest.approx(2.0 * 2.0 * 0.5 + 2.0, rel=1e-14)
 
 
-def test_a_number_that_python_needs_is_part_of_the_code(monkeypatch):
-    make = lambda power: lambda x: x**2 if power > 1.5 else x * float(power)
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda power: lambda x: x**2 if power > 1.5 else x * float(power),
+        lambda power: lambda x: {2.0: x**2}.get(power, x * power),
+        lambda power: lambda x: x**2 if power.as_integer_ratio() == (2, 1) else x * power,
+    ],
+    ids=["value", "hash", "method"],
+)
+def test_a_number_that_python_needs_is_part_of_the_code(make):
     for power in (2.0, 1.0, 0.5):
         np.testing.assert_array_equal(
             lanes.jit(make(power)).batch(X), X**2 if power > 1.5 else X * power

@@ -371,7 +371,7 @@ class LaneFunction:
                 try:
                     variant = self._find_variant(key, signature, len(numbers), rebuild)
                     return evaluate(variant, _convert_numbers([*numbers, *arrays]))
-                except CONCRETIZATION_ERRORS:
+                except NUMBER_ERRORS:
                     # Python decides by a number of the closure, so the code depends on its value.
                     if key is None or any(isinstance(x, jax.core.Tracer) for x in numbers):
                         raise
@@ -501,12 +501,8 @@ class _LaneFunctionVariant:
 
 ARRAY_TYPES = (jax.Array, np.ndarray, np.generic, bool, int, float, complex)
 """Types of arguments that are traced; others are static."""
-CONCRETIZATION_ERRORS = (
-    jax.errors.ConcretizationTypeError,
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-)
-"""Errors of code that needs the value of a number while JAX traces it."""
+NUMBER_ERRORS = (TypeError, AttributeError)
+"""Errors of code that needs a number while JAX traces it: its value, its hash or its methods."""
 
 
 def _find_key(*values: Any) -> str | None:
