@@ -100,6 +100,8 @@ def test_a_gait_of_one_step_asked_for_as_one_of_several_says_what_it_is(period_n
     assert int(gait.minimal_period) == 1
     assert ("its minimal period is 1" in str(gait)) == (period_n > 1)
     assert (bool(lost.found), int(lost.minimal_period)) == (False, 0)
+    if period_n == 1:  # A gait that was not found is no guess.
+        assert bool(vrw.limit_cycle(wheel, model=model, guess=lost).found)
 
 
 @pytest.mark.slow

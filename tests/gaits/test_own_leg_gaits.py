@@ -233,6 +233,20 @@ def test_two_laws_in_turn_give_a_gait_of_two_steps_with_unilateral_contact():
     np.testing.assert_allclose(durations, np.sort(expected.durations.sum(axis=1)), atol=1e-9)
 
 
+@pytest.mark.slow
+def test_force_peaks_with_unilateral_contact_see_both_laws():
+    laws = vrw.AlternatingLegs(vrw.SpringDamper(damping=150.0), vrw.SpringDamper(damping=190.0))
+    expected, cycle = (
+        vrw.limit_cycle(vrw.WheelParams(), model=model, period_n=2)
+        for model in (
+            vrw.ViscoelasticWheel(leg_force=laws),
+            vrw.UnilateralWheel(friction=np.inf, leg_force=laws),
+        )
+    )
+    value = cycle.force_peaks["peak_force"]
+    assert value == pytest.approx(float(expected.measure("peak_force")), rel=1e-6)
+
+
 @pytest.mark.parametrize("friction", [50.0, 0.7])
 def test_the_ladder_gives_the_law_to_both_models(friction):
     law = QuadraticDamper()

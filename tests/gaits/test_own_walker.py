@@ -102,6 +102,17 @@ def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
     assert tuned.value == pytest.approx(3.0, rel=1e-9)
 
 
+def test_an_optimum_is_followed_along_another_parameter():
+    """v = k / (1 - e), and the best kick is the largest."""
+    restitutions, bounds = (0.5, 0.6, 0.75), {"kick": (0.5, 2.0)}
+    curve = vrw.tune(
+        BALL_PARAMS, "velocity", ["kick"], bounds, model=JuggledBall(),
+        along=("ball.restitution", restitutions),
+    )  # fmt: skip
+    expected = 2.0 / (1.0 - np.array(restitutions))
+    np.testing.assert_allclose(curve.dataset.objective, expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_sensitivities_are_the_derivatives_of_the_closed_form(walker):
     """v = k / (1 - e), T = 2 v / g and h = v^2 / 2 g."""

@@ -71,6 +71,7 @@ def test_starts_after_a_landing_reach_the_attractors_of_the_starts_before_it():
     result = vrw.basin(params, grid, options=OPTIONS)
     assert result.attractor.values[0, 0] == 0
     assert result.steps.values[0, 0] <= 1
+    assert vrw.basin(params, grid, max_steps=2, options=OPTIONS).steps.max() == 2
     assert set(result.coords) >= set(POST_LANDING_COMPONENT_NAMES)
     assert not set(result.coords) & set(PRE_TOUCHDOWN_COMPONENT_NAMES)
 

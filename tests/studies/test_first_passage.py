@@ -476,6 +476,19 @@ def test_derivatives_of_sampled_means_are_those_of_quadrature():
 
 
 @pytest.mark.slow
+def test_a_parameter_of_zero_has_a_derivative():
+    """The mass of the hub has almost no effect on a wheel whose legs have much more."""
+    params = vrw.WheelParams(hub_mass=0.0, leg_com=0.9, slope=0.15)
+    gait, random = vrw.limit_cycle(params, model=RIGID), np.random.default_rng(0)
+    start = np.asarray(gait.section_state)
+    groups = WalkerGroups(params, start, 0.05, RIGID, vrw.StepOptions(), 2048, random)
+    sample = sample_passage(groups, float(gait.spectral_radius), 0.1, 200_000)
+    names = ("hub_mass", "slope_sd")
+    gradient = differentiate_log_mean_steps(groups, sample.walk_density, names)
+    assert abs(gradient["hub_mass"]) < 1e-3 * abs(gradient["slope_sd"])
+
+
+@pytest.mark.slow
 def test_a_gradient_of_the_papers_wheel_is_a_central_difference():
     """At this damping walks fail in two ways, with different derivatives."""
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.leg_laws import QuadraticDamper, make_wheel
 
 import vrw_jax as vrw
 
@@ -43,6 +44,19 @@ def test_the_active_limits_change_where_the_damping_reaches_and_leaves_its_bound
         start = {name: float(curve.dataset[name][point]) for name in FREE}
         single = vrw.tune(vrw.WheelParams(slope=slope, **start), "spectral_margin", FREE, BOUNDS)
         assert {limit.name for limit in single.active} == set(names)
+
+
+@pytest.mark.slow
+def test_optima_along_a_parameter_of_the_law_are_gaits_with_the_law():
+    bounds = {"damping": (140.0, 160.0)}
+    curve = vrw.tune(
+        vrw.WheelParams(damping=150.0), "speed", ["damping"], bounds,
+        model=make_wheel(QuadraticDamper(60.0)), along=("leg.c2", (60.0, 30.0, 0.0)),
+    ).dataset  # fmt: skip
+    for c2, damping, speed in zip(curve["leg.c2"], curve.damping, curve.objective, strict=True):
+        wheel = vrw.WheelParams(damping=float(damping))
+        gait = vrw.limit_cycle(wheel, model=make_wheel(QuadraticDamper(float(c2))))
+        assert float(gait.speed) == pytest.approx(float(speed), abs=1e-9)
 
 
 def test_arguments_of_a_curve_are_refused_in_one_sentence():

@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.checks import check_int, check_type, has_traced_leaf
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import format_numbers
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.collocation_finder import CollocationFinder, KinkedGaitFinder
@@ -76,12 +77,16 @@ def make_finder(
 def check_cycle_guess(cycle_guess: Any) -> Any:
     """Convert a user's guess to a cycle, a `CollocationState` or a finite section state.
 
+    A cycle that was not found is no guess.
     Raise ValueError if the section state is not finite.
     """
-    if cycle_guess is None or isinstance(cycle_guess, AbstractCycle | CollocationState):
+    if isinstance(cycle_guess, AbstractCycle | HybridGait):
+        outcome = cycle_guess.outcome
+        if not has_traced_leaf(outcome) and np.all(np.asarray(outcome) != Outcome.STEPPED):
+            return None
+        return cycle_guess.section_state if isinstance(cycle_guess, HybridGait) else cycle_guess
+    if cycle_guess is None or isinstance(cycle_guess, CollocationState):
         return cycle_guess
-    if isinstance(cycle_guess, HybridGait):
-        return cycle_guess.section_state
     section_state = convert_section_state(cycle_guess, "guess")
     if not has_traced_leaf(section_state) and not np.isfinite(section_state).all():
         raise ValueError(

@@ -190,15 +190,14 @@ def limit_cycle(
     model = resolve_model(params, model)
     gait_finder = resolve_finder(params, model, options, period_n)
     params = gait_finder.model.attach_laws(params)
+    guess = check_cycle_guess(guess)
     has_unique_gait = gait_finder.is_multistable or gait_finder.model.leg_period == period_n
     if guess is None and period_n > 1 and not has_unique_gait:
         raise ValueError(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
-    cycle = _search_with_fallbacks(
-        gait_finder, params, check_cycle_guess(guess), options is None, which
-    )
+    cycle = _search_with_fallbacks(gait_finder, params, guess, options is None, which)
     return cycle.replace_missing_gaits_by_nan(params) if fills_missing_gait_with_nan else cycle
 
 

@@ -451,16 +451,13 @@ def walk_until_periodic(
     n_starts = len(start_states)
     leg_models = [model] if is_own_walker(model) else model.list_models_of_legs()
     repeated_wheels = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), n_starts), params)
-    n_rounds = -(-max_steps // N_STEPS_PER_ROUND)
-    state_history = np.full(
-        (n_starts, 1 + n_rounds * N_STEPS_PER_ROUND, start_states.shape[1]), np.nan
-    )
+    state_history = np.full((n_starts, 1 + max_steps, start_states.shape[1]), np.nan)
     state_history[:, 0] = start_states
     walk_outcomes = np.full(n_starts, int(Outcome.STEPPED))
     orbit_periods, n_steps_to_orbit = np.zeros(n_starts, int), np.zeros(n_starts, int)
     unsettled_walk_indices = np.arange(n_starts)
-    for first_step in range(0, n_rounds * N_STEPS_PER_ROUND, N_STEPS_PER_ROUND):
-        last_step = first_step + N_STEPS_PER_ROUND
+    for first_step in range(0, max_steps, N_STEPS_PER_ROUND):
+        last_step = min(first_step + N_STEPS_PER_ROUND, max_steps)
         wheels = select_tree_rows(repeated_wheels, unsettled_walk_indices)
         section_states = state_history[unsettled_walk_indices, first_step]
         outcomes = np.zeros(len(section_states), int)

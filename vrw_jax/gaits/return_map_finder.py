@@ -128,10 +128,12 @@ def measure_return_map_force_peaks(
     - `step_ends`: section state at the end of each gait step, on a leading axis.
     """
     start_states = jnp.concatenate([section_state[None], step_ends[:-1]])
-    measures_by_step = jax.vmap(lambda x: model.measure_force_peaks(params, x, options))(
-        start_states
-    )
-    return jax.tree.map(jnp.nanmax, measures_by_step)
+    measures_by_leg = []
+    for k in range(model.leg_period):
+        measure = functools.partial(model.measure_force_peaks, model.select_params(params, k))
+        starts = start_states[k :: model.leg_period]
+        measures_by_leg.append(jax.vmap(lambda x, measure=measure: measure(x, options))(starts))
+    return jax.tree.map(lambda *values: jnp.nanmax(jnp.concatenate(values)), *measures_by_leg)
 
 
 @eqx.filter_jit

@@ -447,6 +447,10 @@ class ParameterizedWalker(eqx.Module):
         """Return the value of one parameter."""
         return jax.tree.leaves(params)[self.parameter_names.index(name)]
 
+    def with_parameter(self, params: Any, name: str, value: Any) -> tuple[Any, Any]:
+        """Return the walker and its parameters with a new value of one of them."""
+        return self, replace_tree_parameter(params, name, value)
+
     def from_parameter_values(self, values: Any, _n_legs: int) -> tuple[Any, Any]:
         """Return the walker and its parameters with the given values."""
         return self, jax.tree.unflatten(self.structure, list(values))

@@ -40,7 +40,12 @@ from vrw_jax.studies.rigid_passage import (
     solve_passage_on_slopes,
 )
 from vrw_jax.studies.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel.params import (
+    PARAMETER_DOMAINS,
+    PARAMETER_NAMES,
+    WheelParams,
+    compute_wheel_units,
+)
 
 
 class FailingWalks(NamedTuple):
@@ -138,14 +143,21 @@ def differentiate_log_mean_steps(
         """
         if parameter_name == walker_groups.sd_name:
             return -failure_radii / ground_sd
-        parameter_value = float(getattr(params, parameter_name))
-        change_size = RELATIVE_PARAMETER_STEP * abs(parameter_value)
+        parameter_value, domain = (
+            float(getattr(params, parameter_name)),
+            PARAMETER_DOMAINS[parameter_name],
+        )
+        unit = compute_wheel_units(params.symbols()).compute_unit_in_si(domain.unit)
+        change_size = RELATIVE_PARAMETER_STEP * (abs(parameter_value) or float(unit))
+        changes = np.array([change_size, -change_size])
+        if not domain.contains_parameter_value(parameter_value - change_size):
+            changes += 2.0 * change_size
         changed_failure_radii = []
-        for parameter_change in (change_size, -change_size):
+        for parameter_change in changes:
             _, changed_params = walker_groups.model.with_parameter(
                 params,
                 parameter_name,
-                jnp.asarray(parameter_value + parameter_change, params.damping.dtype),
+                jnp.asarray(float(parameter_value + parameter_change), params.damping.dtype),
             )
             changed_cycle: Any = limit_cycle(changed_params, model=walker_groups.model)
             if int(changed_cycle.outcome) != Outcome.STEPPED:
@@ -170,7 +182,7 @@ def differentiate_log_mean_steps(
                     N_CHANGED_WHEEL_BISECTIONS,
                 )
             )
-        return (changed_failure_radii[0] - changed_failure_radii[1]) / (2.0 * change_size)
+        return (changed_failure_radii[0] - changed_failure_radii[1]) / (changes[0] - changes[1])
 
     n_differentiated_walks = np.sum(survives_on_mean_slopes)
     return {

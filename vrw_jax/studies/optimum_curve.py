@@ -101,7 +101,6 @@ def follow_optimum(
     max_evaluations: int,
 ) -> OptimumCurve:
     """Follow the optimum of a `TuneProblem` through the values of a parameter, in their order."""
-    model = problem.gait_finder.model
     limit_names = [
         *(x.removeprefix(UPPER_BOUND_PREFIX) for x in problem.constraint_names),
         *(f"{x} at its lower bound" for x in problem.free_parameters),
@@ -114,8 +113,9 @@ def follow_optimum(
     def optimize(value: float, neighbor: EvaluatedTrial) -> _Optimum | None:
         """Return the optimum at a value, from that at a neighboring value, or None."""
         report_progress(f"optimum at {name} {value:.4g}")
-        params = model.with_parameter(problem.params, name, value)[1]
-        local = dataclasses.replace(problem, params=params)
+        model, params = problem.gait_finder.model.with_parameter(problem.params, name, value)
+        finder = dataclasses.replace(problem.gait_finder, model=model)
+        local = dataclasses.replace(problem, params=params, gait_finder=finder)
         start = local.evaluate_trial(neighbor.normalized_parameters, neighbor)
         # The branch of the neighbor is known at another value, so only its failures count.
         start = start._replace(is_on_branch=np.asarray(True))
@@ -173,7 +173,7 @@ def follow_optimum(
             break
     ever_active = [x for x in limit_names if any(x in optimum.active for optimum in optima)]
     columns = np.array([optimum.prices for optimum in optima])
-    domains = model.parameter_domains
+    domains = problem.gait_finder.model.parameter_domains
     return OptimumCurve(
         name,
         xr.Dataset(
