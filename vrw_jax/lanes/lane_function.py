@@ -303,8 +303,8 @@ def jit(function: Callable[..., PyTree], *, xla_block_size: int = 1024) -> "Lane
             replaces machine code.
 
     Returns:
-        A `LaneFunction`, which is called like `function`. `jax.vmap`, `jit`, `grad`, `jacfwd`,
-        `jacrev` and `hessian` apply to it. Its method `batch` uses all cores.
+        A `LaneFunction`, called with the arguments of `function`, by position. `jax.vmap`, `jit`,
+        `grad`, `jacfwd`, `jacrev` and `hessian` apply to it. Its method `batch` uses all cores.
 
     Examples:
         >>> square_root = lanes.jit(lambda x: jnp.sqrt(x))
@@ -344,17 +344,24 @@ class LaneFunction:
 
         Args:
             *arguments: arguments of the function, as arrays with the batch on their first axis.
-            in_axes: 0 for arguments with a batch axis and None for others, as in `jax.vmap`.
+            in_axes: 0 for arguments with a batch axis and None for others: one for all arguments,
+                or one for each argument or its parts, as in `jax.vmap`.
         """
         if not isinstance(in_axes, list | tuple):
             in_axes = (in_axes,) * len(arguments)
         axes: list[int | None] = []
-        jax.tree.map(
-            lambda axis, tree: axes.extend([axis] * len(jax.tree.leaves(tree))),
-            tuple(in_axes),
-            arguments,
-            is_leaf=lambda axis: axis is None,
-        )
+        try:
+            jax.tree.map(
+                lambda axis, tree: axes.extend([axis] * len(jax.tree.leaves(tree))),
+                tuple(in_axes),
+                arguments,
+                is_leaf=lambda axis: axis is None,
+            )
+        except ValueError:
+            raise ValueError(
+                f"in_axes is {in_axes}, but it does not fit to the {len(arguments)} arguments: "
+                "give 0 or None for each argument."
+            ) from None
         return self._evaluate(arguments, lambda variant, arrays: variant.run_batch(arrays, axes))
 
     def _evaluate(self, arguments: tuple, evaluate: Callable) -> Any:
@@ -424,11 +431,16 @@ class _LaneFunctionVariant:
     def run_batch(self, arrays: Sequence[Any], axes: Sequence[int | None]) -> Any:
         axes = (*[None] * self._n_numbers, *compress(axes, self._is_array))
         arrays = list(map(np.asarray, arrays))
-        sizes = {len(x) for x, axis in zip(arrays, axes, strict=True) if axis == 0}
-        if set(axes) - {0, None} or len(sizes) != 1:
+        sizes: set[Any] = {
+            len(x) if x.ndim else "one number"
+            for x, axis in zip(arrays, axes, strict=True)
+            if axis == 0
+        }
+        if set(axes) - {0, None} or len(sizes) != 1 or "one number" in sizes:
             raise ValueError(
                 f"in_axes is {axes[self._n_numbers :]} and batches have the lengths "
-                f"{sorted(sizes)}: give 0 or None for each argument, and batches of one length."
+                f"{sorted(sizes, key=str)}: give 0 or None for each argument, and batches as "
+                "arrays of one length."
             )
         (n_lanes,) = sizes
         is_shared = [
