@@ -1,5 +1,7 @@
 """Walkers and other systems of a user: steps, batches, derivatives and gaits with known answers."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -254,6 +256,8 @@ def test_a_step_that_never_reaches_the_section_has_a_code_and_finite_numbers():
         Termination.MAX_TIME_REACHED,
     ]
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(rising))
+    endless = dataclasses.replace(rising, termination=np.full(2, Termination.MAX_EVENTS_REACHED))
+    assert all("max_events events: raise it" in ending for ending in endless.ending)
 
 
 to_sky = Guard(lambda y, p: y[0], target_mode="sky")
@@ -284,7 +288,7 @@ def test_wrong_shapes_name_the_function_and_the_state():
         section="impact",
         state=("height", "velocity"),
     )
-    with pytest.raises(ValueError, match=r"the field of 'flight' gives .*'velocity'"):
+    with pytest.raises(ValueError, match=r"the field of mode 'flight' gives .*'velocity'"):
         wrong.step((), [1.0, 0.0])
     with pytest.raises(ValueError, match="its shape must be"):
         BALL.step(BALL_PARAMS, np.ones((3, 1)))

@@ -9,7 +9,7 @@ has a code of `Termination` and contains all earlier events.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -200,23 +200,26 @@ def simulate_hybrid(
         raise ValueError("start contains a number that is not finite: give finite numbers.")
     if events * start.size > MAX_STORED_NUMBERS:
         raise ValueError(f"events is {events}, but so many states don't fit: give fewer.")
-    if not 0 <= mode < len(modes):
+    if check_int("mode", mode, 0) >= len(modes):
         raise ValueError(f"mode is {mode}, but there are {len(modes)} modes: count from 0.")
-    for mode_number, (field, guards) in enumerate(modes):
+    for mode_number, (_, guards) in enumerate(modes):
         if not guards:
             raise ValueError(
                 f"mode {mode_number} has no guard, but only a guard can end it: give one."
             )
-        _check_output_shape(f"the field of mode {mode_number}", field, start, start.shape)
         for guard_number, guard in enumerate(guards):
             guard_name = f"guard {guard_number} of mode {mode_number}"
-            _check_output_shape(guard_name, guard.evaluate, start, ())
-            _check_output_shape(f"the reset of {guard_name}", guard.reset, start, start.shape)
-            if guard.target_mode is not None and not 0 <= guard.target_mode < len(modes):
+            target_mode = mode_number if guard.target_mode is None else guard.target_mode
+            if check_int("target_mode", target_mode, 0) >= len(modes):
                 raise ValueError(
-                    f"{guard_name} leads to mode {guard.target_mode}, but there are {len(modes)}: "
+                    f"{guard_name} leads to mode {target_mode}, but there are {len(modes)}: "
                     "count from 0."
                 )
+    check_mode_functions(
+        {i: mode._replace(guards=dict(enumerate(mode.guards))) for i, mode in enumerate(modes)},
+        f"a state of shape {start.shape}",
+        start,
+    )
     options.check_tolerances(start.dtype)
     if is_machine_code_better(modes, options, events * start.size):
         solution = _simulate_modes_compiled(lambda: (modes, events, mode), options, start)
@@ -333,24 +336,39 @@ def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
     return tuple(modes_with_guard_tuples)
 
 
-def _check_output_shape(
-    function_name: str, function: Callable, start: Array, expected_shape: tuple
+def check_mode_functions(
+    modes: Mapping[Any, Mode], state_text: str, start: Any, *params: Any
 ) -> None:
-    """Raise a ValueError unless `function(start)` returns floats of the shape `expected_shape`."""
-    check_callable(function_name, function, "of the state")
-    function_output: Any = jax.eval_shape(function, start)
-    output_shape = getattr(function_output, "shape", None)
-    if output_shape != expected_shape or not jnp.issubdtype(function_output.dtype, jnp.floating):
-        output_description = (
-            f"{function_output.dtype} of shape {output_shape}"
-            if output_shape is not None
-            else type(function_output).__name__
-        )
-        raise ValueError(
-            f"{function_name} gives {output_description} for a state of shape {start.shape}, but "
-            f"it must give floats of shape {expected_shape}: fields and resets give the state's "
-            "shape, guards one number."
-        )
+    """Raise an error unless fields, guards and resets return floats of the right shapes.
+
+    - `modes`: modes by name or index, whose guards are by name or index too;
+    - `state_text`: description of the state for the error message.
+    """
+
+    def check_output(function_name: str, function: Callable, expected_shape: tuple) -> None:
+        check_callable(function_name, function, "of the state")
+        output: Any = jax.eval_shape(function, start, *params)
+        output_shape = getattr(output, "shape", None)
+        if output_shape != expected_shape or not jnp.issubdtype(output.dtype, jnp.floating):
+            output_description = (
+                f"{output.dtype} of shape {output_shape}"
+                if output_shape is not None
+                else type(output).__name__
+            )
+            raise ValueError(
+                f"{function_name} gives {output_description} for {state_text}, but it must give "
+                f"floats of shape {expected_shape}: fields and resets give the state's shape, "
+                "guards one number."
+            )
+
+    for mode_name, mode in modes.items():
+        check_output(f"the field of mode {mode_name!r}", mode.field, start.shape)
+        for guard_name, guard in mode.guards.items():
+            place = f"guard {guard_name!r} of mode {mode_name!r}"
+            check_output(place, guard.value, ())
+            if guard.armed is not None:
+                check_output(f"armed of {place}", guard.armed, ())
+            check_output(f"the reset of {place}", guard.reset, start.shape)
 
 
 def _simulate_one_event(

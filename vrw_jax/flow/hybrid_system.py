@@ -54,6 +54,7 @@ from vrw_jax.flow.hybrid_simulation import (
     HybridSolution,
     Mode,
     Termination,
+    check_mode_functions,
     no_margins,
     run_events,
     simulate_modes,
@@ -62,6 +63,7 @@ from vrw_jax.flow.phase_integration import StateArray, sample_phase
 
 MAX_EVENTS_PER_STEP = 16
 """Default limit of the events in one step, chosen above those of walkers with several legs."""
+TOO_MANY_EVENTS_TEXT = "The step has not ended after max_events events: raise it in the system."
 
 
 OUTCOME_BY_TERMINATION = np.array(
@@ -133,7 +135,9 @@ class HybridStep(eqx.Module):
             if ending in (Termination.SECTION_REACHED, Termination.BAD_INPUT):
                 return ending.meaning
             place = f"guard {guards[guard]!r} of mode" if guard >= 0 else "mode"
-            return f"{ending.meaning} This is {place} {mode_name!r}."
+            has_too_many = ending == Termination.MAX_EVENTS_REACHED
+            meaning = TOO_MANY_EVENTS_TEXT if has_too_many else ending.meaning
+            return f"{meaning} This is {place} {mode_name!r}."
 
         return format_each_batch_element(
             describe, self.termination, self.last_mode, self.last_guard
@@ -564,7 +568,12 @@ class HybridSystem(AbstractWalker):
 
     def check_definition(self, params: Any, x: Any, name: str) -> None:
         start = jax.eval_shape(self.embed, x, params) if name == "x" else x
-        self._require_shape("embed" if name == "x" else name, start, (len(self.state),))
+        if getattr(start, "shape", None) != (len(self.state),):
+            raise ValueError(
+                f"{'embed' if name == 'x' else name} gives "
+                f"{getattr(start, 'shape', type(start).__name__)}, but the coordinates of the "
+                f"state are {self.state}: give an array of shape {(len(self.state),)}."
+            )
         if name == "x":
             projected: Any = jax.eval_shape(self.project, start, params)
             if getattr(projected, "shape", None) != x.shape:
@@ -573,23 +582,7 @@ class HybridSystem(AbstractWalker):
                     f"{getattr(projected, 'shape', projected)}: give one entry for each section "
                     "coordinate, or mend project."
                 )
-        for mode_name, mode in self.modes.items():
-            field = jax.eval_shape(mode.field, start, params)
-            self._require_shape(f"the field of {mode_name!r}", field, start.shape)
-            for guard_name, guard in mode.guards.items():
-                place = f"{guard_name!r} in {mode_name!r}"
-                value, reset = (
-                    jax.eval_shape(f, start, params) for f in (guard.evaluate, guard.reset)
-                )
-                self._require_shape(f"the guard {place}", value, ())
-                self._require_shape(f"the reset of {place}", reset, start.shape)
-
-    def _require_shape(self, function_name: str, result: Any, shape: tuple[int, ...]) -> None:
-        if getattr(result, "shape", None) != shape:
-            raise ValueError(
-                f"{function_name} gives {getattr(result, 'shape', type(result).__name__)}, but the "
-                f"coordinates of the state are {self.state}: give an array of shape {shape}."
-            )
+        check_mode_functions(self.modes, f"the state {self.state}", start, params)
 
 
 @functools.lru_cache

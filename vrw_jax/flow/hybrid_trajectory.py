@@ -14,7 +14,11 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.flow.hybrid_simulation import Termination
-from vrw_jax.flow.hybrid_system import OUTCOME_BY_TERMINATION, HybridSystem
+from vrw_jax.flow.hybrid_system import (
+    OUTCOME_BY_TERMINATION,
+    TOO_MANY_EVENTS_TEXT,
+    HybridSystem,
+)
 from vrw_jax.flow.phase_integration import sample_phase
 
 
@@ -48,6 +52,8 @@ def sample_walk_of_system(
         if is_valid and system.section in guards[:n_events]:
             n_events = guards.index(system.section) + 1
             ending, outcome = Termination.SECTION_REACHED.meaning, Outcome.STEPPED
+        elif motion.termination == Termination.MAX_EVENTS_REACHED:
+            ending = TOO_MANY_EVENTS_TEXT
         end_times, modes = motion.times[:n_events], motion.modes[:n_events]
         if outcome != Outcome.STEPPED:
             end_times, modes = np.append(end_times, motion.time), np.append(modes, motion.mode)

@@ -54,8 +54,20 @@ class ConstantTorque(eqx.Module):
         return self.torque + 0.0 * dtheta
 
 
-def _make_law_module(law: Any) -> Any:
-    return FunctionLaw(law) if callable(law) and not isinstance(law, eqx.Module) else law
+def _make_law_module(
+    law: Any,
+    law_name: str = "a law of AlternatingLegs",
+    meaning: str = "force along a leg",
+    signature: str = "f(L, dL, params)",
+    unit: str = "N",
+) -> Any:
+    if not callable(law) or isinstance(law, type):
+        raise TypeError(
+            f"{law_name} is {format_value(law)}, but it is the {meaning}: give a "
+            f"function {signature} that returns {unit}, or an object of a module with such a "
+            "__call__."
+        )
+    return law if isinstance(law, eqx.Module) else FunctionLaw(law)
 
 
 class AlternatingLegs(eqx.Module):
@@ -423,13 +435,7 @@ def convert_hub_torque(hub_torque: Any) -> Any:
 def _convert_law(law: Any, law_name: str, meaning: str, signature: str, unit: str) -> Any:
     if law is None:
         return None
-    if not callable(law) or isinstance(law, type):
-        raise TypeError(
-            f"{law_name} is {format_value(law)}, but it is the {meaning}: give a "
-            f"function {signature} that returns {unit}, or an object of a module with such a "
-            "__call__."
-        )
-    law = _make_law_module(law)
+    law = _make_law_module(law, law_name, meaning, signature, unit)
     law_parameters = list(list_parameters(law, law_name[:3]))
     remedy_text = "give a number, or declare the field with eqx.field(static=True)"
     values = [check_reals(x.name, x.value, remedy_text) for x in law_parameters]
