@@ -3,6 +3,7 @@
 import warnings
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -55,6 +56,11 @@ def test_the_factors_can_be_traced_and_batched():
     gravity = lambda time: vrw.WheelParams().scaled(time=time).gravity
     assert float(jax.grad(gravity)(1.0)) == pytest.approx(-2.0 * 9.81)
     assert vrw.WheelParams().scaled(time=np.array([1.0, 2.0])).gravity.shape == (2,)
+
+
+@pytest.mark.parametrize("time", [np.array([1, 2]), jnp.array([1, 2])])
+def test_factors_may_be_arrays_of_integers(time):
+    np.testing.assert_array_equal(vrw.WheelParams().scaled(time=time).gravity, [9.81, 9.81 / 4.0])
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), np.array([1.0, -2.0])])

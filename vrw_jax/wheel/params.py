@@ -305,14 +305,19 @@ class WheelParams(AbstractPrintable):
     def is_in_domain(self) -> Bool[Array, "..."]:
         """Return whether all parameters of each wheel are finite and in their domains.
 
-        The product of any four parameters must also be finite in their floating-point type.
+        The product of any four parameters must also be finite in their floating-point type. If the
+        slope has an axis over steps, so has the result.
         """
-        is_in_all_domains = self.leg_com < self.locked_length
-        # A division of Python's numbers by zero raises an error.
-        value_by_parameter = {
-            name: np.float64(value) if isinstance(value, float | int) else value
-            for name, value in self._parameters.items()
-        }
+        n_axes = max(map(jnp.ndim, self._parameters.values()))
+
+        def align(value: Any) -> Any:
+            """Return a value whose first axis is that of parameters with a further axis."""
+            if isinstance(value, float | int):  # Dividing Python's numbers by zero raises an error.
+                return np.float64(value)
+            return value[:, None] if n_axes == 2 and value.ndim == 1 else value
+
+        value_by_parameter = {name: align(value) for name, value in self._parameters.items()}
+        is_in_all_domains = value_by_parameter["leg_com"] < value_by_parameter["locked_length"]
         for parameter_name, parameter_value in value_by_parameter.items():
             max_value_of_dtype = float(jnp.finfo(jnp.result_type(parameter_value)).max) ** 0.25
             parameter_domain = PARAMETER_DOMAINS[parameter_name]
@@ -325,7 +330,8 @@ class WheelParams(AbstractPrintable):
         for squared_relative_value in relative_values.values():
             is_in_all_domains &= squared_relative_value < MAX_RELATIVE_VALUE**2
         for law_parameter in list_law_parameters(self.laws):
-            is_in_all_domains &= law_parameter.domain.contains_parameter_value(law_parameter.value)
+            law_value = align(law_parameter.value)
+            is_in_all_domains &= law_parameter.domain.contains_parameter_value(law_value)
         return is_in_all_domains
 
     def attach_laws(self, laws: WheelLaws | None) -> "WheelParams":
@@ -378,7 +384,7 @@ class WheelParams(AbstractPrintable):
             >>> print(f"{small.locked_length:.2f} m, {small.gravity:.2f} m/s^2")
             0.20 m, 9.81 m/s^2
         """
-        factor_by_dimension = {"length": length, "time": time, "mass": mass}
+        factor_by_dimension: dict[str, Any] = {"length": length, "time": time, "mass": mass}
         for dimension_name, given_scale_factor in factor_by_dimension.items():
             checked_scale_factor = check_reals(dimension_name, given_scale_factor)
             if not isinstance(checked_scale_factor, jax.core.Tracer) and not np.all(
@@ -388,6 +394,8 @@ class WheelParams(AbstractPrintable):
                     f"{dimension_name} is {format_value(given_scale_factor)}, but a factor of "
                     "scale is positive: give 2, say, for twice as much."
                 )
+            if not isinstance(given_scale_factor, int | float):
+                factor_by_dimension[dimension_name] = checked_scale_factor
         scaled_parameter_values = {}
         for parameter_name, parameter_value in self._parameters.items():
             unit_powers = UNIT_POWERS[PARAMETER_DOMAINS[parameter_name].unit]
