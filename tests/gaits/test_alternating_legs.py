@@ -73,6 +73,8 @@ def test_walks_and_batches_take_the_legs_in_turn(cycle):
     np.testing.assert_allclose(other.section_state, walk.steps.section_state[1], atol=1e-9)
     trajectory = vrw.simulate(PARAMS, cycle.section_state, 2, model=make_wheel())
     assert abs(float(trajectory.time[-1]) - cycle.period) < 1e-8
+    assert "slopes" not in trajectory.attrs
+    assert len(vrw.plot.walk_frames(trajectory, n_frames=2)[0]) == 2
 
 
 def test_equal_legs_have_the_gait_of_the_wheel():

@@ -357,6 +357,14 @@ def test_a_simulation_shows_the_flights_of_a_ball():
     top = 2.0 / GRAVITY
     np.testing.assert_allclose(walk.height, [0, top, 0, 0, top, 0], atol=1e-12)
     assert walk.velocity.attrs["units"] == "m/s"
+    flight = BALL_SYSTEM.modes["flight"]
+    guards = {"apex": Guard(lambda y, p: y[1]), **flight.guards}
+    endless = dataclasses.replace(
+        BALL_SYSTEM, modes={"flight": Mode(flight.field, guards)}, max_events=1
+    )
+    walk = vrw.simulate(BALL_PARAMS, [2.0], 2, model=endless, n_samples=3)
+    assert walk.attrs["outcome"] == "TOO_MANY_EVENTS"
+    assert "max_events events: raise it" in walk.attrs["outcome_meaning"]
     with pytest.raises(TypeError, match=r"vrw\.walk"):
         vrw.simulate(BALL_PARAMS, [2.0], 2, model=JuggledBall())
 

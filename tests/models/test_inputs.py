@@ -11,6 +11,7 @@ from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
 from vrw_jax.models import embed_section_states
+from vrw_jax.models.stepping import convert_step_arguments
 
 
 @pytest.mark.parametrize(
@@ -66,6 +67,18 @@ def test_float32_is_refused_at_tolerances_it_cannot_resolve():
     with pytest.raises(ValueError, match="float32") as caught:
         vrw.step(params, start)
     assert "vrw.start_jax()" in str(caught.value)
+
+
+def test_arguments_of_both_precisions_are_computed_in_double_precision():
+    params = vrw.WheelParams(damping=np.float32(150.0))
+    converted = convert_step_arguments(params, np.ones(3, np.float32), None, None)
+    assert {leaf.dtype for leaf in jax.tree.leaves(converted)} == {np.dtype(float)}
+
+
+def test_a_batch_with_a_slope_for_each_step_is_printed_with_its_domain():
+    params = vrw.WheelParams(damping=[150.0, -1.0], slope=np.full((2, 3), 0.3))
+    assert params.is_in_domain().tolist() == [[True] * 3, [False] * 3]
+    assert "6 values from 0.3" in str(params)
 
 
 @pytest.fixture

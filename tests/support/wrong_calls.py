@@ -45,7 +45,7 @@ def register_wrong_calls() -> None:
     import xarray as xr
 
     import vrw_jax as vrw
-    from vrw_jax import hybrid
+    from vrw_jax import hybrid, lanes
 
     table_1, start = vrw.WheelParams(), vrw.paper_start()
     several = vrw.WheelParams(damping=np.linspace(100.0, 200.0, 3))
@@ -246,6 +246,14 @@ def register_wrong_calls() -> None:
     }.items():  # fmt: skip
         add_wrong_call(f"{name} on five grounds", call, "ValueError", "friction has shape (5,)")
     add_wrong_call(
+        "step with two restitutions",
+        lambda: vrw.step(
+            table_1, start, model=vrw.UnilateralWheel(restitution=np.array([0.1, 0.2]))
+        ),
+        "ValueError",
+        "restitution has shape (2,)",
+    )
+    add_wrong_call(
         "explore on two grounds",
         lambda: vrw.explore(table_1, friction=np.array([0.5, 0.7])),
         "TypeError",
@@ -412,6 +420,20 @@ def register_wrong_calls() -> None:
             "TypeError",
             "outside",
         )
+
+    for label, make in {
+        "torque": lambda v: {"model": vrw.ViscoelasticWheel(hub_torque=v)},
+        "friction": lambda v: {"model": vrw.UnilateralWheel(friction=v)},
+        "tolerance": lambda v: {"options": vrw.StepOptions(rtol=v)},
+    }.items():
+        for name, call in {"step_batch": vrw.step_batch, "simulate": vrw.simulate}.items():
+            x = ones if name == "step_batch" else start
+            add_wrong_call(
+                f"{name} under jit by a traced {label}",
+                lambda c=call, x=x, m=make: jax.jit(lambda v: c(table_1, x, **m(v)))(1e-3),
+                "TypeError",
+                "outside",
+            )
 
     # Cycles
     guesses = given | {"nan": ([0.1, float("nan"), 0.0], "ValueError")}
@@ -609,8 +631,55 @@ def register_wrong_calls() -> None:
          "give Guard("),
         ("a field of one row less", lambda: run_hybrid([ball._replace(field=lambda y: y[:1])]),
          "ValueError", "the field of mode 0"),
+        ("a mode by name", lambda: run_hybrid([ball], mode="fall"), "TypeError", "mode is 'fall'"),
+        ("a next mode by name", lambda: run_hybrid([ball._replace(guards=floor._replace(
+            target_mode="fall"))]), "TypeError", "target_mode is 'fall'"),
     ):  # fmt: skip
         add_wrong_call(f"simulate_hybrid with {name}", call, kind, words)
+
+    def make_drop(**changes):
+        guard = hybrid.Guard(lambda y, p: y[0])._replace(**changes)
+        modes = {"fall": hybrid.Mode(lambda y, p: fall(y), {"floor": guard})}
+        return vrw.HybridSystem(modes=modes, section="floor", state=("height", "rate"))
+
+    for name, changes, words in (
+        ("a guard that is a bool", {"value": lambda y, p: y[0] > 0.0}, "'fall' gives bool"),
+        ("a guard that is an integer", {"value": lambda y, p: jnp.int32(1)}, "'fall' gives int32"),
+        ("an arming bool", {"armed": lambda y, p: y[1] < 0.0}, "armed of guard 'floor'"),
+    ):
+        add_wrong_call(
+            f"a step of a HybridSystem with {name}",
+            lambda c=changes: make_drop(**c).step({}, [1.0, 0.0]), "ValueError", words,
+        )  # fmt: skip
+    add_wrong_call(
+        "a step of a HybridSystem from single numbers",
+        lambda: make_drop().step({}, np.ones(2, np.float32)), "ValueError", "np.asarray(x, float)",
+    )  # fmt: skip
+    add_wrong_call(
+        "simulate a HybridSystem with text",
+        lambda: vrw.simulate({"g": "a"}, [1.0, 0.0], model=make_drop()), "TypeError", "parameter",
+    )  # fmt: skip
+    for label, law in {"a number": 5.0, "a class": vrw.SpringDamper}.items():
+        add_wrong_call(
+            f"legs in turn of {label}",
+            lambda law=law: vrw.AlternatingLegs(law, vrw.SpringDamper()),
+            "TypeError",
+            "a law of AlternatingLegs",
+        )
+
+    # Functions compiled for batches
+    scale = lanes.jit(lambda x, factor: x * factor)
+    for label, arguments, in_axes in (
+        ("a number without in_axes", (np.ones(2), 2.0), 0),
+        ("a list", ([1.0, 2.0], np.ones(2)), 0),
+        ("a tuple of axes that is too short", (np.ones(2), 2.0), (0,)),
+    ):
+        add_wrong_call(
+            f"batch of {label}",
+            functools.partial(scale.batch, *arguments, in_axes=in_axes),
+            "ValueError",
+            "give 0 or None for each argument",
+        )
     add_wrong_call(
         "solve_fixed_point of a map elsewhere",
         lambda: vrw.solve_fixed_point(lambda x: x[:1], start),

@@ -65,7 +65,7 @@ class StepOptions(AbstractPrintable):
     - `solver`: one of `SOLVER_NAMES`, diffrax's Runge-Kutta solvers with an error estimate;
     - `engine`: "diffrax" supports any solver, device and order of derivative; "lanes" runs the same
       method as machine code, for explicit solvers on CPUs; "auto" selects "lanes" if it is
-      available;
+      available. A `RigidWheel` integrates nothing, so that it has no engine;
     - `rtol`, `atol`: relative and absolute tolerance of each solver step, in m, rad, m/s, rad/s;
     - `derivative_tightening`: factor by which tolerances are divided for derivatives, because
       step-size control ignores derivatives. The error of a derivative is then at most ten times
@@ -193,7 +193,10 @@ class StepOptions(AbstractPrintable):
         remedy_text = f"ask for no less, as with StepOptions(rtol={1e2 * min_rtol:.0e})"
         if float_dtype == np.float32:
             restart_remedy_text = (
-                "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
+                "give parameters and start as float64 numbers, as np.asarray(x, float) makes them "
+                "after vrw.start_jax()"
+                if jax.config.jax_enable_x64  # type: ignore[attr-defined]
+                else "call vrw.start_jax() before anything else and leave jax_enable_x64 on"
             )
             remedy_text = f"{restart_remedy_text}, or {remedy_text}"
         raise ValueError(

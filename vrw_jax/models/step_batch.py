@@ -151,7 +151,9 @@ def step_batch(
         ((3, 3), [10, 10, 10], 'lanes')
     """
     require_untraced_arguments(
-        "vrw.step_batch", "map vrw.return_map over the lanes", params, states, heights
+        "vrw.step_batch",
+        "map vrw.return_map over the lanes",
+        *(params, states, heights, model, options),
     )
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps, options = check_int("n_steps", n_steps), convert_step_options(options)

@@ -94,14 +94,17 @@ def convert_model_argument(
             f"model is {format_value(model)}, but a model of the wheel is needed: give "
             f"{describe_accepted_models()}."
         )
-    if not allows_friction_arrays and (
-        friction_shape := jnp.shape(getattr(model, "friction", 0.0))
-    ):
-        raise ValueError(
-            f"friction has shape {friction_shape}, but this call is for one ground: give one "
-            "number, or vary it in a design of vrw.scan; vrw.step_batch takes one for each "
-            "element, vrw.walk one for each of its steps."
-        )
+    for name, other_remedy in {
+        "friction": "vary it in a design of vrw.scan; vrw.step_batch takes one for each element, "
+        "vrw.walk one for each of its steps",
+        "restitution": "map over it with jax.vmap",
+    }.items():
+        shape = getattr(getattr(model, name, None), "shape", ())
+        if shape and not allows_friction_arrays:
+            raise ValueError(
+                f"{name} has shape {shape}, but this call is for one ground: give one number, or "
+                f"{other_remedy}."
+            )
     for law_parameter in list_law_parameters(model.laws):
         if jnp.ndim(law_parameter.value) and not allows_friction_arrays:
             raise ValueError(
@@ -223,7 +226,7 @@ def convert_step_arguments(
         )
     # Parameters made in single precision stay inaccurate after a conversion to double precision.
     parameter_dtype = jnp.result_type(*jax.tree.leaves(params))
-    common_dtype = jnp.result_type(section_state, params.damping)
+    common_dtype = jnp.result_type(section_state, parameter_dtype)
     for dtype in {parameter_dtype, common_dtype}:
         StepOptions.check_tolerances(options, dtype)
 
@@ -342,7 +345,8 @@ def return_map(
         engine: engine that computes the steps; see `StepOptions`.
 
     Returns:
-        The section state just before the next touchdown, with the shape of `x`.
+        The section state just before the next touchdown, with all entries of the model: shape (3,),
+        and more with unilateral contact.
 
     Raises:
         TypeError, ValueError: if an argument is invalid; the message names the remedy.

@@ -22,7 +22,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.walker import is_own_walker, name_missing_parameters
+from vrw_jax.base.walker import check_parameters, is_own_walker, name_missing_parameters
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.flow.hybrid_trajectory import sample_walk_of_system
 from vrw_jax.models.contact_mechanics import (
@@ -107,7 +107,7 @@ def simulate(
         >>> walk.lambda_2.attrs["units"], walk.attrs["outcome"]
         ('N', 'STEPPED')
     """
-    require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x, heights)
+    require_untraced_arguments("vrw.simulate", "use vrw.walk", params, x, heights, model, options)
     n_steps, n_samples = check_int("n_steps", n_steps), check_int("n_samples", n_samples, 2)
     if is_own_walker(model):
         options = convert_step_options(options).with_engine(engine)
@@ -184,7 +184,7 @@ def simulate(
             "slopes": walked_slopes,
             "heights": np.asarray(heights, float).tolist(),
         }
-    elif stepwise_ground is not None:
+    elif given_params.slope.ndim:
         provenance_attributes |= {"frame": SLOPES_FRAME_TEXT, "slopes": slopes.tolist()}
         del provenance_attributes["parameter_slope"]
     dataset = xr.Dataset(
@@ -205,7 +205,7 @@ def _simulate_own_walker(
         raise ValueError(
             "x is None, but this walker has no starts: give section coordinates at the start."
         )
-    first_params = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], params)
+    first_params = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], check_parameters(params))
     with name_missing_parameters(params):
         x = jnp.atleast_2d(walker.starts(first_params))[0] if x is None else x
     params, x, _, options, stepwise = convert_own_walk_arguments(
