@@ -95,8 +95,8 @@ class AlternatingLegs(eqx.Module):
         return jnp.where(self.turn < 0.5, *forces)
 
     def potential(self, L: Elementwise, params: LawParameters) -> Elementwise:
-        energies = (_evaluate_potential(law, L, params) for law in (self.first, self.second))
-        return jnp.where(self.turn < 0.5, *energies)
+        first, second = (_evaluate_potential(law, L, params) for law in (self.first, self.second))
+        return jnp.where(self.turn < 0.5, first, second)
 
     def kinks(self, L: Elementwise, dL: Elementwise, params: LawParameters) -> tuple:
         is_first = self.turn < 0.5
