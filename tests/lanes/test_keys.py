@@ -24,8 +24,8 @@ from vrw_jax.flow.hybrid_simulation import _estimate_time_errors, simulate_modes
 from vrw_jax.flow.hybrid_system import (
     _compile_mode_measures,
     _compile_sampling,
-    _compile_simulation,
     compile_finish,
+    compile_simulation,
 )
 from vrw_jax.flow.segments import _integrate_flow_segments, _multiply_event_determinants
 from vrw_jax.gaits.collocation_search import CollocationSystem, run_search_attempts
@@ -405,7 +405,7 @@ def test_each_setting_of_a_compiled_function_is_part_of_its_key(compiled, settin
         (compile_step, (BALL_SYSTEM,)),
         (compile_finish, (BALL_SYSTEM,)),
         (_compile_sampling, (BALL_SYSTEM, 9)),
-        (_compile_simulation, (BALL_SYSTEM, 3, 0)),
+        (compile_simulation, (BALL_SYSTEM, 3, 0)),
         (_compile_mode_measures, (BALL_SYSTEM, (ACTION,))),
         (_compile_lane_step, (True, jax.tree.structure(NO_LAWS), 8, (0, 1), 0)),
         (_compile_section_function, (embed_section_state, 8)),

@@ -451,6 +451,11 @@ class Event(NamedTuple):
 no_margins = lambda y: y[:0]
 
 
+def continue_after_event(_event: Event) -> Array:
+    """Return False: the simulation continues after any event."""
+    return jnp.asarray(False)
+
+
 def run_events(
     modes: tuple[Mode, ...],
     options: StepOptions,
@@ -459,7 +464,7 @@ def run_events(
     max_events: int,
     log: Any,
     update_log: Callable[[Any, Array, Array, Event], Any],
-    is_last_event: Callable[[Event], Array] = lambda event: jnp.asarray(False),
+    is_last_event: Callable[[Event], Array] = continue_after_event,
     evaluate_margins: Callable[[StateArray], Array] = no_margins,
 ) -> EventRun:
     """Simulate until an event is the last, until `max_events` events, or until a failure.
@@ -547,6 +552,7 @@ def simulate_modes(
     options: StepOptions,
     start: Array,
     first_mode_index: Array,
+    is_last_event: Callable[[Event], Array] = continue_after_event,
 ) -> HybridSolution:
     """Return the simulation that begins at `start` in the mode with the index `first_mode_index`.
 
@@ -594,7 +600,9 @@ def simulate_modes(
     times, states = jnp.zeros(events) + zero, jnp.zeros((events, start.size)) + zero
     time_errors, indices = lax.stop_gradient(times), jnp.zeros((events,), jnp.int32)
     log = [times, time_errors, time_errors, states, states, indices, indices]
-    run = run_events(modes, options, start, first_mode_index, events, log, record_event)
+    run = run_events(
+        modes, options, start, first_mode_index, events, log, record_event, is_last_event
+    )
     last_values = run.n_events, run.time, run.state, run.mode, run.solver_steps, run.termination
     return HybridSolution._make((*run.log, *last_values))
 

@@ -55,6 +55,7 @@ from vrw_jax.flow.hybrid_simulation import (
     Mode,
     Termination,
     check_mode_functions,
+    continue_after_event,
     no_margins,
     run_events,
     simulate_modes,
@@ -353,15 +354,6 @@ class HybridSystem(AbstractWalker):
         evaluate_margins: Callable[[StateArray], Array] = no_margins,
     ) -> EventRun:
         """Simulate until the end of a step, and record its events in a log."""
-        section_guards = [
-            (mode_index, guard_index)
-            for mode_index, mode in enumerate(self.modes.values())
-            for guard_index, name in enumerate(mode.guards)
-            if name == self.section
-        ]
-        is_section = lambda event: jnp.any(
-            jnp.stack([(event.mode == m) & (event.guard == g) for m, g in section_guards])
-        )
         return run_events(
             self._bind_modes(params),
             options,
@@ -370,9 +362,19 @@ class HybridSystem(AbstractWalker):
             self.max_events,
             log,
             update_log,
-            is_section,
+            self.reaches_section,
             evaluate_margins,
         )
+
+    def reaches_section(self, event: Event) -> Array:
+        """Return whether an event ends a step."""
+        section_guards = [
+            (event.mode == mode_index) & (event.guard == guard_index)
+            for mode_index, mode in enumerate(self.modes.values())
+            for guard_index, name in enumerate(mode.guards)
+            if name == self.section
+        ]
+        return jnp.any(jnp.stack(section_guards))
 
     def take_step(self, params: Any, x: Array, options: StepOptions) -> HybridStep:
         """Return one step of one element; `compile_step` compiles this function."""
@@ -535,9 +537,8 @@ class HybridSystem(AbstractWalker):
             TypeError, ValueError: if an argument is invalid, or a function returns a wrong shape.
         """
         params, start, options = check_arguments(self, params, start, options, 1, "start")
-        return _compile_simulation(self, check_int("events", events), self._find_mode(mode))(
-            params, start, options
-        )
+        simulate = compile_simulation(self, check_int("events", events), self._find_mode(mode))
+        return simulate(params, start, options)
 
     def simulate_batch(
         self,
@@ -554,7 +555,7 @@ class HybridSystem(AbstractWalker):
         first axis, and `start` has the shape (batch, dim), or (dim,) for all elements.
         """
         params, start, options = check_arguments(self, params, start, options, 2, "start")
-        simulate = _compile_simulation(self, check_int("events", events), self._find_mode(mode))
+        simulate = compile_simulation(self, check_int("events", events), self._find_mode(mode))
         return simulate.batch(params, start, options, in_axes=find_batch_axes(params, start))
 
     def return_map(
@@ -688,11 +689,18 @@ def _compile_sampling(system: HybridSystem, n_samples: int) -> Any:
 
 
 @functools.lru_cache
-def _compile_simulation(system: HybridSystem, events: int, mode: int) -> Any:
+def compile_simulation(
+    system: HybridSystem, events: int | None = None, mode: int | None = None
+) -> Any:
+    """Return the compiled simulation of at most `events` events, by default of one step."""
+    first_mode = system._find_mode(None) if mode is None else mode
+    ends_at_event = system.reaches_section if events is None else continue_after_event
+
     def simulate(params: Any, start: Array, options: StepOptions) -> HybridSolution:
-        first_mode = jnp.asarray(mode, jnp.int32)
-        modes = system._bind_modes(params)
-        solution = simulate_modes((modes, events), options, start, first_mode)
+        modes = system._bind_modes(params), events or system.max_events
+        solution = simulate_modes(
+            modes, options, start, jnp.asarray(first_mode, jnp.int32), ends_at_event
+        )
         return solution._replace(termination=_check_domains(params, solution.termination))
 
     return lanes.jit(simulate)

@@ -18,6 +18,7 @@ from vrw_jax.flow.hybrid_system import (
     OUTCOME_BY_TERMINATION,
     TOO_MANY_EVENTS_TEXT,
     HybridSystem,
+    compile_simulation,
 )
 from vrw_jax.flow.phase_integration import sample_phase
 
@@ -34,26 +35,16 @@ def sample_walk_of_system(
     The walk ends at the first step that fails, with the motion until its end.
     """
     mode_names, time, step, outcome = tuple(system.modes), 0.0, 0, Outcome.STEPPED
-    guard_names = [tuple(mode.guards) for mode in system.modes.values()]
     pieces: list[tuple[np.ndarray, np.ndarray, int, int]] = []
     for step, params in enumerate(params_of_steps):
         start = system.embed(jnp.asarray(x), params)
-        motion = jax.tree.map(
-            np.asarray,
-            system.simulate(params, start, events=system.max_events, options=options),
+        motion = jax.tree.map(np.asarray, compile_simulation(system)(params, start, options))
+        n_events, outcome = (
+            int(motion.n_events),
+            Outcome(OUTCOME_BY_TERMINATION[motion.termination]),
         )
-        n_events = int(motion.n_events)
-        guards = [
-            guard_names[mode][guard]
-            for mode, guard in zip(motion.modes, motion.guards, strict=True)
-        ]
-        ending, outcome = motion.ending, Outcome(int(OUTCOME_BY_TERMINATION[motion.termination]))
-        is_valid = motion.termination != Termination.BAD_INPUT
-        if is_valid and system.section in guards[:n_events]:
-            n_events = guards.index(system.section) + 1
-            ending, outcome = Termination.SECTION_REACHED.meaning, Outcome.STEPPED
-        elif motion.termination == Termination.MAX_EVENTS_REACHED:
-            ending = TOO_MANY_EVENTS_TEXT
+        has_too_many = motion.termination == Termination.MAX_EVENTS_REACHED
+        ending = TOO_MANY_EVENTS_TEXT if has_too_many else motion.ending
         end_times, modes = motion.times[:n_events], motion.modes[:n_events]
         if outcome != Outcome.STEPPED:
             end_times, modes = np.append(end_times, motion.time), np.append(modes, motion.mode)
