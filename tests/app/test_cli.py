@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -467,11 +468,15 @@ def test_a_branch_without_a_gait_is_reported_and_writes_nothing(
 ) -> None:
     none = Branch("damping", xr.Dataset(coords={"damping": ("point", np.zeros(0))}), (),
                   ("", ""), Outcome.NO_CYCLE_FOUND)  # fmt: skip
-    monkeypatch.setattr("vrw_jax.app.commands.continue_branch", lambda *_, **__: none)
-    config.write_text('[branch]\nparameter = "damping"\nbounds = [290.0, 300.0]\n')
+    received = {}
+    follow = lambda *_, **settings: received.update(settings) or none
+    monkeypatch.setattr("vrw_jax.app.commands.continue_branch", follow)
+    branch = '[branch]\nparameter = "damping"\nbounds = [290.0, 300.0]\n'
+    config.write_text(f"{branch}[options]\nrtol = 1e-6\n")
     result = run_command("continue", config)
     assert result.exit_code == 1
     assert "there is no gait to start from (NO_CYCLE_FOUND" in result.stderr
+    assert received["step_options"] == replace(vrw.StepOptions.tight(), rtol=1e-6)
     assert not (config.parent / "results").exists()
 
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vrw_jax.app.config import Config, load_config, parse_assignment, parse_config
+from vrw_jax.app.config import Config, load_config, parse_assignments, parse_config
+from vrw_jax.wheel.parameter_sets import parameter_sets
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 CONFIG_FOLDER = Path(__file__).parents[2] / "configs"
@@ -82,9 +83,11 @@ def test_random_samples_are_reproduced_by_their_seed_and_stay_in_their_box(kind:
     assert np.all((draw(1) >= [[100.0], [0.2]]) & (draw(1) <= [[200.0], [0.3]]))
 
 
-def test_an_assignment_changes_one_parameter() -> None:
-    assert parse_assignment("damping = 150") == ("damping", 150.0)
-    assert parse_assignment("n_legs=10") == ("n_legs", 10)
+def test_assignments_change_parameters_of_the_wheel_or_of_a_named_set() -> None:
+    assert parse_assignments(["damping = 150", "n_legs=10"]) == {"damping": 150.0, "n_legs": 10}
+    two_peaks = parameter_sets["two_peaks"].values
+    changed = parse_assignments(["damping=150", "parameter_set=two_peaks"])
+    assert changed == two_peaks | {"damping": 150.0}
 
 
 LEG_FILE = """
@@ -97,7 +100,14 @@ class SoftLeg(eqx.Module):
     def __call__(self, L, dL, params):
         return self.k * (params.natural_length - L) - params.damping * dL
 
-stiff_leg = SoftLeg(600.0)
+class BareLeg(SoftLeg):
+    k: float
+
+    def __init__(self, k):
+        self.k = k
+
+stiffness = 600.0
+stiff_leg = SoftLeg(stiffness)
 """
 
 
@@ -130,10 +140,16 @@ def test_a_config_drives_the_hub_by_a_torque_and_sweeps_it() -> None:
         ('"my_leg.py:leg"', "my_leg.py does not define leg"),
         ('"other.py:leg"', "names the file other.py, which"),
         ("3", "a Python file and a name in it"),
+        ('"torn.py:leg"', r"torn.py:leg, but this raises SyntaxError .*: mend torn.py"),
+        ('"lonely.py:leg"', r"raises ModuleNotFoundError \(No module named 'nowhere'\): mend"),
+        ('"my_leg.py:BareLeg"', "raises TypeError .*'k'.*: mend my_leg.py, where arguments of"),
+        ('"my_leg.py:stiffness"', "raises TypeError .*leg_force is 600.0, but it is the force"),
     ],
 )
 def test_a_wrong_place_of_a_law_is_one_sentence(setting, message, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("my_leg.py").write_text(LEG_FILE)
+    Path("torn.py").write_text("def leg(L, dL, params:")
+    Path("lonely.py").write_text("import nowhere")
     with pytest.raises(ValueError, match=message):
         parse_config(f"[model]\nleg_force = {setting}\n")

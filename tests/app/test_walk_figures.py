@@ -112,6 +112,16 @@ def test_feet_between_two_samples_are_interpolated(sliding_walk):
     assert sample == 8
 
 
+def test_every_gait_of_a_comparison_has_a_curve(paper_walk):
+    gaits = [paper_walk.assign_attrs(parameter_damping=value) for value in (1, 2, 3, 4, 5)]
+    for draw in (vrw.plot.rear_force, vrw.plot.foot_height):
+        axes = draw(gaits).axes[0]
+        labels = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert len(set(labels)) == 5
+        curves = [line for line in axes.lines if line.get_label() in labels]
+        assert len({(line.get_linestyle(), line.get_color()) for line in curves}) == 5
+
+
 def test_a_walk_that_can_not_be_drawn_is_refused_with_the_remedy(sliding_walk):
     for draw in (vrw.plot.rear_force, vrw.plot.foot_height):
         with pytest.raises(ValueError, match=r"the paper's wheel; vrw\.plot\.gait_panels, sticks"):

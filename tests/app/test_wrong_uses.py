@@ -384,12 +384,28 @@ WRONG_COMMANDS: dict[str, tuple[tuple[str, ...], str, str]] = {
         TUNE_TABLE.format("speed", BOUNDS_LINE),
         "there is no such user",
     ),
+    "the sensitivity of legs in turn": (
+        ("robustness", "my.toml"),
+        '[scan]\nslope_sd = 0.01\n[model]\nleg_force = "legs.py:legs"',
+        "the legs alternate, but gait sensitivity norms are those of gaits of one step",
+    ),
+    "the simplest model of legs in turn": (
+        ("gait", "my.toml"),
+        '[model]\nname = "auto"\nleg_force = "legs.py:legs"',
+        'the legs alternate, but model "auto"',
+    ),
     "a step beyond the range": (
         ("continue", "my.toml"),
         BRANCH_TABLE.format("4.0, 230.0") + "max_ds = 5.0",
         "max_ds",
     ),
 }
+
+
+LEGS_IN_TURN = """
+import vrw_jax as vrw
+legs = vrw.AlternatingLegs(vrw.SpringDamper(damping=150.0), vrw.SpringDamper(damping=170.0))
+"""
 
 
 @pytest.fixture
@@ -401,6 +417,7 @@ def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)
     (tmp_path / "letter.txt").write_text("dear reader")
+    (tmp_path / "legs.py").write_text(LEGS_IN_TURN)
     (tmp_path / "letter.bin").write_bytes(b"\xff\xfe\x00")
     for place in ("occupied", "other", "torn"):
         (tmp_path / place / "scan.zarr").mkdir(parents=True)

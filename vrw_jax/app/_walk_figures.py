@@ -1,6 +1,7 @@
 """Figures of walks: Figs 6 to 10 of the paper, and an animation of a walk."""
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -307,7 +308,16 @@ def sticks(gait: xr.Dataset, interval: float = 0.05, *, width: FigureWidth = Non
 
 
 GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
-"""Line styles of the gaits in one figure."""
+"""Line styles of the gaits in one figure, which more gaits repeat in other colors."""
+
+
+def _format_gait_lines(
+    gaits: Sequence[xr.Dataset], vary: str
+) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
+    """Yield each gait with the style and the label of its line, for matplotlib."""
+    for gait, line_style in zip(gaits, itertools.cycle(GAIT_LINE_STYLES), strict=False):
+        label = format_value_label(vary, gait.attrs[f"parameter_{vary}"])
+        yield gait, {"linestyle": line_style, "label": label}
 
 
 @figure_style()
@@ -334,13 +344,12 @@ def foot_height(
     figure, (step_axes, takeoff_axes) = make_panel_grid(
         find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES), 2, 2.6, 0.0, 2
     )
-    for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
+    for gait, line_format in _format_gait_lines(gaits, vary):
         foot_height_mm = 1e3 * gait.foot_2_z
         lowest_mm = float(foot_height_mm.min())
         clearance_text = f"lowest −{-lowest_mm:.1f} mm" if lowest_mm < -1e-6 else "clear"
-        gait_label = format_value_label(vary, gait.attrs[f"parameter_{vary}"])
-        step_axes.plot(gait.time, gait.foot_2_z, linestyle=line_style, label=gait_label)
-        takeoff_axes.plot(gait.time, foot_height_mm, linestyle=line_style, label=clearance_text)
+        step_axes.plot(gait.time, gait.foot_2_z, **line_format)
+        takeoff_axes.plot(gait.time, foot_height_mm, **line_format | {"label": clearance_text})
     for panel_letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
         draw_panel_letter(axes, panel_letter)
         axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
@@ -393,14 +402,9 @@ def rear_force(
     require_variables_of_datasets("gaits", gaits, ("phase", "lambda_4"), NO_PAPER_WALK_REMEDY)
     figure = StyledFigure(figsize=(find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES), 2.5))
     axes = figure.subplots()
-    for gait, line_style in zip(gaits, GAIT_LINE_STYLES, strict=False):
+    for gait, line_format in _format_gait_lines(gaits, vary):
         double_support = gait.isel(time=gait.phase.values == 0)
-        (force_line,) = axes.plot(
-            double_support.time,
-            double_support.lambda_4,
-            linestyle=line_style,
-            label=format_value_label(vary, gait.attrs[f"parameter_{vary}"]),
-        )
+        (force_line,) = axes.plot(double_support.time, double_support.lambda_4, **line_format)
         axes.plot(
             0.0,
             double_support.lambda_4[0],

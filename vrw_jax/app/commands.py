@@ -22,7 +22,7 @@ import typer
 
 from vrw_jax.app import console as printing
 from vrw_jax.app import scanning
-from vrw_jax.app.config import Config, is_figure_file, load_config, parse_assignment
+from vrw_jax.app.config import Config, is_figure_file, load_config, parse_assignments
 from vrw_jax.app.console import (
     ExitCode,
     print_error_sentence,
@@ -34,6 +34,7 @@ from vrw_jax.app.console import (
 )
 from vrw_jax.app.explorer import make_page_address
 from vrw_jax.base.checks import check_path
+from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import PROGRESS_VARIABLE
 from vrw_jax.base.start import start_jax
@@ -174,9 +175,9 @@ def run_gait_command(
     """Walk a wheel and print its gait: durations, speed, indicators, force peaks and margins.
 
     The walk begins near the gait of Table 1 of the paper, or at the start in the config. The
-    command then finds the limit cycle near the state after the last step. With unilateral contact
-    and no start in the config, it finds the slowest attracting gait instead. The command writes no
-    file.
+    command then finds the limit cycle of the wheel. With rigid legs or unilateral contact and a
+    start in the config, this is the limit cycle near the end of the walk. With unilateral contact
+    and no start, it is the slowest attracting gait. The command writes no file.
 
     [bold]Examples[/bold]
 
@@ -187,28 +188,35 @@ def run_gait_command(
     with report_command_errors():
         gait_config, params = _load_config_and_wheel(config, changes)
         model: Any = gait_config.make_model()
+        gait_model: Any
+        gait_model, model_selection_reason = resolve_model_with_reason(params, model)
         options = gait_config.make_options()
         start = gait_config.gait.start
         section_state = model.compute_default_start(params) if start is None else jnp.asarray(start)
         section_state = model.complete_section_state(params, section_state)
         n_steps_walked, n_steps = 0, steps or gait_config.gait.steps
+        models_of_legs = model.list_models_of_legs()
         while True:
-            step_result: Any = step(params, section_state, model=model, options=options)
+            if n_steps_walked % model.leg_period == 0:
+                guess = section_state
+            model_of_leg = models_of_legs[n_steps_walked % model.leg_period]
+            step_result: Any = step(params, section_state, model=model_of_leg, options=options)
             has_stepped = int(step_result.outcome) == Outcome.STEPPED
             n_steps_walked += has_stepped
             if not has_stepped or n_steps_walked == n_steps:
                 break
             section_state = step_result.section_state
-        model, model_selection_reason = resolve_model_with_reason(params, model)
-        can_search_without_start = (
-            start is None or make_finder(model, params.n_legs).supports_cold_start
-        )
+        finder = make_finder(gait_model, params.n_legs, period_n=model.leg_period)
         limit_cycle_result: Any = limit_cycle(
-            params, guess=None if can_search_without_start else section_state, model=model
+            params,
+            guess=None if start is None or finder.supports_cold_start else guess,
+            period_n=model.leg_period,
+            model=gait_model,
+            options=options if isinstance(options, finder.options_type) else None,
         )
         force_peaks: dict[str, Any] = {}
         missing_force_peaks_reason = ""
-        if model.is_compliant and limit_cycle_result.found:
+        if gait_model.is_compliant and limit_cycle_result.found:
             try:
                 force_peaks = limit_cycle_result.measures(FORCE_PEAK_MEASURES)
             except ValueError as error:  # for unilateral contact without machine code
@@ -488,12 +496,18 @@ def run_robustness_command(
                 "write slope_sd = 0.01, in rad, say."
             )
         if robustness_config.design is None:
-            params, wheel_model = robustness_config.make_wheel(), robustness_config.make_model()
-            first_passage_result = first_passage(params, slope_sd, model=wheel_model)
+            params = robustness_config.make_wheel()
+            model: Any = resolve_model_with_reason(params, robustness_config.make_model())[0]
+            finder = make_finder(model, params.n_legs, period_n=model.leg_period)
+            has_options = bool(robustness_config.step_option_values)
+            options = robustness_config.make_options() if has_options else None
             sensitivity_result = gait_sensitivity(
-                params, SENSITIVITY_NORM_MEASURES, model=wheel_model
+                params,
+                SENSITIVITY_NORM_MEASURES,
+                model=model,
+                options=options if isinstance(options, finder.options_type) else None,
             )
-            print(first_passage_result)
+            print(first_passage(params, slope_sd, model=model, options=options))
             print(sensitivity_result)
             return
     run_scan_command(config, folder, picture=picture)
@@ -620,6 +634,7 @@ def run_continue_command(
             period_n=branch_config.period,
             model=command_config.make_model(),
             options=arclength_options,
+            step_options=replace(StepOptions.tight(), **command_config.step_option_values),
         )
         if not branch.values.size:
             print_error_sentence(
@@ -653,7 +668,7 @@ def _load_config_and_wheel(
     "damping=150".
     """
     command_config = _start_jax_and_load_config(config_path)
-    return command_config, command_config.make_wheel(dict(map(parse_assignment, changes or [])))
+    return command_config, command_config.make_wheel(parse_assignments(changes or []))
 
 
 MISSING_CONFIG_TABLE_MESSAGES = {

@@ -399,7 +399,9 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
         model_table, ("name", *defaults), f'[model] with name = "{model_name}"', "settings"
     )
     laws = {
-        name: _load_law(name, model_table.pop(name)) for name in LAW_NAMES if name in model_table
+        name: _load_law(model_class, name, model_table.pop(name))
+        for name in LAW_NAMES
+        if name in model_table
     }
     model = model_class(**laws)
     design = None
@@ -442,20 +444,20 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
     return config
 
 
-def parse_assignment(assignment_text: str) -> tuple[str, float | int]:
-    """Return the parameter name and the number in a text such as "damping=150"."""
-    parameter_name, equals_separator, value_text = (
-        assignment_part.strip() for assignment_part in assignment_text.partition("=")
-    )
-    if not equals_separator:
-        raise ValueError(
-            f"--set {assignment_text} has no '=': write a parameter and its value, damping=150."
-        )
-    try:
-        assigned_number = int(value_text) if parameter_name == "n_legs" else float(value_text)
-    except ValueError:
-        assigned_number = value_text  # type: ignore[assignment]  # The check below reports the error.
-    return parameter_name, _parse_wheel_table({parameter_name: assigned_number})[parameter_name]
+def parse_assignments(assignment_texts: Iterable[str]) -> dict[str, float | int]:
+    """Return the parameters that texts such as "damping=150" assign, as in `[wheel]`."""
+    table: dict[str, Any] = {}
+    for text in assignment_texts:
+        name, equals_separator, value_text = (part.strip() for part in text.partition("="))
+        if not equals_separator:
+            raise ValueError(
+                f"--set {text} has no '=': write a parameter and its value, damping=150."
+            )
+        try:
+            table[name] = int(value_text) if name == "n_legs" else float(value_text)
+        except ValueError:
+            table[name] = value_text  # The check below reports the error.
+    return _parse_wheel_table(table)
 
 
 def _parse_wheel_table(table: ConfigTable) -> dict[str, float | int]:
@@ -470,7 +472,7 @@ def _parse_wheel_table(table: ConfigTable) -> dict[str, float | int]:
     return {**set_values, **_read_parameters(values, Finite)}
 
 
-def _load_law(law_name: str, location: object) -> Any:
+def _load_law(model_class: type[AbstractWheel], law_name: str, location: object) -> Any:
     """Return the law that a text such as "my_leg.py:leg" names, from the Python file.
 
     A torque may also be a number.
@@ -495,14 +497,23 @@ def _load_law(law_name: str, location: object) -> Any:
     assert module_spec is not None
     assert module_spec.loader is not None  # The name of the file ends in .py.
     module = importlib.util.module_from_spec(module_spec)
-    module_spec.loader.exec_module(module)
-    if not hasattr(module, name_in_file):
+    try:
+        module_spec.loader.exec_module(module)
+        if hasattr(module, name_in_file):
+            law = getattr(module, name_in_file)
+            law = law() if isinstance(law, type) else law
+            model_class(**{law_name: law})  # checks the law
+            return law
+    except Exception as error:
         raise ValueError(
-            f"{law_name} is {location}, but {file_name} does not define {name_in_file}: write "
-            f"{name_in_file} = ... there."
-        )
-    law = getattr(module, name_in_file)
-    return law() if isinstance(law, type) else law
+            f"{law_name} is {location}, but this raises {type(error).__name__} "
+            f"({' '.join(str(error).split())}): mend {file_name}, where arguments of classes need "
+            "default values."
+        ) from error
+    raise ValueError(
+        f"{law_name} is {location}, but {file_name} does not define {name_in_file}: write "
+        f"{name_in_file} = ... there."
+    )
 
 
 def _read_like_defaults(table: ConfigTable, defaults: ConfigTable) -> dict[str, Any]:

@@ -146,7 +146,7 @@ def limit_cycle(
     For any model other than the paper's, the fixed point of its return map is computed, with the
     `StepOptions` of its gait step. The result is a `ReturnMapCycle`, whose errors are those of the
     gait step. With unilateral contact a wheel may have several attracting gaits. Without a `guess`,
-    walks from fixed starts find these gaits (`cycles.gait_walks`). `which` then selects the
+    walks from fixed starts find these gaits (`gaits.gait_walks`). `which` then selects the
     "slowest" gait, the "fastest" gait, or an index in the order of increasing speed. `limit_cycles`
     returns all attracting gaits. Model "auto" selects the lowest model whose margins are positive
     for the gait on its ground. A `LimitCycle` then belongs to the paper's model, a `ReturnMapCycle`
@@ -308,6 +308,12 @@ def resolve_model_with_reason(
         or params.damping.ndim
     ):
         return model, None
+    if selected_model.leg_period > 1:
+        raise ValueError(
+            'the legs alternate, but model "auto" tests gaits of one step only: give '
+            "vrw.ViscoelasticWheel(leg_force=...) or vrw.UnilateralWheel(leg_force=...), or one "
+            "law for all legs."
+        )
     paper_cycle = limit_cycle(params, model=selected_model.viscoelastic_model)
     if not bool(paper_cycle.found):
         return selected_model.fallback_model, f"The paper's wheel has no gait: {paper_cycle.ending}"

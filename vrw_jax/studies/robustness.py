@@ -178,6 +178,11 @@ def gait_sensitivity(
         >>> print(f"{jax.grad(norm)(vrw.WheelParams()).damping:.5f} s/rad per N s/m")
         0.01431 s/rad per N s/m
     """
+    if getattr(model, "leg_period", 1) > 1:
+        raise ValueError(
+            "the legs alternate, but gait sensitivity norms are those of gaits of one step: give "
+            "one law for all legs, or take vrw.first_passage."
+        )
     if not is_own_walker(model):
         model = resolve_model(params, model)
     cycle_finder = resolve_finder(params, model, options, guess=guess)
