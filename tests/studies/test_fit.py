@@ -176,6 +176,10 @@ def test_forms_and_units_of_data_do_not_matter(small_fit, tmp_path):
         (pandas.DataFrame(in_ms), {}),
         (dataset, {}),
         (exact, {"covariance": variances}),
+        (
+            {"period [ms]": [300.0], "dls_fraction": [0.4], "speed [cm/s]": [95.0]},
+            {"covariance": np.diag([4.0, 0.02, 2.0]) ** 2},
+        ),
     ):
         result = vrw.fit(data, SMALL_WHEEL, **keywords)
         np.testing.assert_allclose(result.values, small_fit.values, rtol=1e-9)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
+from vrw_jax.studies.multifidelity import _estimate_mean
 
 TABLE_1 = vrw.WheelParams(damping=150.0)
 WHEELS_NEAR_TABLE_1 = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 24))
@@ -178,6 +179,12 @@ def test_a_mean_combines_few_unilateral_gaits_with_all_gaits_of_the_paper():
     assert mean.error < 2e-3
     assert mean.n_high_fidelity < 60
     assert mean.cost < mean.cost_high_fidelity_only
+
+
+def test_the_mean_of_wheels_that_are_all_computed_has_no_sampling_error():
+    has_gait = np.ones(12, bool)
+    drawn = (np.array([2.0]), has_gait[:1], np.array([1.9]))
+    assert _estimate_mean(np.full(12, 2.0), has_gait, *drawn) == (2.0, 0.0)
 
 
 def test_a_mean_includes_only_wheels_with_a_gait():

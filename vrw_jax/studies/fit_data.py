@@ -93,6 +93,7 @@ def read_data(
     kind = "series" if TIME_COLUMN in table else "steps" if STEP_COLUMN in table else "gaits"
     units = {TIME_COLUMN: "s", HEIGHT_COLUMN: "m", **units}
     covariance = table.pop(COVARIANCE_NAME, covariance)
+    factor_by_name: dict[str, float] = {}
     for name, column in table.items():
         if not np.isfinite(column).all():
             raise ValueError(
@@ -111,6 +112,7 @@ def read_data(
                 f"{name} has the unit {unit!r}, but it is a quantity in {si_unit or 'SI units'}: "
                 f"give one of {', '.join(filter(None, factors))}."
             )
+        factor_by_name[name] = factors[unit]
         table[name] = column * factors[unit]
     label_names = (WALK_COLUMN, STEP_COLUMN, TIME_COLUMN)
     repeat = lambda column: np.broadcast_to(column, (*column.shape[:-1], n_rows))
@@ -126,7 +128,8 @@ def read_data(
             f"{', '.join(list(units)[:4])}, say."
         )
     values = np.stack(np.broadcast_arrays(*(repeat(table[name]) for name in names)), -1)
-    errors, whitener = _read_errors(table, names, covariance, values.shape[-2:])
+    scales = np.array([factor_by_name.get(name, 1.0) for name in names])
+    errors, whitener = _read_errors(table, names, covariance, scales, values.shape[-2:])
     is_batch = values.ndim == 3
     for i, name in enumerate(names):
         is_duration = name == "period" or name.startswith("duration")
@@ -204,9 +207,16 @@ def _read_table(data: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def _read_errors(
-    table: Mapping[str, np.ndarray], names: tuple[str, ...], covariance: Any, shape: tuple
+    table: Mapping[str, np.ndarray],
+    names: tuple[str, ...],
+    covariance: Any,
+    scales: np.ndarray,
+    shape: tuple,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return standard errors, and the matrices that whiten residuals."""
+    """Return standard errors, and the matrices that whiten residuals, in SI units.
+
+    - `scales`: factors from the units of the measured columns, in which `covariance` is.
+    """
     n_rows, n_columns = shape
     if covariance is not None:
         matrices = check_numpy_reals("covariance", covariance)
@@ -215,6 +225,7 @@ def _read_errors(
                 f"covariance has shape {matrices.shape}, but the measured columns are "
                 f"{', '.join(names)}: give shape ({n_columns}, {n_columns}), or one for each row."
             )
+        matrices = matrices * np.outer(scales, scales)
         try:
             factors = np.linalg.cholesky(np.broadcast_to(matrices, (n_rows, n_columns, n_columns)))
         except np.linalg.LinAlgError:

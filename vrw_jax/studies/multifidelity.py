@@ -317,6 +317,8 @@ def _estimate_mean(
     mean = (
         np.sum(pilot_values) + n_remaining * (np.mean(control_values) + np.mean(differences))
     ) / n_gaits
+    if n_drawn == n_remaining:  # The gaits of all wheels are computed, perhaps of one only.
+        return float(mean), 0.0
     squared_residuals = n_drawn * np.var(differences - mean * drawn_has_gait)
     squared_residuals += _compute_unseen_wheel_variance(
         pilot_has_gait, pilot_values - mean * pilot_has_gait
