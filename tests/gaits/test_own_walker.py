@@ -32,6 +32,8 @@ from vrw_jax.hybrid import Guard, Mode
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_a_gait_has_the_closed_form_of_velocity_multiplier_and_period(walker):
     gait = vrw.limit_cycle(BALL_PARAMS, model=walker)
+    again = vrw.limit_cycle(BALL_PARAMS, model=walker, guess=gait)
+    np.testing.assert_allclose(again.section_state, gait.section_state, rtol=1e-12)
     np.testing.assert_allclose(gait.section_state, [2.0], rtol=1e-12)
     np.testing.assert_allclose(np.asarray(gait.multipliers), [0.5], rtol=1e-9)
     # A flight lasts one solver step of a parabola; in the system it starts at the velocity before.
@@ -540,6 +542,35 @@ class AimedBall(JuggledBall):
         (lambda: vrw.sensitivities({"slope": 0.009}, model=SIMPLEST_WALKER), "starts="),
         (lambda: vrw.limit_cycles(BALL_PARAMS, model=JuggledBall()), "one common length"),
         (lambda: vrw.limit_cycle({"kick": np.ones(1)}, model=JuggledBall()), "limit_cycles"),
+        (
+            lambda: vrw.continue_branch(
+                BALL_PARAMS,
+                "kick",
+                (0.5, 3.0),
+                model=JuggledBall(),
+                force_peaks=True,
+                cycle=vrw.limit_cycle(BALL_PARAMS, model=JuggledBall()),
+            ),
+            "force_peaks",
+        ),
+        (lambda: vrw.basin(KICKS, {"velocity": 1.0}, model=JuggledBall()), "one walker"),
+        (
+            lambda: vrw.basin_share(KICKS, {"velocity": (1.0, 3.0)}, model=JuggledBall()),
+            "one walker",
+        ),
+        (lambda: vrw.first_passage(KICKS, 0.1, model=JuggledBall()), "one walker"),
+        (lambda: vrw.phase_response(KICKS, model=BALL_SYSTEM), "one walker"),
+        (lambda: vrw.smallest_disturbance(KICKS, model=BALL_SYSTEM), "one walker"),
+        (
+            lambda: vrw.tune(
+                BALL_PARAMS,
+                vrw.WheelObjective(abs),
+                ["kick"],
+                {"kick": (1.0, 2.0)},
+                model=JuggledBall(),
+            ),
+            "a walker of yours",
+        ),
         (
             lambda: vrw.walk(KICKS, [2.0], 3, model=JuggledBall()),
             "shape",

@@ -148,12 +148,17 @@ def is_tree_in_domain(params: Any) -> Any:
     return is_inside
 
 
-def require_tree_in_domain(params: Any) -> None:
-    """Raise an error that names the first parameter outside its domain.
+def require_one_walker(params: Any) -> None:
+    """Raise an error that names the first parameter that has a batch axis or is outside its domain.
 
-    Traced parameters are not checked.
+    The values of traced parameters are not checked.
     """
     for parameter in list_tree_parameters(params):
+        if parameter.value.ndim:
+            raise ValueError(
+                f"{parameter.name} has shape {parameter.value.shape}, but this function is for one "
+                "walker whose parameters are numbers: give one number."
+            )
         if not has_traced_leaf(parameter.value):
             parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))
 

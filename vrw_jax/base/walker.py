@@ -22,6 +22,7 @@ from vrw_jax.base.parameters import (
     is_tree_in_domain,
     list_tree_parameters,
     replace_tree_parameter,
+    require_one_walker,
 )
 
 
@@ -213,6 +214,13 @@ def check_parameters(params: Any) -> Any:
         return check_reals("a parameter", leaf, *remedy)
 
     return jax.tree.map(check, params)
+
+
+def check_one_walker(params: Any) -> Any:
+    """Return a tree of parameters as numbers within their domains, or raise an error."""
+    params = check_parameters(params)
+    require_one_walker(params)
+    return params
 
 
 @contextlib.contextmanager

@@ -402,6 +402,11 @@ def continue_branch(
     """
     if is_own_walker(model):
         check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
+        if cycle_options is not None or force_peaks:
+            raise ValueError(
+                "cycle_options or force_peaks is given for a wheel, but the model is a walker of "
+                "yours: give step_options=vrw.StepOptions(...), and measures= for peaks."
+            )
         return continue_hybrid_branch(
             model, params, name, bounds, cycle, period_n, step_options, options, margins, switch_at,
             measures,

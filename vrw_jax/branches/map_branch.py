@@ -39,6 +39,7 @@ from vrw_jax.base.parameters import (
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     AbstractWalker,
+    check_one_walker,
     make_return_map,
     name_coordinates,
     step_batch_of_walker,
@@ -569,6 +570,7 @@ def continue_hybrid_branch(
     step_options = StepOptions() if step_options is None else step_options
     check_type("step_options", step_options, StepOptions, "give vrw.StepOptions()")
     n_periods = SWITCHED_KINDS.get(switch_at.kind, 1) if isinstance(switch_at, SpecialPoint) else 1
+    params = check_one_walker(params)
     start_value = float(jax.tree.leaves(params)[find_tree_parameter(params, name)])
     params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
 

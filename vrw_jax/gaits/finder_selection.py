@@ -10,7 +10,6 @@ from jaxtyping import Array
 
 from vrw_jax.base.checks import check_int, check_type, has_traced_leaf
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import format_numbers
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.collocation_finder import CollocationFinder, KinkedGaitFinder
@@ -21,7 +20,11 @@ from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
-from vrw_jax.gaits.walker_finder import HybridGait, make_walker_finder
+from vrw_jax.gaits.walker_finder import (
+    convert_gait_guess,
+    is_known_missing,
+    make_walker_finder,
+)
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -80,11 +83,9 @@ def check_cycle_guess(cycle_guess: Any) -> Any:
     A cycle that was not found is no guess.
     Raise ValueError if the section state is not finite.
     """
-    if isinstance(cycle_guess, AbstractCycle | HybridGait):
-        outcome = cycle_guess.outcome
-        if not has_traced_leaf(outcome) and np.all(np.asarray(outcome) != Outcome.STEPPED):
-            return None
-        return cycle_guess.section_state if isinstance(cycle_guess, HybridGait) else cycle_guess
+    cycle_guess = convert_gait_guess(cycle_guess)
+    if isinstance(cycle_guess, AbstractCycle):
+        return None if is_known_missing(cycle_guess.outcome) else cycle_guess
     if cycle_guess is None or isinstance(cycle_guess, CollocationState):
         return cycle_guess
     section_state = convert_section_state(cycle_guess, "guess")

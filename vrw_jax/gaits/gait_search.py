@@ -222,7 +222,8 @@ def limit_cycles(
     Args:
         params: the wheels; fields are scalars or of shape (wheels,). For a walker of yours, its
             parameters.
-        guess: for a walker of yours, section coordinates for all elements or one row for each.
+        guess: for a walker of yours, section coordinates for all elements or one row for each, or
+            its gaits for similar parameters.
         period_n: number of gait steps after which the gaits repeat.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: as in `limit_cycle`.

@@ -23,7 +23,6 @@ from vrw_jax.base.parameters import (
     find_tree_parameter,
     list_tree_parameters,
     replace_tree_parameter,
-    require_tree_in_domain,
 )
 from vrw_jax.base.printing import (
     format_each_batch_element,
@@ -36,6 +35,7 @@ from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import (
     AbstractWalker,
     check_arguments,
+    check_one_walker,
     check_parameters,
     compile_step,
     find_batch_length,
@@ -180,6 +180,18 @@ class HybridGait(NamedTuple):
         return format_heading_and_rows("HybridGait", rows)
 
 
+def is_known_missing(outcome: Any) -> bool:
+    """Return whether no gait was found, as far as the outcome is known outside of jit."""
+    return not has_traced_leaf(outcome) and bool(np.all(np.asarray(outcome) != Outcome.STEPPED))
+
+
+def convert_gait_guess(guess: Any) -> Any:
+    """Return the section coordinates if a guess is a `HybridGait`, None if it was not found."""
+    if not isinstance(guess, HybridGait):
+        return guess
+    return None if is_known_missing(guess.outcome) else guess.section_state
+
+
 def find_walker_gaits(
     walker: Any, params: Any, guess: Any, period_n: int, options: Any, is_batch: bool = False
 ) -> HybridGait:
@@ -187,6 +199,7 @@ def find_walker_gaits(
 
     For a batch, return the gaits, in which an element without a gait has a code.
     """
+    guess = convert_gait_guess(guess)
     if is_batch and any(np.shape(leaf)[:1] == (0,) for leaf in jax.tree.leaves((params, guess))):
         fill = lambda x: np.full((1, *np.shape(x)[1:]), np.nan) if np.shape(x)[:1] == (0,) else x
         params, guess = jax.tree.map(fill, (params, guess))
@@ -586,16 +599,8 @@ def make_walker_finder(
 
     - `guess`: section coordinates from which each search begins, instead of the walker's starts.
     """
-    params = check_parameters(params)
-    named_domains = []
-    for parameter in list_tree_parameters(params):
-        if parameter.value.ndim:
-            raise ValueError(
-                f"{parameter.name} has shape {parameter.value.shape}, but this function is for one "
-                "walker whose parameters are numbers: give one number."
-            )
-        named_domains.append((parameter.name, parameter.domain))
-    require_tree_in_domain(params)
+    params, guess = check_one_walker(params), convert_gait_guess(guess)
+    named_domains = [(x.name, x.domain) for x in list_tree_parameters(params)]
     if walker.starts is None and guess is None:
         raise ValueError(
             "this walker has no starts, but the search for its gaits begins there: give a function "

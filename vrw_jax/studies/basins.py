@@ -24,12 +24,11 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import require_tree_in_domain
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     check_arguments,
-    check_parameters,
+    check_one_walker,
     is_own_walker,
     name_coordinates,
 )
@@ -119,7 +118,7 @@ def basin(
         # The model is valid for any start.
         model = convert_model_argument(model).fallback_model
     else:
-        params = check_parameters(params)
+        params = check_one_walker(params)
     options = convert_step_options(options)
     options.check_tolerances(np.dtype(jnp.result_type(*jax.tree.leaves(params), float)))
     options = options.with_engine(engine)
@@ -337,8 +336,7 @@ class StableGait(NamedTuple):
         )
         is_own = is_own_walker(model)
         if is_own:
-            params = check_parameters(params)
-            require_tree_in_domain(params)
+            params = check_one_walker(params)
         else:
             model = convert_model_argument(model).fallback_model  # valid for any start
             require_single_wheel(params, f"call {caller_name} for one wheel after the other")

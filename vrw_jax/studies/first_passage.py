@@ -20,11 +20,10 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import require_tree_in_domain
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
-from vrw_jax.base.walker import AbstractWalker, check_parameters, is_own_walker
+from vrw_jax.base.walker import AbstractWalker, check_one_walker, is_own_walker
 from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.lanes.autodiff import make_zero_tangent
 from vrw_jax.models.stepping import (
@@ -461,10 +460,9 @@ def first_passage(
     n_walkers, max_steps = check_int("n_walkers", n_walkers), check_int("max_steps", max_steps)
     tol = None if tol is None else check_positive("tol", tol)
     if is_own_walker(model):
+        params = check_one_walker(params)
         _check_walker_on_random_ground(model, params, ground_sd, sd_name)
         resolved_model: Any = model
-        params = check_parameters(params)
-        require_tree_in_domain(params)
     else:
         resolved_model = convert_model_argument(resolve_model(params, model))
     if resolved_model.is_wheel and resolved_model.make_vertical_rate_map(params) is not None:

@@ -207,6 +207,7 @@ def tune(
         options=options,
         cycle_options=cycle_options,
     )
+    curve_arguments = None if along is None else _check_along(tune_problem, along)
     exploration_result = (
         tune_problem.explore_random_starts(n_starts, seed) if n_starts > 1 else None
     )
@@ -216,11 +217,10 @@ def tune(
         if exploration_result is None
         else exploration_result.normalized_parameters[exploration_result.best_start_index]
     )
-    if along is not None:
+    if curve_arguments is not None:
         return follow_optimum(
-            tune_problem, *_check_along(tune_problem, along), start_trial, tolerance,
-            max_evaluations,
-        )  # fmt: skip
+            tune_problem, *curve_arguments, start_trial, tolerance, max_evaluations
+        )
     compilation_end_seconds = time.perf_counter()
     maximization_result = maximize_objective(
         tune_problem.evaluate_trial,
@@ -236,6 +236,11 @@ def tune(
 def _check_along(problem: TuneProblem, along: Any) -> tuple[str, list[float]]:
     """Return the name and the values of the parameter along which an optimum is followed."""
     check_type("along", along, tuple, 'write along=("slope", (0.30, 0.25, 0.20))')
+    if len(along) != 2:
+        raise ValueError(
+            f"along has {len(along)} entries, but it is a parameter and its values: write "
+            'along=("slope", (0.30, 0.25, 0.20)).'
+        )
     name, values = along
     check_parameter_name(name, problem.gait_finder.model.parameter_names, "parameter")
     if name in problem.free_parameters:
@@ -660,6 +665,11 @@ def make_tune_problem(
     """
     own_finder = None
     if is_own_walker(model):
+        if isinstance(objective, WheelObjective):
+            raise ValueError(
+                "objective is a WheelObjective, which is a function of WheelParams, but the model "
+                "is a walker of yours: give a measure, or a function of the gait."
+            )
         own_finder = make_walker_finder(model, params, convert_step_options(options))
         params = check_parameters(params)
     else:
