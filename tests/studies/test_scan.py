@@ -404,6 +404,14 @@ def test_the_result_of_a_sample_does_not_depend_on_the_others(
         np.testing.assert_array_equal(mixed[name][40:], value, name)
 
 
+def test_rows_outside_a_domain_are_known_before_a_gait_with_contact_is_searched() -> None:
+    plan = plan_scan(vrw.grid(slope=[0.3]), ["speed"], model=vrw.UnilateralWheel())
+    samples = {"slope": np.array([0.3, np.nan, 0.3]), "friction": np.array([np.inf, 0.8, -1.0])}
+    request = plan.evaluation_request
+    is_inside = request.are_rows_in_domain(request.stack_parameter_rows(samples))
+    np.testing.assert_array_equal(is_inside, [True, False, False])
+
+
 def test_a_scan_does_not_depend_on_its_chunks(engine: CollocationScanEngine) -> None:
     by_chunk = [
         run_plan(make_plan(chunk), evaluate=engine).drop_attrs() for chunk in (12, SMALL_GRID.size)

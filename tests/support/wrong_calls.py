@@ -915,6 +915,7 @@ def register_wrong_calls() -> None:
     add_wrong_call(
         "tune free twice", lambda: tune(free=["damping", "damping"]), "ValueError", "twice"
     )
+    add_wrong_call("tune along a name", lambda: tune(along=("slope",)), "ValueError", "along has 1")
     add_wrong_call("tune nothing", lambda: tune(free=[]), "ValueError", "no parameter")
     add_wrong_call("tune a number", lambda: tune(free=3), "TypeError", "free")
     add_wrong_call(
@@ -1031,6 +1032,12 @@ def register_wrong_calls() -> None:
     )
     add_wrong_call("scan for a number", lambda: scan(measures=3), "TypeError", "measures")
     add_wrong_call("scan for numbers", lambda: scan(measures=[3]), "TypeError", "measures")
+    add_wrong_call(
+        "scan with contact and options of collocation",
+        lambda: scan(model=vrw.UnilateralWheel(), cycle_options=vrw.CycleOptions()),
+        "ValueError",
+        "cycle_options",
+    )
     add_wrong_call("scan of a batch", lambda: scan(base=several), "ValueError", "one wheel")
     add_wrong_call("scan of a table", lambda: scan(base={"slope": 0.3}), "TypeError", "WheelParams")
     add_wrong_call(

@@ -108,6 +108,19 @@ class EvaluationRequest(NamedTuple):
             rows[:, model.parameter_names.index(name)] = samples
         return rows
 
+    def are_rows_in_domain(self, rows: np.ndarray) -> np.ndarray:
+        """Return for each row of parameters whether all are finite and within their domains.
+
+        The friction of a wheel may be infinite.
+        """
+        domains = self.wheel_model.parameter_domains.items()
+        is_inside = [
+            domain.contains_parameter_value(values)
+            | (self.wheel_model.is_wheel and name == FRICTION_NAME and np.isposinf(values))
+            for (name, domain), values in zip(domains, rows.T, strict=True)
+        ]
+        return np.all(is_inside, axis=0)
+
     def make_gait_finder(self) -> Any:
         """Return the finder of gaits, whose programs do not depend on the values of a law.
 
@@ -395,8 +408,9 @@ def _evaluate_contact_block(
     # Over a period friction balances the weight along the slope. Without enough friction no gait
     # exists.
     friction, slope = rows[:, -1], rows[:, PARAMETER_NAMES.index("slope")]
-    has_enough_friction = friction >= np.tan(slope)
-    rows = rows[has_enough_friction] if has_enough_friction.any() else rows[:1]
+    is_in_domain = evaluation_request.are_rows_in_domain(rows)
+    may_have_gait = is_in_domain & (friction >= np.tan(slope))
+    rows = rows[may_have_gait] if may_have_gait.any() else rows[:1]
     slow_gaits = find_slow_gaits(gait_finder, rows)
     make_reader = functools.partial(MeasureReader, gait_finder.measure_reader)
     read_gaits = functools.partial(
@@ -410,9 +424,10 @@ def _evaluate_contact_block(
     )[1]
     results |= evaluation_request.read_derivatives(differentiate, model)
     # Samples without a gait may have any index.
-    gait_indices = np.maximum(np.cumsum(has_enough_friction) - 1, 0)
+    gait_indices = np.maximum(np.cumsum(may_have_gait) - 1, 0)
     outcomes, results = select_tree_rows((slow_gaits.outcome, results), gait_indices)
-    outcomes = np.where(has_enough_friction, outcomes, Outcome.NO_CYCLE_FOUND)
+    outcomes = np.where(may_have_gait, outcomes, Outcome.NO_CYCLE_FOUND)
+    outcomes = np.where(is_in_domain, outcomes, Outcome.BAD_INPUT)
     return mask_failed_samples(outcomes, results)
 
 
@@ -572,9 +587,8 @@ def evaluate_to_tolerance(
     """
     assert evaluation_request.error_tolerance is not None
     measure_names = evaluation_request.measure_names
-    *wheel_parameter_columns, sample_friction = evaluation_request.stack_parameter_rows(
-        samples_by_parameter
-    ).T
+    rows = evaluation_request.stack_parameter_rows(samples_by_parameter)
+    *wheel_parameter_columns, sample_friction = rows.T
     params = make_wheel_from_parameters(
         tuple(map(jnp.asarray, wheel_parameter_columns)), evaluation_request.base_wheel.n_legs
     )
@@ -589,7 +603,9 @@ def evaluate_to_tolerance(
     sample_results = dict(zip(measure_names, measure_result.values.T, strict=True))
     sample_results |= dict(zip(error_names, measure_result.errors.T, strict=True))
     model_codes = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
-    return mask_failed_samples(measure_result.outcomes, sample_results | {"rung": model_codes})
+    is_in_domain = evaluation_request.are_rows_in_domain(rows)
+    outcomes = np.where(is_in_domain, measure_result.outcomes, Outcome.BAD_INPUT)
+    return mask_failed_samples(outcomes, sample_results | {"rung": model_codes})
 
 
 def evaluate_own_gaits(
@@ -601,11 +617,6 @@ def evaluate_own_gaits(
         evaluation_request.wheel_model.walker,
         evaluation_request.base_wheel,
         evaluation_request.step_options,
-    )
-    domains = finder.model.parameter_domains.values()
-    is_in_domain = np.all(
-        [domain.contains_parameter_value(x) for domain, x in zip(domains, rows.T, strict=True)],
-        axis=0,
     )
     propose = functools.partial(_propose_starts, finder)
     evaluate = functools.partial(_evaluate_walkers, finder, evaluation_request.measure_names)
@@ -629,6 +640,7 @@ def evaluate_own_gaits(
         np.split(rows, range(WALKER_BLOCK_SIZE, len(rows), WALKER_BLOCK_SIZE)),
         n_threads,
     )
+    is_in_domain = evaluation_request.are_rows_in_domain(rows)
     outcomes = np.where(is_in_domain, results.pop("outcome"), Outcome.BAD_INPUT)
     return mask_failed_samples(outcomes, results)
 

@@ -227,6 +227,11 @@ def plan_scan(
             cycle_options=cycle_options,
             step_options=options,
         )
+    if cycle_options is not None and not isinstance(gait_finder.search_options, CycleOptions):
+        raise ValueError(
+            "cycle_options is given, but the gaits of this model are found on its return map: give "
+            "options=vrw.StepOptions(...) of its step."
+        )
     dtype = np.dtype(jnp.result_type(*jax.tree.leaves(base)))
     options.check_tolerances(dtype)
     gait_finder.search_options.check_tolerances(dtype)
