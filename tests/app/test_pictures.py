@@ -1,6 +1,7 @@
 """Figures use colors that color-blind readers distinguish, one meaning per color, and one form of
 units."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from vrw_jax.app import _gait_figures as branch
 from vrw_jax.app import figure_style as style
 from vrw_jax.app._gait_figures import basin_figure, tuning_figure
 from vrw_jax.app._walk_figures import indicators, save_animation
+from vrw_jax.app.config import load_config, parse_config
+from vrw_jax.app.reports import write_tuning_report
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.studies import TrialKind
 from vrw_jax.studies.tune_maximization import TuneStatus
@@ -128,10 +131,11 @@ def test_the_indicator_figure_shows_its_slope():
     assert style.format_value_label("slope", 0.3) in rows
 
 
-def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations():
+@pytest.fixture(scope="module")
+def tune_result():
     path = xr.Dataset(
         {
-            "damping": ("evaluation", [150.0, 195.0, 200.0]),
+            "damping": ("evaluation", [150.0, 195.0, 200.0], {"units": "N s/m"}),
             "objective": ("evaluation", [0.4, np.nan, 0.5], {"long_name": "dls_fraction"}),
             "constraint_value": (("evaluation", "constraint"), [[1.0], [np.nan], [0.5]]),
             "margin": ("constraint", [0.0]),
@@ -141,7 +145,7 @@ def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations
         {"evaluation": range(3), "constraint": ["locked_stopper_force[3]"]},
         {"free": "damping", "lower": [100.0], "upper": [200.0]},
     )
-    result = vrw.TuneResult(
+    return vrw.TuneResult(
         params=vrw.WheelParams(damping=200.0),
         status=TuneStatus.CONVERGED,
         objective="dls_fraction",
@@ -160,12 +164,30 @@ def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations
         compile_seconds=0.5,
         model=vrw.ViscoelasticWheel(),
     )
-    objective, slack, parameters = tuning_figure(result).axes
+
+
+def test_objective_and_parameters_of_a_tuning_run_are_drawn_over_the_evaluations(tune_result):
+    objective, slack, parameters = tuning_figure(tune_result).axes
     np.testing.assert_array_equal(objective.lines[0].get_xydata(), [[0.0, 0.4], [2.0, 0.5]])
     np.testing.assert_array_equal(
         parameters.lines[0].get_xydata(), [[0.0, 0.5], [1.0, 0.95], [2.0, 1.0]]
     )
     assert [bar.get_width() for bar in slack.patches] == [1.0, 0.5]
+
+
+def test_the_config_of_a_tuned_wheel_has_its_model_and_options(tune_result, tmp_path):
+    settings = '[model]\nname = "unilateral"\nfriction = 0.8\nhub_torque = 2\n'
+    config = parse_config(f"{settings}[options]\nrtol = 1e-9\n[tune.bounds]\nslope = [0.2, 0.4]")
+    model = vrw.UnilateralWheel(friction=0.9, hub_torque=3.0)
+    result = dataclasses.replace(tune_result, model=model)
+    write_tuning_report(result, tmp_path, config, draws_figure=False)
+    written = load_config(tmp_path / "wheel.toml")
+    assert float(written.make_wheel().damping) == 200.0
+    written_model = written.make_model()
+    assert isinstance(written_model, vrw.UnilateralWheel)
+    assert (float(written_model.friction), float(written_model.hub_torque.torque)) == (0.9, 3.0)
+    assert written.make_options() == config.make_options()
+    assert written.tune is None
 
 
 UNIT = r"(s|ms|µs|m|mm|N|J|%|rad|m/s|rad/s|N s/m|N·s/m)"

@@ -589,7 +589,7 @@ def run_tune_command(
         )
         printing.print_text_table("Tuned gait", tune_result.describe().items())
         printing.print_written_paths(
-            write_tuning_report(tune_result, folder, command_config.figures if picture else None)
+            write_tuning_report(tune_result, folder, command_config, draws_figure=picture)
         )
     if not tune_result.converged:
         print_error_sentence(

@@ -2,6 +2,9 @@
 
 import csv
 import io
+import itertools
+import json
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from vrw_jax import plot
-from vrw_jax.app.config import FigureConfig
+from vrw_jax.app.config import Config, FigureConfig
 from vrw_jax.base.printing import format_markdown_table
 from vrw_jax.branches.branch import Branch
 from vrw_jax.models.measures import MEASURES, describe_violation, get_measure
@@ -41,10 +44,11 @@ def write_figures(
 
 
 def write_tuning_report(
-    tune_result: TuneResult, folder: Path, figure_config: FigureConfig | None
+    tune_result: TuneResult, folder: Path, config: Config, draws_figure: bool = True
 ) -> list[Path]:
     """Write the data, summary, config and figure for a tuned gait into `folder`, and return the
-    paths. No figure is drawn if `figure_config` is None.
+    paths. The written config has the tables `[model]` and `[options]` of `config`, with tuned
+    values.
     """
     toml_lines = [
         f"# Tuned: {tune_result.objective} {tune_result.value:.6g}. Walk it with `vrw gait`.",
@@ -57,6 +61,17 @@ def write_tuning_report(
         unit_comment = f" # {parameter_unit}" if parameter_unit else ""
         toml_lines.append(f"{parameter_name} = {parameter_value!r}{unit_comment}")
     toml_lines += [f"n_legs = {tune_result.params.n_legs}", ""]
+    model, settings = tune_result.model, tomllib.loads(config.source_text)
+    tables = {name: dict(settings[name]) for name in ("model", "options") if name in settings}
+    for name in model.own_parameter_domains:
+        value = float(model.get_parameter(tune_result.params, name))
+        setting = name.replace("hub.torque", "hub_torque")
+        if setting in tables.get("model", ()):
+            tables["model"][setting] = value
+        else:
+            toml_lines += [f"# In the file of the law: {name} = {value!r}", ""]
+    for name, table in tables.items():
+        toml_lines += [f"[{name}]", *itertools.starmap(_format_setting, table.items()), ""]
     written_paths = _write_dataset_and_texts(
         folder,
         "path.zarr",
@@ -66,10 +81,17 @@ def write_tuning_report(
             "summary.md": format_tuning_summary(tune_result),
         },
     )
-    if figure_config is not None:
-        figure = plot.tuning_figure(tune_result, width=figure_config.width)
-        written_paths += write_figures({"tuning": figure}, folder, figure_config)
+    if draws_figure:
+        figure = plot.tuning_figure(tune_result, width=config.figures.width)
+        written_paths += write_figures({"tuning": figure}, folder, config.figures)
     return written_paths
+
+
+def _format_setting(name: str, value: Any) -> str:
+    """Return a line of TOML. Texts and truth values are written as in JSON."""
+    if isinstance(value, str | bool):
+        return f"{name} = {json.dumps(value, ensure_ascii=False)}"
+    return f"{name} = {value!r}"
 
 
 def write_branch_report(
