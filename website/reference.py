@@ -92,7 +92,12 @@ An unknown key, or a value outside its domain, raises an error before the comput
 _HEADER = ("key", "default", "meaning")
 _DEFAULTS = {name: float(getattr(WheelParams(), name)) for name in PARAMETER_DOMAINS}
 _TABLES = (
-    ("options", StepOptions, "Numerical options of a step, as in [`StepOptions`](walking.md)."),
+    (
+        "options",
+        StepOptions,
+        "Numerical options of a step, as in [`StepOptions`](walking.md). `vrw continue` has "
+        "tolerances of 1e-13 by default.",
+    ),
     ("gait", GaitConfig, "The walk of `vrw gait`."),
     (
         "scan",

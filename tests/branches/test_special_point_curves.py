@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,6 +122,12 @@ def test_the_bounds_of_a_parameter_are_read_once():
 @pytest.fixture(scope="module")
 def table_1_cycle():
     return vrw.limit_cycle(vrw.WheelParams(damping=130.0))
+
+
+def test_a_gait_that_was_not_found_begins_no_curve(table_1_cycle):
+    lost = eqx.tree_at(lambda cycle: cycle.outcome, table_1_cycle, jnp.int32(9))
+    with pytest.raises(ValueError, match="cycle was not found"):
+        vrw.continue_special_point("lambda_4_plus", CURVE_PARAMETERS, lost)
 
 
 @pytest.fixture(scope="module")

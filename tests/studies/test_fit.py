@@ -150,6 +150,8 @@ def test_a_batch_of_data_sets_has_the_estimates_of_each(small_fit):
         dataset[name] = (("dataset", "trial"), numbers[:2, :, k])
     of_dimension = vrw.fit(dataset, SMALL_WHEEL)
     np.testing.assert_allclose(of_dimension.values, batch.values[:2], rtol=1e-4)
+    assert "spread" in str(of_dimension)
+    assert "spread" not in str(vrw.fit(dataset.isel(dataset=[0]), SMALL_WHEEL))
 
 
 def test_a_search_from_a_wheel_without_a_gait_finds_the_wheel(small_fit):
@@ -477,3 +479,5 @@ def test_the_law_that_made_the_data_is_chosen():
     assert table.attrs["fits"]["quadratic damper"]["leg.c2"] == pytest.approx(40.0, abs=0.01)
     errors = table.prediction_error
     assert errors.sel(law="quadratic damper") < 0.1 < errors.sel(law="linear")
+    table = vrw.compare_laws(data, WHEEL, n_folds=1)  # One part leaves nothing to fit.
+    assert np.isnan(table.prediction_error).all()

@@ -696,6 +696,19 @@ def test_workers_with_another_environment_are_refused(
     assert jax.config.jax_compilation_cache_dir == cache  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow  # compiles the search with a law
+def test_workers_of_a_cluster_compute_laws_of_a_script() -> None:
+    """Python's pickle refuses functions without a name."""
+    from distributed import LocalCluster
+
+    law = lambda L, dL, p: p.stiffness * (p.natural_length - L) - 1.1 * p.damping * dL
+    model, design = vrw.ViscoelasticWheel(leg_force=law), vrw.grid(damping=[150.0])
+    with LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster:
+        table = vrw.scan(design, ["period"], model=model, dask=cluster.scheduler_address)
+    expected = vrw.limit_cycle(vrw.WheelParams(damping=165.0)).period
+    assert float(table.period[0]) == pytest.approx(float(expected), rel=1e-9)
+
+
 def test_an_address_without_a_scheduler_gets_one_sentence(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

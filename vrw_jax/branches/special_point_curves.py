@@ -157,6 +157,10 @@ def continue_special_points(
         LimitCycle,
         "give vrw.limit_cycle(params), or model= and params= of a walker of yours",
     )
+    if not np.all(cycle.found):
+        raise ValueError(
+            "the cycle was not found, but a curve begins at a gait: give a cycle that was found."
+        )
     if cycle.period_n != 1:
         raise ValueError(
             f"the gait has {cycle.period_n} steps, but a curve needs a gait of one step: give one."

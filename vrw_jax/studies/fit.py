@@ -594,16 +594,17 @@ def compare_laws(
 def _predict_left_out(result: FitResult, n_folds: int) -> Any:
     """Return the root mean square of the residuals of rows that were left out of the fit.
 
-    The rows are divided into parts, of which each is left out in turn.
+    The rows are divided into parts, of which each is left out in turn. One part would leave out all
+    rows, so that the result is NaN.
     """
     n_rows = result.data.values.shape[1]
     targets = result.target
     if result.values.ndim == 1:
         targets = FitTarget(*(x[None] for x in targets))
     squares = np.zeros(result.values.shape[:-1])
-    if not n_folds:
+    if (n_folds := min(n_folds, n_rows)) < 2:
         return squares + np.nan
-    for fold in range(n_folds := min(n_folds, n_rows)):
+    for fold in range(n_folds):
         is_left_out = np.arange(n_rows)[None] % n_folds == fold
         kept = targets._replace(row_weights=1.0 - is_left_out)
         solution = solve_fits(result.problem, kept, np.atleast_2d(result.values))

@@ -237,14 +237,16 @@ class FitResult:
         """Return pairs of label and text that summarize the result."""
         units = ["" if unit == "1" else f" {unit}" for unit in self.units]
         if self.values.ndim > 1:
-            spread = self.values[np.asarray(self.converged)].std(0, ddof=1)
+            converged = self.values[np.asarray(self.converged)]
+            has_spread = len(converged) > 1
+            spreads = converged.std(0, ddof=1) if has_spread else np.zeros(len(self.names))
             return [
                 ("data sets", f"{len(self.values):,}"),
                 ("converged", f"{int(np.sum(self.converged)):,}"),
                 *(
-                    (name, f"mean {mean:.6g}, spread {sd:.3g}{unit}")
+                    (name, f"mean {mean:.6g}{f', spread {sd:.3g}' * has_spread}{unit}")
                     for name, mean, sd, unit in zip(
-                        self.names, self.values.mean(0), spread, units, strict=True
+                        self.names, self.values.mean(0), spreads, units, strict=True
                     )
                 ),
             ]

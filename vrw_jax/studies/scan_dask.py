@@ -136,7 +136,9 @@ def _compute_chunks_on_cluster(
     missing_chunks: Sequence[int],
 ) -> Iterator[ChunkResult]:
     """Yield each missing chunk's index and results, in the order of completion."""
-    pickled_request = pickle.dumps(scan_plan.evaluation_request)
+    from cloudpickle import dumps  # pickles functions of a script, and is a dependency of Dask
+
+    pickled_request = dumps(scan_plan.evaluation_request)
     local_computing_environment = describe_computing_environment()
     remaining_chunks = iter(missing_chunks)
     chunk_index_by_future: dict[Future, int] = {}
