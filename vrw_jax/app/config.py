@@ -7,6 +7,7 @@ value, the allowed values and the remedy.
 import dataclasses
 import importlib.util
 import math
+import sys
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -497,6 +498,7 @@ def _load_law(model_class: type[AbstractWheel], law_name: str, location: object)
     assert module_spec is not None
     assert module_spec.loader is not None  # The name of the file ends in .py.
     module = importlib.util.module_from_spec(module_spec)
+    writes_no_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         module_spec.loader.exec_module(module)
         if hasattr(module, name_in_file):
@@ -510,6 +512,8 @@ def _load_law(model_class: type[AbstractWheel], law_name: str, location: object)
             f"({' '.join(str(error).split())}): mend {file_name}, where arguments of classes need "
             "default values."
         ) from error
+    finally:
+        sys.dont_write_bytecode = writes_no_bytecode
     raise ValueError(
         f"{law_name} is {location}, but {file_name} does not define {name_in_file}: write "
         f"{name_in_file} = ... there."
