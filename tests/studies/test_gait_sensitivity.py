@@ -226,7 +226,7 @@ def test_an_unstable_gait_has_an_infinite_norm():
     [
         ("perod", {}, "did you mean 'period'"),
         ([], {}, "'nothing' is no measure of a step"),
-        *mark_slow(("period", {"damping": 300.0}, "this wheel has no gait whose sensitivity")),
+        *mark_slow(("period", {"damping": 300.0}, "there is no gait whose sensitivity")),
     ],
 )
 def test_bad_arguments_are_one_sentence(measures, changes, sentence):
