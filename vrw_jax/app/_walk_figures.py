@@ -355,7 +355,7 @@ def foot_height(
         axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
         axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
         axes.set_xlabel("time since landing [s]")
-        axes.legend(loc="upper left")
+    step_axes.legend(loc="upper left")
     heights = np.concatenate([gait.foot_2_z for gait in gaits])
     min_height, max_height = heights.min(), heights.max()
     takeoff_times = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
@@ -365,10 +365,11 @@ def foot_height(
         ylabel="height of foot 2, $z_2$ [m]",
     )
     takeoff_axes.set(
-        xlim=(min(takeoff_times) - 0.03, max(takeoff_times) + 0.1),
+        xlim=(min(takeoff_times) - 0.03, max(takeoff_times) + 0.12),
         ylim=(1.3e3 * min_height - 0.5, -1.8e3 * min_height + 0.5),
         ylabel="$z_2$ [mm]",
     )
+    takeoff_axes.legend(loc="best")
     takeoff_axes.text(
         0.98,
         0.03,
