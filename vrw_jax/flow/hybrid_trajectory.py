@@ -39,10 +39,8 @@ def sample_walk_of_system(
     for step, params in enumerate(params_of_steps):
         start = system.embed(jnp.asarray(x), params)
         motion = jax.tree.map(np.asarray, compile_simulation(system)(params, start, options))
-        n_events, outcome = (
-            int(motion.n_events),
-            Outcome(OUTCOME_BY_TERMINATION[motion.termination]),
-        )
+        n_events = int(motion.n_events)
+        outcome = Outcome(OUTCOME_BY_TERMINATION[motion.termination])
         has_too_many = motion.termination == Termination.MAX_EVENTS_REACHED
         ending = TOO_MANY_EVENTS_TEXT if has_too_many else motion.ending
         end_times, modes = motion.times[:n_events], motion.modes[:n_events]

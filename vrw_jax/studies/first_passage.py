@@ -142,10 +142,8 @@ def differentiate_log_mean_steps(
         """
         if parameter_name == walker_groups.sd_name:
             return -failure_radii / ground_sd
-        parameter_value, domain = (
-            float(getattr(params, parameter_name)),
-            PARAMETER_DOMAINS[parameter_name],
-        )
+        parameter_value = float(getattr(params, parameter_name))
+        domain = PARAMETER_DOMAINS[parameter_name]
         unit = compute_wheel_units(params.symbols()).compute_unit_in_si(domain.unit)
         change_size = RELATIVE_PARAMETER_STEP * (abs(parameter_value) or float(unit))
         changes = np.array([change_size, -change_size])
