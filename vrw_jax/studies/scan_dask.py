@@ -136,7 +136,7 @@ def _compute_chunks_on_cluster(
     missing_chunks: Sequence[int],
 ) -> Iterator[ChunkResult]:
     """Yield each missing chunk's index and results, in the order of completion."""
-    from cloudpickle import dumps  # pickles functions of a script, and is a dependency of Dask
+    from distributed.protocol.pickle import dumps  # pickles functions of a script too
 
     pickled_request = dumps(scan_plan.evaluation_request)
     local_computing_environment = describe_computing_environment()
