@@ -220,29 +220,29 @@ def test_a_gait_with_unilateral_contact_loses_the_energy_of_descent_and_motor():
     assert abs(lost - descent - torque * PARAMS.leg_angle) < 1e-8 * lost
 
 
-def test_two_laws_in_turn_give_a_gait_of_two_steps_with_unilateral_contact():
-    laws = vrw.AlternatingLegs(vrw.SpringDamper(damping=150.0), vrw.SpringDamper(damping=170.0))
-    expected, cycle = (
+def find_gaits_of_two_laws(second_damping):
+    """Return the gait of the paper's wheel with two laws in turn, and that with contact."""
+    laws = vrw.AlternatingLegs(
+        vrw.SpringDamper(damping=150.0), vrw.SpringDamper(damping=second_damping)
+    )
+    return (
         vrw.limit_cycle(vrw.WheelParams(), model=model, period_n=2)
         for model in (
             vrw.ViscoelasticWheel(leg_force=laws),
             vrw.UnilateralWheel(friction=np.inf, leg_force=laws),
         )
     )
+
+
+def test_two_laws_in_turn_give_a_gait_of_two_steps_with_unilateral_contact():
+    expected, cycle = find_gaits_of_two_laws(170.0)
     durations = np.sort(cycle.durations.sum(axis=1))
     np.testing.assert_allclose(durations, np.sort(expected.durations.sum(axis=1)), atol=1e-9)
 
 
 @pytest.mark.slow
 def test_force_peaks_with_unilateral_contact_see_both_laws():
-    laws = vrw.AlternatingLegs(vrw.SpringDamper(damping=150.0), vrw.SpringDamper(damping=190.0))
-    expected, cycle = (
-        vrw.limit_cycle(vrw.WheelParams(), model=model, period_n=2)
-        for model in (
-            vrw.ViscoelasticWheel(leg_force=laws),
-            vrw.UnilateralWheel(friction=np.inf, leg_force=laws),
-        )
-    )
+    expected, cycle = find_gaits_of_two_laws(190.0)
     value = cycle.force_peaks["peak_force"]
     assert value == pytest.approx(float(expected.measure("peak_force")), rel=1e-6)
 

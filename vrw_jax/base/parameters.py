@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 
-from vrw_jax.base.checks import check_real, has_traced_leaf, require_known_name
+from vrw_jax.base.checks import check_real, require_known_name
 
 
 class ParameterDomain(NamedTuple):
@@ -146,21 +146,6 @@ def is_tree_in_domain(params: Any) -> Any:
     for parameter in list_tree_parameters(params):
         is_inside &= parameter.domain.contains_parameter_value(parameter.value)
     return is_inside
-
-
-def require_one_walker(params: Any) -> None:
-    """Raise an error that names the first parameter that has a batch axis or is outside its domain.
-
-    The values of traced parameters are not checked.
-    """
-    for parameter in list_tree_parameters(params):
-        if parameter.value.ndim:
-            raise ValueError(
-                f"{parameter.name} has shape {parameter.value.shape}, but this function is for one "
-                "walker whose parameters are numbers: give one number."
-            )
-        if not has_traced_leaf(parameter.value):
-            parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))
 
 
 def find_tree_parameter(params: Any, name: str) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax import lanes
-from vrw_jax.base.checks import check_reals, check_type
+from vrw_jax.base.checks import check_reals, check_type, has_traced_leaf
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
@@ -22,7 +22,6 @@ from vrw_jax.base.parameters import (
     is_tree_in_domain,
     list_tree_parameters,
     replace_tree_parameter,
-    require_one_walker,
 )
 
 
@@ -217,9 +216,20 @@ def check_parameters(params: Any) -> Any:
 
 
 def check_one_walker(params: Any) -> Any:
-    """Return a tree of parameters as numbers within their domains, or raise an error."""
+    """Return a tree of parameters as numbers within their domains, or raise an error.
+
+    The error names the first parameter that has a batch axis or is outside its domain. The values
+    of traced parameters are not checked.
+    """
     params = check_parameters(params)
-    require_one_walker(params)
+    for parameter in list_tree_parameters(params):
+        if parameter.value.ndim:
+            raise ValueError(
+                f"{parameter.name} has shape {parameter.value.shape}, but this function is for one "
+                "walker whose parameters are numbers: give one number."
+            )
+        if not has_traced_leaf(parameter.value):
+            parameter.domain.require_value_in_domain(parameter.name, float(parameter.value))
     return params
 
 

@@ -64,7 +64,6 @@ from vrw_jax.flow.phase_integration import StateArray, sample_phase
 
 MAX_EVENTS_PER_STEP = 16
 """Default limit of the events in one step, chosen above those of walkers with several legs."""
-TOO_MANY_EVENTS_TEXT = "The step has not ended after max_events events: raise it in the system."
 
 
 OUTCOME_BY_TERMINATION = np.array(
@@ -82,6 +81,13 @@ OUTCOME_BY_TERMINATION = np.array(
     np.int32,
 )
 """Outcome of a step by the `Termination` of its simulation."""
+
+
+def describe_step_ending(termination: Termination) -> str:
+    """Return why the simulation of a step ended, as one sentence."""
+    if termination == Termination.MAX_EVENTS_REACHED:
+        return "The step has not ended after max_events events: raise it in the system."
+    return termination.meaning
 
 
 class HybridStep(eqx.Module):
@@ -136,9 +142,7 @@ class HybridStep(eqx.Module):
             if ending in (Termination.SECTION_REACHED, Termination.BAD_INPUT):
                 return ending.meaning
             place = f"guard {guards[guard]!r} of mode" if guard >= 0 else "mode"
-            has_too_many = ending == Termination.MAX_EVENTS_REACHED
-            meaning = TOO_MANY_EVENTS_TEXT if has_too_many else ending.meaning
-            return f"{meaning} This is {place} {mode_name!r}."
+            return f"{describe_step_ending(ending)} This is {place} {mode_name!r}."
 
         return format_each_batch_element(
             describe, self.termination, self.last_mode, self.last_guard

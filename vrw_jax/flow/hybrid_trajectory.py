@@ -16,9 +16,9 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.flow.hybrid_simulation import Termination
 from vrw_jax.flow.hybrid_system import (
     OUTCOME_BY_TERMINATION,
-    TOO_MANY_EVENTS_TEXT,
     HybridSystem,
     compile_simulation,
+    describe_step_ending,
 )
 from vrw_jax.flow.phase_integration import sample_phase
 
@@ -41,8 +41,7 @@ def sample_walk_of_system(
         motion = jax.tree.map(np.asarray, compile_simulation(system)(params, start, options))
         n_events = int(motion.n_events)
         outcome = Outcome(OUTCOME_BY_TERMINATION[motion.termination])
-        has_too_many = motion.termination == Termination.MAX_EVENTS_REACHED
-        ending = TOO_MANY_EVENTS_TEXT if has_too_many else motion.ending
+        ending = describe_step_ending(Termination(int(motion.termination)))
         end_times, modes = motion.times[:n_events], motion.modes[:n_events]
         if outcome != Outcome.STEPPED:
             end_times, modes = np.append(end_times, motion.time), np.append(modes, motion.mode)

@@ -238,14 +238,15 @@ class FitResult:
         units = ["" if unit == "1" else f" {unit}" for unit in self.units]
         if self.values.ndim > 1:
             converged = self.values[np.asarray(self.converged)]
-            has_spread = len(converged) > 1
-            spreads = converged.std(0, ddof=1) if has_spread else np.zeros(len(self.names))
+            spreads = [""] * len(self.names)
+            if len(converged) > 1:
+                spreads = [f", spread {sd:.3g}" for sd in converged.std(0, ddof=1)]
             return [
                 ("data sets", f"{len(self.values):,}"),
                 ("converged", f"{int(np.sum(self.converged)):,}"),
                 *(
-                    (name, f"mean {mean:.6g}{f', spread {sd:.3g}' * has_spread}{unit}")
-                    for name, mean, sd, unit in zip(
+                    (name, f"mean {mean:.6g}{spread}{unit}")
+                    for name, mean, spread, unit in zip(
                         self.names, self.values.mean(0), spreads, units, strict=True
                     )
                 ),
