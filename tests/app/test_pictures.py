@@ -142,8 +142,12 @@ def tune_result():
             "breach": ("evaluation", [0.0, np.nan, 0.0]),
             "kind": ("evaluation", [TrialKind.START, TrialKind.LOST, TrialKind.ITERATE]),
         },
-        {"evaluation": range(3), "constraint": ["locked_stopper_force[3]"]},
-        {"free": "damping", "lower": [100.0], "upper": [200.0]},
+        {
+            "evaluation": range(3),
+            "constraint": ["locked_stopper_force[3]"],
+            "free_parameter": ["damping"],
+        },
+        {"lower": [100.0], "upper": [200.0]},
     )
     return vrw.TuneResult(
         params=vrw.WheelParams(damping=200.0),

@@ -104,6 +104,25 @@ def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
     assert tuned.value == pytest.approx(3.0, rel=1e-9)
 
 
+def test_the_name_of_a_parameter_may_contain_a_space():
+    class Decay(vrw.AbstractWalker):
+        """x -> x / 2 + s has the fixed point 2 s."""
+
+        def advance(self, params, x, options):
+            return vrw.AdvanceResult(0.5 * x + params["step size"], jnp.ones(1))
+
+        def starts(self, params):
+            return jnp.array([1.0])
+
+    name, walker = "step size", Decay()
+    tuned = vrw.tune({name: 1.0}, "x0", [name], {name: (0.5, 3.0)}, model=walker)
+    assert tuned.value == pytest.approx(6.0, rel=1e-9)
+    assert "step size 3" in str(tuned)
+    vrw.plot.tuning_figure(tuned)
+    scan = vrw.scan(vrw.grid(**{name: [0.5, 1.0]}), ["x0"], base={name: 1.0}, model=walker)
+    np.testing.assert_allclose(scan.x0, [1.0, 2.0], rtol=1e-9)
+
+
 def test_an_optimum_is_followed_along_another_parameter():
     """v = k / (1 - e), and the best kick is the largest."""
     restitutions, bounds = (0.5, 0.6, 0.75), {"kick": (0.5, 2.0)}

@@ -444,7 +444,7 @@ def tuning_figure(tuned: TuneResult, *, width: FigureWidth = None) -> Figure:
     parameter_axes = panel_axes["parameters"]
     # The parameters are scaled so that their bounds are 0 and 1.
     for parameter_name, lower_bound, upper_bound in zip(
-        path_dataset.attrs["free"].split(),
+        path_dataset.free_parameter.values,
         path_dataset.attrs["lower"],
         path_dataset.attrs["upper"],
         strict=True,
@@ -531,7 +531,7 @@ def _draw_constraint_slacks(
         path_dataset[parameter_name].values
         / float(tune_result.model.get_parameter(tune_result.params, parameter_name))
         - 1.0
-        for parameter_name in path_dataset.attrs["free"].split()
+        for parameter_name in path_dataset.free_parameter.values
     ]
     tuned_evaluation_index = np.nanargmin(np.abs(relative_parameter_changes).sum(axis=0))
     with np.errstate(invalid="ignore"):

@@ -175,7 +175,7 @@ def format_tuning_summary(tune_result: TuneResult) -> str:
         (parameter_name, f"{float(tune_result.path[parameter_name][0]):.6g}",
         f"{float(getattr(tune_result.params, parameter_name)):.6g}",
          MEASURES[parameter_name].display_unit)
-        for parameter_name in tune_result.path.attrs["free"].split()
+        for parameter_name in tune_result.path.free_parameter.values
     ]  # fmt: skip
     return "\n".join([
         f"# Tuned: {tune_result.objective}",

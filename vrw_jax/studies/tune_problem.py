@@ -624,13 +624,11 @@ class TuneProblem:
             "evaluation": np.arange(len(trials)),
             "constraint": list(self.constraint_names),
             "constraint_unit": ("constraint", constraint_units),
+            "free_parameter": list(self.free_parameters),
         }
         path_dataset_attributes = {
             "title": f"Path of tuning {self.objective_label} over "
             f"{', '.join(self.free_parameters)}",
-            "free": " ".join(
-                self.free_parameters
-            ),  # It is a text because netCDF has no lists of names.
             "lower": self.lower_bounds.tolist(),
             "upper": self.upper_bounds.tolist(),
             "ending": maximization_result.status.name,

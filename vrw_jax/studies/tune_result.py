@@ -265,13 +265,13 @@ class TuneResult:
 
     def describe(self) -> dict[str, str]:
         """Return the printed texts that summarize the result, by label."""
-        free_parameter_names = self.path.attrs["free"].split()
 
         def describe_value(name: str) -> str:
             value = self.model.get_parameter(self.params, name)
             return format_quantity(value, self.path[name].attrs["units"])
 
-        parameter_texts = [f"{name} {describe_value(name)}" for name in free_parameter_names]
+        names = self.path.free_parameter.values
+        parameter_texts = [f"{name} {describe_value(name)}" for name in names]
         feasibility_text = (
             "every constraint kept" if self.validation.is_feasible else "a constraint broken"
         )
