@@ -122,30 +122,10 @@ def fit(
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     n_starts = check_int("n_starts", n_starts)
-    finder: Any
-    if is_own_walker(model):
-        guess = None if start is None or isinstance(start, str) else np.atleast_2d(start)[0]
-        if guess is None and model.starts is None:
-            raise ValueError(
-                "start is None, but this walker has no starts from which a search begins: give "
-                "section coordinates, or one row of them for each walk."
-            )
-        finder = resolve_finder(params, model, options, guess=guess)
-        time_unit = None
-        own_units = [(measure.name, measure.unit) for measure in finder.described_measures]
-        own_units += [(name, x.unit) for name, x in finder.model.named_domains]
-        # Without a declaration, the unit is unknown.
-        units = {"period": "s"} | {name: unit for name, unit in own_units if unit != "1"}
-        entries = finder.coordinates
-    else:
-        model = resolve_model(params, model)
-        finder = resolve_finder(params, model, None, getattr(model, "leg_period", 1))
-        time_unit = math.sqrt(float(params.locked_length) / float(params.gravity))
-        units = finder.model.units
-        # The landing on both feet of the paper's wheel leaves two of the three entries.
-        entries = fit_problem.START_NAMES[:2]
+    finder, units, entries = _resolve_walker(params, model, start, options)
     model = finder.model
     domains, parameter_names = model.parameter_domains, model.parameter_names
+    time_unit = math.sqrt(params.locked_length / params.gravity) if model.is_wheel else None
     table = fit_data.read_data(data, covariance, units, parameter_names, time_unit)
     if table.kind == "gaits" and finder.leg_period > 1 and finder.is_multistable:
         raise ValueError(
@@ -173,44 +153,11 @@ def fit(
         for entry in entries
         if has_unknown_starts
     ]
-    row_steps, times, n_steps = table.labels.get("step"), table.labels.get("time"), 1
-    if row_steps is not None:
-        row_steps = row_steps.astype(int) - int(row_steps.min())
-        n_steps = int(row_steps.max()) + 1
-    if times is None:
-        window = None
-    else:
-        spacing = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
-        window = spacing if window is None else float(check_real("window", window))
-        if not starts_from_gait:
-            if times.min() < window:
-                raise ValueError(
-                    f"the series begins {times.min():g} s after the first touchdown, but its "
-                    f"samples are means over {window:g} s before and after them: begin later, or "
-                    "give window=."
-                )
-            last_time = float(times.max()) + window
-            n_steps = max(n_steps, _count_steps(finder, params, first_states, last_time, options))
-        else:
-            n_steps = finder.leg_period
-    offset_names = [f"{name}{fit_problem.OFFSET_SUFFIX}" for name in parameter_names]
-    if table.kind == "series":
-        offset_names.append(fit_problem.TIME_OFFSET)
-    for name in free:
-        require_known_name(name, (*parameter_names, *offset_names), "parameter of the walker")
-        if name in table.conditions:
-            raise ValueError(
-                f"{name} is free and a column of data, but a column describes what is known: free "
-                f"{name}_offset, or remove one of them."
-            )
+    row_steps, n_steps, window = _arrange_steps(
+        table, finder, params, None if starts_from_gait else first_states, window, options
+    )
     unknown_names = (*free, *extra, *start_names)
-    if not unknown_names or len(set(unknown_names)) < len(unknown_names):
-        raise ValueError(f"the unknowns are {unknown_names}, but each is named once: change free.")
-    for name in (*bounds, *priors):
-        require_known_name(name, unknown_names, "unknown")
-    if table.kind == "gaits" and observe is None:
-        for name in table.names:
-            require_known_name(name, finder.differentiable_measures, "measure of gaits")
+    _check_unknowns(table, finder, free, unknown_names, (*bounds, *priors), observe)
     base_values = np.asarray(model.collect_parameter_values(params), float)
     known_values = dict(zip(parameter_names, base_values, strict=True)) | extra
     first = np.array([float(known_values.get(name, 0.0)) for name in (*free, *extra)])
@@ -233,7 +180,7 @@ def fit(
             "conditions": _arrange_conditions(table, model, row_walks, row_steps, n_steps),
             "row_walks": row_walks,
             "row_steps": row_steps,
-            "times": times,
+            "times": table.labels.get("time"),
             "window": window,
             "starts": first_states,
             "whitener": table.whitener,
@@ -276,6 +223,96 @@ def fit(
         return mean_fit
     starts = np.tile(mean_fit.values, (len(table.values), 1))
     return make_result(mean_fit.problem, targets, starts, *arguments, is_batch=True)
+
+
+def _resolve_walker(
+    params: Any, model: Any, start: Any, options: StepOptions
+) -> tuple[Any, dict[str, str], tuple[str, ...]]:
+    """Return the finder of gaits, the units of quantities by name, and the entries of a start that
+    may be unknown.
+    """
+    if is_own_walker(model):
+        guess = None if start is None or isinstance(start, str) else np.atleast_2d(start)[0]
+        if guess is None and model.starts is None:
+            raise ValueError(
+                "start is None, but this walker has no starts from which a search begins: give "
+                "section coordinates, or one row of them for each walk."
+            )
+        finder: Any = resolve_finder(params, model, options, guess=guess)
+        own_units = [(measure.name, measure.unit) for measure in finder.described_measures]
+        own_units += [(name, x.unit) for name, x in finder.model.named_domains]
+        # Without a declaration, the unit is unknown.
+        units = {"period": "s"} | {name: unit for name, unit in own_units if unit != "1"}
+        return finder, units, finder.coordinates
+    model = resolve_model(params, model)
+    finder = resolve_finder(params, model, None, getattr(model, "leg_period", 1))
+    # The landing on both feet of the paper's wheel leaves two of the three entries.
+    return finder, finder.model.units, fit_problem.START_NAMES[:2]
+
+
+def _arrange_steps(
+    table: Any,
+    finder: Any,
+    params: Any,
+    first_states: np.ndarray | None,
+    window: float | None,
+    options: StepOptions,
+) -> tuple[np.ndarray | None, int, float | None]:
+    """Return the index of the step of each row, the number of steps, and the window of a series.
+
+    - `first_states`: section states at which the walks begin, None for the steady gait.
+    """
+    row_steps, times = table.labels.get("step"), table.labels.get("time")
+    n_steps = 1
+    if row_steps is not None:
+        row_steps = row_steps.astype(int) - int(row_steps.min())
+        n_steps = int(row_steps.max()) + 1
+    if times is None:
+        return row_steps, n_steps, None
+    spacing = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
+    window = spacing if window is None else float(check_real("window", window))
+    if first_states is None:
+        return row_steps, finder.leg_period, window
+    if times.min() < window:
+        raise ValueError(
+            f"the series begins {times.min():g} s after the first touchdown, but its samples are "
+            f"means over {window:g} s before and after them: begin later, or give window=."
+        )
+    last_time = float(times.max()) + window
+    n_steps = max(n_steps, _count_steps(finder, params, first_states, last_time, options))
+    return row_steps, n_steps, window
+
+
+def _check_unknowns(
+    table: Any,
+    finder: Any,
+    free: Sequence[str],
+    unknown_names: tuple[str, ...],
+    described_names: Sequence[str],
+    observe: Any,
+) -> None:
+    """Raise an error unless the names of unknowns and of columns are known.
+
+    - `described_names`: names of unknowns with bounds or a prior.
+    """
+    parameter_names = finder.model.parameter_names
+    offset_names = [f"{name}{fit_problem.OFFSET_SUFFIX}" for name in parameter_names]
+    if table.kind == "series":
+        offset_names.append(fit_problem.TIME_OFFSET)
+    for name in free:
+        require_known_name(name, (*parameter_names, *offset_names), "parameter of the walker")
+        if name in table.conditions:
+            raise ValueError(
+                f"{name} is free and a column of data, but a column describes what is known: free "
+                f"{name}_offset, or remove one of them."
+            )
+    if not unknown_names or len(set(unknown_names)) < len(unknown_names):
+        raise ValueError(f"the unknowns are {unknown_names}, but each is named once: change free.")
+    for name in described_names:
+        require_known_name(name, unknown_names, "unknown")
+    if table.kind == "gaits" and observe is None:
+        for name in table.names:
+            require_known_name(name, finder.differentiable_measures, "measure of gaits")
 
 
 def _find_first_states(
