@@ -325,13 +325,47 @@ def test_inverse_functions_agree_with_those_of_numpy_to_round_off():
         values = lanes.jit(lambda *x, f=function: f(*x)).batch(*arguments)
         with np.errstate(divide="ignore", invalid="ignore"):
             expected = getattr(np, function.__name__)(*arguments)
-        # a few rounding errors; arctan2 of (-0, x) is not among the cases
+        # a few rounding errors
         np.testing.assert_allclose(values, expected, rtol=2e-15, atol=1e-300, err_msg=str(function))
     np.testing.assert_allclose(
         jax.vmap(jax.grad(lanes.jit(jnp.arctan)))(np.array([0.3, -2.0])),
         1.0 / (1.0 + np.array([0.09, 4.0])),
         rtol=1e-15,
     )
+
+
+EDGES = [0.0, 1e-30, 1e-8, 1e-3, 0.3, 0.5, 1.0, 1.5, 2.0, 80.0, 87.5, 100.0, 1e5, 1e30, np.inf]
+EDGE_FUNCTIONS = (
+    np.exp, np.log, np.expm1, np.log1p, np.tanh, np.sinh, np.cosh, np.arcsin, np.arccos,
+    np.arctan, np.arcsinh, np.arccosh, np.arctanh, np.cbrt, np.sign,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_functions_are_those_of_numpy_at_edges_of_their_domain(dtype):
+    x = np.array([*EDGES, *(-x for x in EDGES), np.nan], dtype)
+    y, z = map(np.ravel, np.meshgrid(x, np.array([-np.inf, -1.0, -0.0, 0.0, 1.0, np.nan], dtype)))
+    cases = [(function, (x,)) for function in EDGE_FUNCTIONS]
+    power = lambda x: x ** dtype(1.5)
+    cases += [(power, (x,)), (np.arctan2, (y, z))]
+    for function, arguments in cases:
+        compute = getattr(jnp, getattr(function, "__name__", ""), function)
+        values = lanes.jit(lambda *x, f=compute: f(*x)).batch(*arguments)
+        assert values.dtype == dtype
+        with np.errstate(all="ignore"):
+            expected = function(*(np.asarray(x, float) for x in arguments)).astype(dtype)
+        # A few rounding errors; of a power, those of its logarithm, which is at most 104 here.
+        # Results below the smallest normal number may be zero.
+        rtol = (104 if function is power else 8) * np.finfo(dtype).eps
+        tiny = np.finfo(dtype).tiny
+        np.testing.assert_allclose(values, expected, rtol=rtol, atol=tiny, err_msg=str(function))
+
+
+def test_nan_is_an_extreme_entry_and_no_entries_have_a_sum():
+    y = jnp.array([1.0, np.nan, 3.0, np.nan])
+    assert lanes.jit(lambda y: (jnp.argmax(y), jnp.argmin(y)))(y) == (1, 1)
+    reduce = lambda y: (jnp.sum(y[:0]), jnp.max(y[:0], initial=-1.0), jnp.all(y[:0] > 0.0))
+    assert lanes.jit(reduce)(y) == (0.0, -1.0, True)
 
 
 @pytest.mark.parametrize("has_machine_code", [True, False])

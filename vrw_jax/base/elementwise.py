@@ -3,6 +3,7 @@
 Sine, cosine and arcsine are polynomials, which all engines evaluate identically.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from types import ModuleType
@@ -14,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree
 
+from vrw_jax import lanes
 from vrw_jax.base.types import Elementwise
 
 
@@ -190,3 +192,40 @@ def _arcsine_jvp(primals: tuple, tangents: tuple) -> tuple:
         is_inside, 1.0 / jnp.sqrt(jnp.where(is_inside, squared_cosine, 1.0)), 0.0
     )
     return compute_arcsine(sine), derivative * sine_tangent
+
+
+def _interpolate(function: Callable[[np.ndarray], np.ndarray]) -> list[float]:
+    """Return a polynomial of degree 5 through values at Chebyshev's points of [0, 1], lowest power
+    first.
+    """
+    x = 0.5 - 0.5 * np.cos(np.pi * (np.arange(6) + 0.5) / 6)
+    return np.polynomial.polynomial.polyfit(x, function(x), 5).tolist()
+
+
+LOGARITHM_COEFFICIENTS = _interpolate(np.log1p)
+POWER_OF_TWO_COEFFICIENTS = _interpolate(np.exp2)
+
+
+def approximate_power(x: Array, exponent: Any) -> Array:
+    """Return x**exponent for estimates, to about 1e-5, where logarithm and power are in float32.
+
+    In machine code, polynomials replace `exp` and `log`, which would call the C library once per
+    batch element. `x` and the power are then between 1e-37 and 1e37.
+    """
+    if not lanes.targets_machine_code() or x.dtype != jnp.float32:
+        return jnp.exp(jnp.log(x) * exponent)
+    evaluate = lambda coefficients, z: functools.reduce(
+        lambda total, coefficient: total * z + coefficient, coefficients[::-1]
+    )
+    as_float = lambda bits: lax.bitcast_convert_type(bits, jnp.float32)
+    bits = lax.bitcast_convert_type(x, jnp.int32)
+    binary_exponent = (bits >> 23) - 127  # sign, 8 bits of exponent + 127, 23 bits of mantissa
+    mantissa = as_float((bits & 0x7FFFFF) | 0x3F800000)  # between 1 and 2
+    logarithm = binary_exponent.astype(jnp.float32) * math.log(2.0) + evaluate(
+        LOGARITHM_COEFFICIENTS, mantissa - 1.0
+    )
+    power_of_two = logarithm * exponent * (1.0 / math.log(2.0))
+    whole_power = jnp.floor(power_of_two)
+    return evaluate(POWER_OF_TWO_COEFFICIENTS, power_of_two - whole_power) * as_float(
+        (whole_power.astype(jnp.int32) + 127) << 23
+    )

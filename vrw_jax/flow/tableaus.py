@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base.elementwise import run_if_any_element_active
+from vrw_jax.base.elementwise import approximate_power, run_if_any_element_active
 from vrw_jax.base.types import Vector
 
 
@@ -239,8 +239,8 @@ def compute_step_size_factor(
 
     `mean_squared_error` is the mean square of the solver step's error divided by the tolerance.
     """
-    error_power = jnp.exp(
-        jnp.log(jnp.clip(mean_squared_error, 1e-20, 1e20)) * (-0.5 / tableau.convergence_order)
+    error_power = approximate_power(
+        jnp.clip(mean_squared_error, 1e-20, 1e20), -0.5 / tableau.convergence_order
     ).astype(float_dtype)
     return jnp.clip(
         STEP_LENGTH_SAFETY_FACTOR * error_power,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.lanes.llvm_library import ir
-from vrw_jax.lanes.value_emitter import I32, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
+from vrw_jax.lanes.value_emitter import LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
 
 FUSED_MULTIPLY_ADD_FLAGS = ("contract",)
 """LLVM's fast-math flag that lets the processor round a product and a following sum once instead of
@@ -231,14 +231,9 @@ def emit_float_function(
 ) -> LlvmValue:
     """Emit a function of a float, such as "sqrt", and return its LLVM value.
 
-    The function is one of LLVM's intrinsic functions, or a polynomial for `exp` and `log` in
-    float32.
+    The function is one of LLVM's intrinsic functions.
     """
     _require_float_dtype(intrinsic_function_name, operation)
-    if operation.operand_dtype == np.float32 and intrinsic_function_name == "exp":
-        return _emit_float32_exponential(operation, x)
-    if operation.operand_dtype == np.float32 and intrinsic_function_name == "log":
-        return _emit_float32_logarithm(operation, x)
     return _emit_intrinsic_call(operation, intrinsic_function_name, x)
 
 
@@ -264,6 +259,19 @@ def _emit_binary_instruction(
     return operation.value_emitter.emit_binary_instruction(
         llvm_opcode, *operation.value_emitter.to_scalars_or_vectors(x, y)
     )
+
+
+def emit_bits(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
+    """Emit the number of the result's type that has the same bits, and return its LLVM value."""
+    if operation.operand_dtype.itemsize != operation.result_dtype.itemsize:
+        raise NotImplementedError(
+            f"the bits of {operation.operand_dtype} as {operation.result_dtype} have no machine "
+            "code: take types of the same size."
+        )
+    llvm_type = LLVM_NUMBER_TYPES[operation.result_dtype.name]
+    if isinstance(x.type, ir.VectorType):
+        llvm_type = operation.value_emitter.make_vector_type(llvm_type)
+    return operation.llvm_builder.bitcast(x, llvm_type)
 
 
 def emit_conversion(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
@@ -312,86 +320,6 @@ def _emit_intrinsic_call(
     return operation.llvm_builder.call(llvm_module.globals[intrinsic_name], [operand])
 
 
-def _emit_polynomial(
-    operation: ElementwiseOperation, x: LlvmValue, polynomial_coefficients: Sequence[float]
-) -> LlvmValue:
-    """Emit a polynomial in `x` by Horner's scheme and return its LLVM value. The coefficients begin
-    with the lowest power.
-    """
-    llvm_builder, make_llvm_constant = (
-        operation.llvm_builder,
-        operation.value_emitter.make_llvm_constant,
-    )
-    horner_sum = make_llvm_constant(x.type, polynomial_coefficients[-1])
-    for polynomial_coefficient in polynomial_coefficients[-2::-1]:
-        horner_sum = llvm_builder.fadd(
-            llvm_builder.fmul(horner_sum, x, flags=FUSED_MULTIPLY_ADD_FLAGS),
-            make_llvm_constant(x.type, polynomial_coefficient),
-            flags=FUSED_MULTIPLY_ADD_FLAGS,
-        )
-    return horner_sum
-
-
-def _get_integer_type(llvm_type: ir.Type) -> ir.Type:
-    """Return the type of 32-bit integers, or of vectors of them if `llvm_type` is a vector."""
-    return ir.VectorType(I32, llvm_type.count) if isinstance(llvm_type, ir.VectorType) else I32
-
-
-def _emit_float32_logarithm(operation: ElementwiseOperation, operand: LlvmValue) -> LlvmValue:
-    """Emit the natural logarithm of a positive normal float32 number, accurate to 1e-5, and return
-    its LLVM value.
-
-    LLVM's own logarithm would call the C library once per lane.
-    """
-    llvm_builder, llvm_type = operation.llvm_builder, operand.type
-    make_llvm_constant = operation.value_emitter.make_llvm_constant
-    llvm_integer_type = _get_integer_type(llvm_type)
-    float_bits = llvm_builder.bitcast(operand, llvm_integer_type)
-    make_integer_constant = lambda x: make_llvm_constant(llvm_integer_type, x)
-    binary_exponent = llvm_builder.sub(
-        llvm_builder.ashr(float_bits, make_integer_constant(23)), make_integer_constant(127)
-    )
-    mantissa_bits = llvm_builder.or_(
-        llvm_builder.and_(float_bits, make_integer_constant(0x7FFFFF)),
-        make_integer_constant(0x3F800000),
-    )
-    mantissa_minus_one = llvm_builder.fsub(
-        llvm_builder.bitcast(mantissa_bits, llvm_type), make_llvm_constant(llvm_type, 1.0)
-    )
-    return llvm_builder.fadd(
-        llvm_builder.fmul(
-            llvm_builder.sitofp(binary_exponent, llvm_type),
-            make_llvm_constant(llvm_type, np.log(2.0)),
-        ),
-        _emit_polynomial(operation, mantissa_minus_one, LOGARITHM_COEFFICIENTS),
-    )
-
-
-def _emit_float32_exponential(operation: ElementwiseOperation, operand: LlvmValue) -> LlvmValue:
-    """Emit the exponential of a float32 number between -87 and 88, and return its LLVM value.
-
-    The relative error is at most 1e-6.
-    """
-    llvm_builder, llvm_type = operation.llvm_builder, operand.type
-    make_llvm_constant = operation.value_emitter.make_llvm_constant
-    llvm_integer_type = _get_integer_type(llvm_type)
-    exponent_of_two = llvm_builder.fmul(operand, make_llvm_constant(llvm_type, 1.0 / np.log(2.0)))
-    integer_exponent = _emit_intrinsic_call(operation, "floor", exponent_of_two)
-    fractional_power_of_two = _emit_polynomial(
-        operation, llvm_builder.fsub(exponent_of_two, integer_exponent), POWER_OF_TWO_COEFFICIENTS
-    )
-    integer_power_of_two_bits = llvm_builder.shl(
-        llvm_builder.add(
-            llvm_builder.fptosi(integer_exponent, llvm_integer_type),
-            make_llvm_constant(llvm_integer_type, 127),
-        ),
-        make_llvm_constant(llvm_integer_type, 23),
-    )
-    return llvm_builder.fmul(
-        fractional_power_of_two, llvm_builder.bitcast(integer_power_of_two_bits, llvm_type)
-    )
-
-
 def _equals_llvm_constant(llvm_value: LlvmValue, expected_number: int) -> bool:
     """Return whether an LLVM value is a constant that equals `expected_number` in every lane."""
     if not isinstance(llvm_value, ir.Constant):
@@ -402,30 +330,12 @@ def _equals_llvm_constant(llvm_value: LlvmValue, expected_number: int) -> bool:
     return isinstance(constant_content, (int, float)) and constant_content == expected_number
 
 
-def _fit_polynomial(
-    fitted_function: Callable[[np.ndarray], np.ndarray], polynomial_degree: int
-) -> list[float]:
-    """Return the coefficients, lowest power first, of a polynomial that interpolates
-    `fitted_function`.
-
-    The interpolation points are Chebyshev's points on [0, 1].
-    """
-    x = 0.5 - 0.5 * np.cos(
-        np.pi * (np.arange(polynomial_degree + 1) + 0.5) / (polynomial_degree + 1)
-    )
-    return list(
-        map(float, np.polynomial.polynomial.polyfit(x, fitted_function(x), polynomial_degree))
-    )
-
-
-LOGARITHM_COEFFICIENTS = _fit_polynomial(np.log1p, 5)
-POWER_OF_TWO_COEFFICIENTS = _fit_polynomial(np.exp2, 5)
-
 ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "abs": emit_absolute_value,
     "add": emit_sum,
     "add_any": emit_sum,
     "and": partial(emit_bitwise_operation, "and_"),
+    "bitcast_convert_type": emit_bits,
     "convert_element_type": emit_conversion,
     "copy": _return_operand,
     "div": emit_quotient,

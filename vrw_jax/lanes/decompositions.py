@@ -11,14 +11,17 @@ from jax import lax
 
 
 def _find_extremum(is_better: Callable, x: jax.Array, *, axes: Any, index_dtype: Any) -> Any:
-    """Return the index of the first smallest or largest entry on an axis."""
+    """Return the index of the first NaN on an axis, or else of its first extreme entry."""
     x = x.astype(jnp.int32) if x.dtype == bool else x
+    is_float = jnp.issubdtype(x.dtype, jnp.floating)
     best, *others = (
         lax.index_in_dim(x, i, axes[0], keepdims=False) for i in range(x.shape[axes[0]])
     )
     index = jnp.zeros(best.shape, index_dtype)
     for i, entry in enumerate(others, 1):
         is_better_entry = is_better(entry, best)
+        if is_float:
+            is_better_entry |= (entry != entry) & (best == best)
         index = jnp.where(is_better_entry, jnp.asarray(i, index_dtype), index)
         best = jnp.where(is_better_entry, entry, best)
     return index
@@ -122,13 +125,14 @@ def _expm1(x: jax.Array, **_: Any) -> jax.Array:
     u = jnp.exp(x)
     is_small, is_minus_one = u == 1.0, u - 1.0 == -1.0
     is_simple = is_small | is_minus_one | jnp.isinf(u)
-    quotient = (u - 1.0) * x / jnp.where(is_simple, 1.0, jnp.log(jnp.where(is_simple, 2.0, u)))
-    return jnp.where(is_small, x, jnp.where(is_simple, u - 1.0, quotient))
+    ratio = x / jnp.where(is_simple, 1.0, jnp.log(jnp.where(is_simple, 2.0, u)))
+    return jnp.where(is_small, x, jnp.where(is_simple, u - 1.0, (u - 1.0) * ratio))
 
 
 def _log1p(x: jax.Array, **_: Any) -> jax.Array:
     u = 1.0 + x
-    return jnp.where(u == 1.0, x, jnp.log(u) * x / jnp.where(u == 1.0, 1.0, u - 1.0))
+    is_simple = (u == 1.0) | (u == jnp.inf)
+    return jnp.where(is_simple, x, jnp.log(u) * (x / jnp.where(is_simple, 1.0, u - 1.0)))
 
 
 def _tanh(x: jax.Array, **_: Any) -> jax.Array:
@@ -138,7 +142,7 @@ def _tanh(x: jax.Array, **_: Any) -> jax.Array:
 
 def _sinh(x: jax.Array, **_: Any) -> jax.Array:
     t = _expm1(jnp.abs(x))
-    magnitude = 0.5 * (t + t / (t + 1.0))
+    magnitude = 0.5 * (t + jnp.where(t == jnp.inf, 1.0, t / (t + 1.0)))
     return jnp.where(x < 0.0, -magnitude, magnitude)
 
 
@@ -146,8 +150,8 @@ def _atan2(y: jax.Array, x: jax.Array, **_: Any) -> jax.Array:
     """Return the angle of a vector: that of a polynomial with an error of 1e-5 (Abramowitz and
     Stegun 4.4.49), corrected by the sine of its difference to the angle.
     """
-    is_below = y < 0.0
-    is_infinite = jnp.isinf(x) | jnp.isinf(y)
+    is_below = jnp.signbit(y)
+    is_infinite = (jnp.isinf(x) | jnp.isinf(y)) & (x == x) & (y == y)
     shrink = lambda z: jnp.where(jnp.isinf(z), jnp.where(z < 0.0, -1.0, 1.0), 0.0)
     y, x = (jnp.where(is_infinite, shrink(z), z) for z in (y, x))
     largest = jnp.maximum(jnp.abs(x), jnp.abs(y))
@@ -160,7 +164,7 @@ def _atan2(y: jax.Array, x: jax.Array, **_: Any) -> jax.Array:
         + square * (-0.3302995 + square * (0.1801410 + square * (-0.0851330 + square * 0.0208351)))
     )
     angle = jnp.where(jnp.abs(y) > jnp.abs(x), 0.5 * jnp.pi - angle, angle)
-    angle = jnp.where(x < 0.0, jnp.pi - angle, angle)
+    angle = jnp.where(jnp.signbit(x), jnp.pi - angle, angle)
     angle = jnp.where(is_below, -angle, angle)
     radius = jnp.sqrt(x * x + y * y)
     sine = (y * jnp.cos(angle) - x * jnp.sin(angle)) / jnp.where(radius == 0.0, 1.0, radius)
@@ -186,7 +190,7 @@ def _asinh(x: jax.Array, **_: Any) -> jax.Array:
 
 def _acosh(x: jax.Array, **_: Any) -> jax.Array:
     is_large = x > 1e8
-    part = jnp.where(is_large, 1.0, x)
+    part = jnp.where(is_large, 1.0, jnp.where(x < 1.0, jnp.nan, x))
     magnitude = _log1p((part - 1.0) + jnp.sqrt((part - 1.0) * (part + 1.0)))
     return jnp.where(is_large, jnp.log(x) + math.log(2.0), magnitude)
 
@@ -206,7 +210,10 @@ def _pow(x: jax.Array, y: jax.Array, **_: Any) -> jax.Array:
     at_zero = jnp.where(y > 0.0, 0.0, jnp.where(y < 0.0, jnp.inf, y))
     half = 0.5 * y
     is_odd = half != jnp.floor(half)
-    of_negative = jnp.where(y == jnp.floor(y), jnp.where(is_odd, -magnitude, magnitude), jnp.nan)
+    of_fraction = jnp.where(x == -jnp.inf, magnitude, jnp.nan)
+    of_negative = jnp.where(
+        y == jnp.floor(y), jnp.where(is_odd, -magnitude, magnitude), of_fraction
+    )
     power = jnp.where(x == 0.0, at_zero, jnp.where(x < 0.0, of_negative, magnitude))
     return jnp.where((y == 0.0) | (x == 1.0), 1.0, power)
 
@@ -215,7 +222,8 @@ def _cbrt(x: jax.Array, **_: Any) -> jax.Array:
     size = jnp.abs(x)
     root = jnp.exp(jnp.log(jnp.where(size > 0.0, size, 1.0)) / 3.0)
     root = root - (root - size / (root * root)) / 3.0  # Newton's step removes the error of exp.
-    return jnp.where(size > 0.0, jnp.where(x < 0.0, -root, root), x)
+    is_simple = (size == 0.0) | (size == jnp.inf)
+    return jnp.where(is_simple, x, jnp.where(x < 0.0, -root, root))
 
 
 DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
@@ -243,7 +251,7 @@ DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "scatter-add": functools.partial(_scatter, jnp.add),
     "scatter-mul": functools.partial(_scatter, jnp.multiply),
     "select_n": _select_case,
-    "sign": lambda x: jnp.where(x > 0, 1, jnp.where(x < 0, -1, 0)).astype(x.dtype),
+    "sign": lambda x: jnp.where(x > 0, 1, jnp.where(x < 0, -1, x)).astype(x.dtype),
     "sinh": _sinh,
     "tan": lambda x, **_: jnp.sin(x) / jnp.cos(x),
     "tanh": _tanh,

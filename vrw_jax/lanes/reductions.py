@@ -19,7 +19,7 @@ from vrw_jax.lanes.array_emitter import (
 )
 from vrw_jax.lanes.lazy_arrays import EntryIndex, LazyArray, LlvmArray
 from vrw_jax.lanes.llvm_library import ir
-from vrw_jax.lanes.value_emitter import LlvmValue
+from vrw_jax.lanes.value_emitter import LLVM_NUMBER_TYPES, LlvmValue
 
 
 def emit_cumulative_sum(
@@ -110,6 +110,15 @@ COMBINING_PRIMITIVE_BY_REDUCTION = {
 """Elementwise primitive by which each reduction combines two entries."""
 
 
+def _get_value_of_no_entries(combining_primitive: str, dtype: np.dtype) -> Any:
+    if combining_primitive not in ("max", "min"):
+        return 0 if combining_primitive != "and" else 1 if dtype.kind == "b" else -1
+    sign = -1 if combining_primitive == "max" else 1
+    if dtype.kind == "f":
+        return sign * np.inf
+    return np.iinfo(dtype).max if sign > 0 else np.iinfo(dtype).min
+
+
 def emit_reduced_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, array: LlvmArray
 ) -> LlvmArray:
@@ -142,6 +151,11 @@ def emit_reduced_array(
             return array_emitter.get_array_entry(array, entry_index)
 
         n_terms = math.prod(reduced_axis_lengths)
+        if n_terms == 0:
+            return array_emitter.value_emitter.make_llvm_constant(
+                LLVM_NUMBER_TYPES[result_dtype.name],
+                _get_value_of_no_entries(combining_primitive, result_dtype),
+            )
         if isinstance(array, np.ndarray) or n_terms <= array_emitter.MAX_UNROLLED_REDUCTION_TERMS:
             return functools.reduce(
                 emit_combination, map(get_entry_to_reduce, np.ndindex(*reduced_axis_lengths))

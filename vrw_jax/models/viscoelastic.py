@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
-from vrw_jax.base.elementwise import compute_sine_cosine
+from vrw_jax.base.elementwise import approximate_power, compute_sine_cosine
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
@@ -525,8 +525,8 @@ def _make_phase_runner(
             next_phase_inputs = previous_phase_end.next_phase_inputs
             dt0 = next_phase_inputs.next_solver_dt
             if phase.has_stiff_start:
-                tolerance_root = jnp.exp(
-                    jnp.log(options.rtol.astype(jnp.float32)) / tableau.convergence_order
+                tolerance_root = approximate_power(
+                    options.rtol.astype(jnp.float32), 1.0 / tableau.convergence_order
                 ).astype(dt0.dtype)
                 max_transient_dt = (
                     MAX_FIRST_STEP_IN_TRANSIENT_TIMES * tolerance_root * phase.s.m / phase.s.c
