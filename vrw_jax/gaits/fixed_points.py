@@ -86,12 +86,17 @@ class FixedPointResult(NamedTuple):
         of such texts.
         """
 
-        def describe_convergence(converged: bool, n_iterations: int, is_singular: bool) -> str:
+        def describe_convergence(
+            converged: bool, n_iterations: int, is_singular: bool, n_invariants: int
+        ) -> str:
             converged_text = "converged" if converged else "did not converge"
             convergence = f"Newton's method {converged_text} after {n_iterations} iterations"
             if is_singular:
                 return f"{convergence}. {UNIT_MULTIPLIER_ADVICE}"
-            return convergence + ("." if converged else ": start nearer to the fixed point.")
+            if converged:
+                return convergence + "."
+            check = ", and check that the map conserves the invariants" if n_invariants else ""
+            return f"{convergence}: start nearer to the fixed point{check}."
 
         n_invariants = np.asarray(0 if self.n_invariants is None else self.n_invariants)
         return format_each_batch_element(
@@ -99,6 +104,7 @@ class FixedPointResult(NamedTuple):
             self.converged,
             self.n_iterations,
             np.asarray(count_unit_multipliers(np.asarray(self.jacobian)) > n_invariants),
+            np.broadcast_to(n_invariants, np.shape(self.converged)),
         )
 
     def __repr__(self) -> str:
@@ -121,6 +127,14 @@ class FixedPointResult(NamedTuple):
 MAX_NEWTON_ITERATIONS = 30
 """Default limit of Newton iterations. The value is chosen far above the number that a start near
 the fixed point needs.
+"""
+
+
+MAX_RESIDUAL = 1e-6
+"""Largest change of a fixed point, relative to its size, if invariants are kept.
+
+The equations then have no solution if the map does not conserve the invariants, although the
+corrections vanish. The value is chosen far above the error of a step with default options.
 """
 
 
@@ -153,7 +167,10 @@ def solve_fixed_point(
             component is its size at the start or at the fixed point, whichever is larger.
         max_iterations: largest number of Newton iterations.
         invariants: functions of the state that the map conserves, such as an energy. Fixed points
-            then form a curve, and that with the invariants of `start` is found.
+            then form a curve, and that with the invariants of `start` is found. If a map does not
+            conserve them, the search does not converge. Derivatives are those along this curve: by
+            a value that breaks the conservation there are none, and what is returned is no
+            derivative.
 
     Returns:
         A `FixedPointResult`: the state, its multipliers, and the status of the iteration.
@@ -222,13 +239,15 @@ def solve_fixed_point_implicit(
     units: Any = None,
     max_iterations: int = MAX_NEWTON_ITERATIONS,
     invariants: Sequence[Callable[[Array], Array]] = (),
+    max_residual: float | Scalar = MAX_RESIDUAL,
     differentiates_jacobian: bool = False,
 ) -> FixedPointResult:
     """Find a fixed point of a map whose second derivatives are expensive.
 
-    The other arguments are those of `solve_fixed_point`. Derivatives of order n of the fixed point
-    require only derivatives of order n of `function`. Derivatives of the Jacobian are NaN, unless
-    `differentiates_jacobian` is true.
+    The other arguments are those of `solve_fixed_point`. With `invariants`, a state is a fixed
+    point only if its image differs by at most `max_residual` times the size of the state.
+    Derivatives of order n of the fixed point require only derivatives of order n of `function`.
+    Derivatives of the Jacobian are NaN, unless `differentiates_jacobian` is true.
     """
     check_callable("function", function, "that maps a state to the next")
     start, period_n = check_reals("start", start), check_int("period_n", period_n)
@@ -240,7 +259,9 @@ def solve_fixed_point_implicit(
     else:
         check_positive("tolerance", tolerance)
 
-    tolerance = lax.stop_gradient(jnp.asarray(tolerance, start.dtype))
+    tolerance, max_residual = lax.stop_gradient(
+        [jnp.asarray(x, start.dtype) for x in (tolerance, max_residual)]
+    )
     # A unit of 0 is replaced by the size of the component.
     units = jnp.zeros_like(start) if units is None else check_state_units(units, start)
     newton_configuration = (
@@ -250,13 +271,22 @@ def solve_fixed_point_implicit(
     compiled_program = None
     if isinstance(function, ReturnMap):
         compiled_program = get_compiled_program(
-            _find_fixed_point_of_iterate, newton_configuration, start, tolerance, units
+            _find_fixed_point_of_iterate,
+            newton_configuration,
+            start,
+            tolerance,
+            max_residual,
+            units,
         )
-    return (compiled_program or find_fixed_point)(start, tolerance, units)
+    return (compiled_program or find_fixed_point)(start, tolerance, max_residual, units)
 
 
 def _find_fixed_point_of_iterate(
-    newton_configuration: tuple, start: Array, tolerance: Array, units: Array
+    newton_configuration: tuple,
+    start: Array,
+    tolerance: Array,
+    max_residual: Array,
+    units: Array,
 ) -> FixedPointResult:
     function, period_n, invariants, *loop_configuration = newton_configuration
 
@@ -268,7 +298,13 @@ def _find_fixed_point_of_iterate(
 
     closure_converted_map, closed_over_values = jax.closure_convert(evaluate_equations, start)
     result = _run_newton_loop(
-        closure_converted_map, *loop_configuration, start, tolerance, units, *closed_over_values
+        closure_converted_map,
+        *loop_configuration,
+        start,
+        tolerance,
+        max_residual,
+        units,
+        *closed_over_values,
     )
     n_invariants = sum(jax.eval_shape(invariant, start).size for invariant in invariants)
     return result._replace(n_invariants=jnp.asarray(n_invariants, jnp.int32))
@@ -309,6 +345,7 @@ def _run_newton_loop(
     differentiates_jacobian: bool,
     start: Array,
     tolerance: Array,
+    max_residual: Array,
     units: Array,
     *closed_over_values: Any,
 ) -> FixedPointResult:
@@ -340,7 +377,7 @@ def _run_newton_loop(
         )
         defect = values - jnp.pad(x, (0, len(values) - len(x)))
         newton_correction = _solve_fixed_point_equations(jacobian, defect)
-        jacobian, residual = jacobian[: len(x)], jnp.max(jnp.abs(defect))
+        jacobian, residual = jacobian[: len(x)], jnp.max(jnp.abs(defect[: len(x)]))
         # The sum of the terms of a component is no more accurate than its largest term.
         component_sizes = jnp.max(
             jnp.abs(jnp.stack([start, x, x + newton_correction, jnp.abs(jacobian) @ jnp.abs(x)])), 0
@@ -382,6 +419,10 @@ def _run_newton_loop(
         needs_newton_iteration, iterate_newton, initial_loop_state
     )
     has_newton_converged = correction_norm <= tolerance
+    n_equations = jax.eval_shape(closure_converted_map, start, *closed_over_values).size
+    if n_equations > start.size:
+        size = jnp.max(jnp.maximum(units, jnp.abs(x)))
+        has_newton_converged &= residual <= max_residual * size
     return FixedPointResult(
         jnp.where(has_newton_converged, x, start),
         jacobian,
@@ -407,7 +448,7 @@ def _run_newton_jvp(
     result = _run_newton_loop(
         closure_converted_map, max_iterations, differentiates_jacobian, *primals
     )
-    closed_over_values, value_tangents = tuple(primals[3:]), tuple(tangents[3:])
+    closed_over_values, value_tangents = tuple(primals[4:]), tuple(tangents[4:])
     compute_jacobian = lambda x, *values: evaluate_with_jacobian(
         lambda x: closure_converted_map(x, *values), x
     )[1]

@@ -46,6 +46,7 @@ from vrw_jax.base.walker import (
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import (
     MAX_NEWTON_ITERATIONS,
+    MAX_RESIDUAL,
     FixedPointResult,
     solve_fixed_point_implicit,
 )
@@ -144,14 +145,16 @@ class HybridGait(NamedTuple):
     def why(self) -> Any:
         """Return a sentence on how the search ended; for a batch, an array of sentences."""
 
-        def describe(code: int, newton: str, n_iterations: int, step_code: int, end: str) -> str:
+        def describe(
+            code: int, newton: str, n_iterations: int, residual: float, step_code: int, end: str
+        ) -> str:
             if code == Outcome.STEPPED:
                 return newton
             if code != Outcome.NO_CYCLE_FOUND:
                 outcome = Outcome(int(code))
                 reason = end if end and code == step_code else outcome.meaning
                 return f"A step of the search failed: {outcome.name}. {reason}"
-            is_interrupted = n_iterations < MAX_NEWTON_ITERATIONS
+            is_interrupted = n_iterations < MAX_NEWTON_ITERATIONS and residual == 0.0
             return newton + " One of its steps failed." * is_interrupted
 
         return format_each_batch_element(
@@ -159,9 +162,15 @@ class HybridGait(NamedTuple):
             self.outcome,
             self.fixed_point.ending,
             self.fixed_point.n_iterations,
+            self.fixed_point.residual,
             self.last_step.outcome,
             getattr(self.last_step, "ending", ""),
         )
+
+    @property
+    def ending(self) -> Any:
+        """Return the sentence of `why`, as of other gaits."""
+        return self.why
 
     def __repr__(self) -> str:
         if isinstance(self.period, jax.core.Tracer):
@@ -386,6 +395,8 @@ def _search_from_guess(
         guess,
         period_n=period_n,
         invariants=[lambda x: walker.evaluate_invariants(params, x)] if walker.invariants else (),
+        # Steps conserve their invariants as accurately as they are computed.
+        max_residual=jnp.maximum(MAX_RESIDUAL, 100.0 * options.rtol),
     )
     x, period, values = fixed_point.x, jnp.zeros((), fixed_point.x.dtype), []
     numbers = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((params, guess))])
