@@ -203,6 +203,44 @@ def test_an_energy_conserving_biped_has_a_gait_on_its_level_set():
     assert np.min(np.abs(np.asarray(gait.multipliers) - 1.0)) < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("level_rate", "armed_rate", "ends_at_start"),
+    [(1.0, 2.0, False), (1.0, -1.0, False), (-1.0, -0.5, False), (-1.0, 2.0, True)],
+)
+def test_a_guard_that_is_zero_with_armed_ends_the_mode_only_if_it_falls(
+    level_rate, armed_rate, ends_at_start
+):
+    field = lambda y, p: jnp.stack([p["level_rate"], p["armed_rate"], 1.0 + 0.0 * y[2]])
+    guards = {
+        "low": Guard(lambda y, p: y[0], armed=lambda y, p: y[1], ends_walk=True),
+        "late": Guard(lambda y, p: 2.0 - y[2]),
+    }
+    system = vrw.HybridSystem(
+        modes={"run": Mode(field, guards)}, section="late", state=("level", "armed", "time")
+    )
+    rates = {"level_rate": level_rate, "armed_rate": armed_rate}
+    step = system.step(rates, jnp.zeros(3))
+    assert step.duration == pytest.approx(0.0 if ends_at_start else 2.0, abs=1e-12)
+
+
+def test_there_is_no_gait_if_a_declared_invariant_changes():
+    """x[1] grows by `drift` in each step, so that no state repeats unless the drift is zero."""
+
+    class DriftingWalker(vrw.AbstractWalker):
+        invariants = [lambda x, p: x[1]]  # noqa: RUF012
+
+        def advance(self, params, x, options):
+            image = jnp.stack([0.5 * x[0] + 1.0, x[1] + params["drift"]])
+            return vrw.AdvanceResult(image, jnp.ones(1))
+
+    find = lambda drift: vrw.limit_cycle({"drift": drift}, model=DriftingWalker(), guess=[1.0, 2.0])
+    assert find(0.0).found
+    gait = find(0.3)
+    assert gait.outcome == vrw.Outcome.NO_CYCLE_FOUND
+    assert "conserves the invariants" in gait.ending
+    assert "steps failed" not in gait.ending
+
+
 def test_batches_have_the_bits_of_single_steps_and_reverse_mode_the_values_of_forward_mode():
     starts = SPRING_START + 0.01 * np.random.default_rng(0).uniform(-1.0, 1.0, (37, 4))
     stiffness = np.linspace(18.0, 22.0, 37)

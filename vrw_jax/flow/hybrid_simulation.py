@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
@@ -402,6 +402,7 @@ def _simulate_one_event(
     # For a guard at rest the second derivative decides: the guard does not end the mode if it will
     # rise.
     will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
+    will_guard_rise |= lax.stop_gradient(_find_rising_ties(mode, state))
     guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
     n_margins = jax.eval_shape(evaluate_margins, state).size
     guards_and_margins = GuardsAndMargins(
@@ -419,6 +420,22 @@ def _simulate_one_event(
     ]
     next_mode = select_entry_by_mask(guard_index, jnp.asarray(next_modes, jnp.int32))
     return phase_end, violated_guard.astype(jnp.int32), next_state, next_mode.astype(jnp.int32)
+
+
+def _find_rising_ties(mode: Mode, state: StateArray) -> Bool[Array, " n_guards"]:
+    """Return which guards are zero together with `armed`, and positive or not armed from then on.
+
+    The larger rate is then that of the guard, but the derivative of a maximum is the mean of both.
+    """
+    ties = []
+    for guard in mode.guards:
+        evaluate = lambda y, g=guard: jnp.stack([g.value(y), -g.armed(y)])
+        if guard.armed is None:
+            ties.append(jnp.asarray(False))
+        else:
+            values, rates = jax.jvp(evaluate, (state,), (mode.field(state),))
+            ties.append(jnp.all(values == 0.0) & (jnp.max(rates) > 0.0))
+    return jnp.stack(ties)
 
 
 class EventRun(NamedTuple):

@@ -336,10 +336,11 @@ class HybridSystem(AbstractWalker):
                 bind(mode.field),
                 tuple(
                     Guard(
-                        bind(guard.evaluate),
+                        bind(guard.value),
                         bind(guard.reset),
                         None if guard.target_mode is None else self._find_mode(guard.target_mode),
-                        ends_walk=guard.ends_walk,
+                        None if guard.armed is None else bind(guard.armed),
+                        guard.ends_walk,
                     )
                     for guard in mode.guards.values()
                 ),
@@ -609,11 +610,11 @@ def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> Hy
         return evaluate
 
     def extend_guard(guard: Guard) -> Guard:
-        return Guard(
-            lambda y, params: guard.evaluate(y[:n], params),
-            lambda y, params: jnp.concatenate([guard.reset(y[:n], params), y[n:]]),
-            guard.target_mode,
-            ends_walk=guard.ends_walk,
+        armed = guard.armed
+        return guard._replace(
+            value=lambda y, params: guard.value(y[:n], params),
+            reset=lambda y, params: jnp.concatenate([guard.reset(y[:n], params), y[n:]]),
+            armed=None if armed is None else lambda y, params: armed(y[:n], params),
         )
 
     return HybridSystem(
