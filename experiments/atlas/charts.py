@@ -21,13 +21,8 @@ from experiments.shared.tables import (
     read_table,
     replace_block,
 )
-from vrw_jax.app.figure_style import (
-    OUTCOME_LABELS_AND_COLORS,
-    PAGE_FIGURE_WIDTH_INCHES,
-    figure_style,
-    save,
-)
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax import Outcome
+from vrw_jax.plot import PAGE_FIGURE_WIDTH_INCHES, figure_style, save, style
 
 STYLES = {  # of Okabe and Ito, a marker each
     "lanes Tsit5": ("#0072B2", "o"),
@@ -178,7 +173,9 @@ def between(rows: list[Row]) -> Figure:
 
 def describe_outcome(outcome: str) -> str:
     """Return a short description of the outcome of a step."""
-    return "stepped" if outcome == "STEPPED" else OUTCOME_LABELS_AND_COLORS[Outcome[outcome]][0]
+    return (
+        "stepped" if outcome == "STEPPED" else style.OUTCOME_LABELS_AND_COLORS[Outcome[outcome]][0]
+    )
 
 
 def summarize_by_border(rows: list[Row]) -> list[Row]:

@@ -31,8 +31,8 @@ from experiments.shared.tables import (
     write_named_rows,
 )
 from experiments.shared.timing import start_without_cache, use_one_core
-from vrw_jax.app.figure_style import PAGE_FIGURE_WIDTH_INCHES as WIDE
-from vrw_jax.app.figure_style import figure_style, save
+from vrw_jax.plot import PAGE_FIGURE_WIDTH_INCHES as WIDE
+from vrw_jax.plot import figure_style, save
 
 TABLE = FIGURES / "atlas_failures.csv"
 ORDER = (

@@ -13,7 +13,6 @@ import xarray as xr
 import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import plot as plots
-from vrw_jax.app.figure_style import format_value_label
 
 DAMPINGS = (100.0, 200.0)  # N s/m
 ANGULAR_RATES = np.linspace(0.4, 3.2, 57)  # rad/s
@@ -33,8 +32,8 @@ def main() -> None:
         basin_result = vrw.basin(params, grid, options=vrw.StepOptions(rtol=1e-9, atol=1e-9))
         results.append(basin_result)
         title_parts = (
-            format_value_label("damping", damping),
-            format_value_label("theta_touchdown", theta),
+            plots.style.format_value_label("damping", damping),
+            plots.style.format_value_label("theta_touchdown", theta),
         )
         titles.append(", ".join(title_parts))
         print(

@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import plot as plots
-from vrw_jax.app.figure_style import draw_panel_letter, format_axis_label
 
 DAMPING_BOUNDS = (100.0, 219.0)
 N_POINTS = 25
@@ -60,11 +59,11 @@ def draw_disturbances(result: vrw.SmallestDisturbance, basins: object) -> Figure
     profile.set_xlim(result.profile_times[0], result.profile_times[-1])
     profile.legend()
     branch.plot(basins.damping, basins.smallest_disturbance, "o-", color="black", markersize=2.5)
-    branch.set_xlabel(format_axis_label("damping"))
+    branch.set_xlabel(plots.style.format_axis_label("damping"))
     branch.set_ylabel("smallest change over the step [rad/s]")
     branch.set_ylim(bottom=0.0)
-    draw_panel_letter(profile, "a")
-    draw_panel_letter(branch, "b")
+    plots.style.draw_panel_letter(profile, "a")
+    plots.style.draw_panel_letter(branch, "b")
     return figure
 
 

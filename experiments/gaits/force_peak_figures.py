@@ -27,7 +27,6 @@ from experiments.gaits.force_peak_wheels import (
 )
 from experiments.shared.tables import FIGURES, Row, group_rows, read_column, read_table
 from vrw_jax import plot as plots
-from vrw_jax.app.figure_style import OKABE_ITO_BLUE, OKABE_ITO_ORANGE, draw_panel_letter
 
 PEAK_COLORS = {0: "#56B4E9", 1: "#0072B2", 2: "#E69F00", 3: "#D55E00"}
 """Colors of Okabe and Ito by number of peaks."""
@@ -89,14 +88,14 @@ def draw_causes(map_rows: list[Row]) -> None:
     draw_peak_times(panels["times"], map_rows)
     draw_dampings(panels["dampings"])
     for letter, axis in zip("abc", panels.values(), strict=True):
-        draw_panel_letter(axis, letter)
+        plots.style.draw_panel_letter(axis, letter)
     plots.save(figure, FIGURES, "force_peak_causes")
 
 
 def draw_stances(axis: Axes) -> None:
     """Draw the force on one foot, from its landing to its lift-off, of three walkers."""
     labels = {"table_1": "Table 1", "two_peaks": "two-peak wheel"}
-    colors = (OKABE_ITO_BLUE, OKABE_ITO_ORANGE, plots.DARK_GRAY_COLOR)
+    colors = (plots.style.OKABE_ITO_BLUE, plots.style.OKABE_ITO_ORANGE, plots.DARK_GRAY_COLOR)
     for color, (walker, rows) in zip(
         colors, group_rows(read_table(STANCE_TABLE), "walker").items(), strict=True
     ):

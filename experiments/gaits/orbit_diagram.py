@@ -18,7 +18,6 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax import plot as plots
 from vrw_jax.app._gait_figures import BRANCH_END_COLOR, SPECIAL_POINT_LINE_STYLE
-from vrw_jax.app.figure_style import draw_markers, format_axis_label
 from vrw_jax.gaits.gait_walks import (
     PeriodicWalkEnds,
     find_distinct_orbits,
@@ -84,7 +83,7 @@ def make_orbit_figure(orbits: xr.Dataset, special_point_damping: float) -> Figur
         if is_in_group.any():
             size = 2.4 if marker == "o" else 3.4
             x, y = value[is_in_group], orbits.dtheta_post_impact.values[is_in_group]
-            draw_markers(rates, x, y, marker, colour, fill, markersize=size, label=text)
+            plots.style.draw_markers(rates, x, y, marker, colour, fill, markersize=size, label=text)
     periods.plot(value, orbits.period.values, "s", color="black", markersize=2.0)
     for axes in (rates, periods):
         axes.axvline(
@@ -106,7 +105,7 @@ def make_orbit_figure(orbits: xr.Dataset, special_point_damping: float) -> Figur
     periods.set_ylabel("period [steps]")
     periods.set_ylim(0.0, 1.0 + float(orbits.period.max()))
     periods.yaxis.get_major_locator().set_params(integer=True)
-    periods.set_xlabel(format_axis_label("damping"))
+    periods.set_xlabel(plots.style.format_axis_label("damping"))
     return figure
 
 

@@ -13,7 +13,7 @@ from matplotlib.patches import Arc
 
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax.app import paper_reproduction as reproduction
-from vrw_jax.app.figure_style import (
+from vrw_jax.plot import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,

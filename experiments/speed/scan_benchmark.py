@@ -204,9 +204,8 @@ def main() -> None:
     compare(sizes[-1])
 
     from vrw_jax import plot as plots
-    from vrw_jax.app._scan_figures import scan_figures
 
-    for name, figure in scan_figures(vrw.open_scan(STORES / f"{sizes[-1]}.zarr")).items():
+    for name, figure in plots.scan_figures(vrw.open_scan(STORES / f"{sizes[-1]}.zarr")).items():
         plots.save(figure, FIGURES, f"{name}_of_{sizes[-1]}")
 
 

@@ -13,13 +13,12 @@ from matplotlib.figure import Figure
 import vrw_jax as vrw
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax import plot as plots
-from vrw_jax.app.figure_style import draw_panel_letter, format_axis_label
 
 BOUNDS = {"damping": (20.0, 1000.0), "stiffness": (150.0, 1500.0)}
 SLOPES = np.linspace(0.30, 0.05, 101)
 PANELS = (
-    ("damping", format_axis_label("damping")),
-    ("stiffness", format_axis_label("stiffness")),
+    ("damping", plots.style.format_axis_label("damping")),
+    ("stiffness", plots.style.format_axis_label("stiffness")),
     ("objective", "largest stability margin"),
 )
 
@@ -42,9 +41,9 @@ def draw_optima(curve: vrw.OptimumCurve) -> Figure:
         axes.plot(curve.dataset.slope, curve.dataset[name], color="black")
         for change in curve.changes:
             axes.axvline(change.value, color=plots.LEG_2_COLOR, linestyle=(0, (1, 1.2)))
-        axes.set_xlabel(format_axis_label("slope"))
+        axes.set_xlabel(plots.style.format_axis_label("slope"))
         axes.set_ylabel(label)
-        draw_panel_letter(axes, letter)
+        plots.style.draw_panel_letter(axes, letter)
     return figure
 
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.shared.tables import DOCS, FIGURES, Row, format_markdown, replace_block
-from vrw_jax.app.figure_style import PAGE_FIGURE_WIDTH_INCHES, figure_style, save
+from vrw_jax.plot import PAGE_FIGURE_WIDTH_INCHES, figure_style, save
 
 QUANTITIES = {  # group and title of each panel
     "post_impact": ("step", "state after the next landing"),
