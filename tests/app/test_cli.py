@@ -28,13 +28,8 @@ from vrw_jax.app import scanning
 from vrw_jax.app.commands import app
 from vrw_jax.app.config import parse_config
 from vrw_jax.app.console import make_scan_progress_reporter, replace_unencodable_characters
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.branches.branch import Branch
-from vrw_jax.studies import SpecialPointMap
+from vrw_jax.studies import ScanPlan, ScanProgress, SpecialPointMap
 from vrw_jax.studies import scan_execution as forecast
-from vrw_jax.studies.scan_execution import ScanProgress
-from vrw_jax.studies.scan_planning import ScanPlan
-from vrw_jax.studies.scan_store import open_scan
 
 SCAN_CONFIG = """
 [grid]
@@ -231,7 +226,7 @@ def test_a_map_of_force_peaks_has_those_of_each_gait_on_the_mesh_of_the_config(
     )
     result = run_command("map", config, "--out", tmp_path)
     assert result.exit_code == 0, result.output
-    data = open_scan(tmp_path / "scan.zarr")
+    data = vrw.open_scan(tmp_path / "scan.zarr")
     assert set(data.n_force_peaks.values.ravel()) == {1.0, 2.0}
     for i, j in ((0, 1), (1, 0)):
         wheel = vrw.WheelParams(
@@ -248,7 +243,7 @@ def test_a_scan_writes_data_and_figures_to_the_printed_paths(config: Path) -> No
     result = run_command("scan", config)
     assert result.exit_code == 0, result.output
     folder = config.parent / "results" / "small"
-    data = open_scan(folder / "scan.zarr")
+    data = vrw.open_scan(folder / "scan.zarr")
     assert dict(data.sizes) == {"damping": 4, "slope": 3, "stiffness": 2, "leg": 6}
     assert data.attrs["config"] == SCAN_CONFIG
     pictures = sorted(path.name for path in folder.glob("*.png"))
@@ -296,7 +291,7 @@ def test_a_tilde_is_the_home_folder_in_paths_of_configs_and_results(
     (home / "mine" / "small.toml").write_text(SCAN_CONFIG)
     result = run_command("scan", "~/mine/small.toml", "--out", "~/here", "--no-picture")
     assert result.exit_code == 0, result.output
-    scanned = open_scan("~/here/scan.zarr")
+    scanned = vrw.open_scan("~/here/scan.zarr")
     stored = vrw.scan(vrw.grid(damping=[100.0]), ["speed"], store="~/there.zarr")
     assert dict(stored.sizes) == {"damping": 1, "leg": 6}
     assert scanned.sizes["damping"] == 4
@@ -466,8 +461,8 @@ def test_verify_reports_whether_a_store_is_complete_and_intact(
 def test_a_branch_without_a_gait_is_reported_and_writes_nothing(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    none = Branch("damping", xr.Dataset(coords={"damping": ("point", np.zeros(0))}), (),
-                  ("", ""), Outcome.NO_CYCLE_FOUND)  # fmt: skip
+    none = vrw.Branch("damping", xr.Dataset(coords={"damping": ("point", np.zeros(0))}), (),
+                      ("", ""), vrw.Outcome.NO_CYCLE_FOUND)  # fmt: skip
     received = {}
     follow = lambda *_, **settings: received.update(settings) or none
     monkeypatch.setattr("vrw_jax.app.commands.continue_branch", follow)
@@ -538,7 +533,7 @@ def test_a_gait_of_the_simplest_model_names_the_model_and_the_reason(
 INTERRUPTED_SCAN_SCRIPT = """
 import sys, time
 sys.path.insert(0, {tests!r})
-from vrw_jax.studies.scan_planning import ScanPlan
+from vrw_jax.studies import ScanPlan
 def wait_for_signal():
     for _ in range(600):  # Python handles a signal that arrives just before a sleep after it.
         time.sleep(0.1)
@@ -552,8 +547,7 @@ def slow(columns):
             wait_for_signal()
 ScanPlan.build_scan_engine = lambda _: slow
 sys.argv = ["vrw", "scan", {config!r}]
-from vrw_jax.app.commands import main
-main()
+import vrw_jax.__main__
 """
 
 

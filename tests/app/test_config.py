@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vrw_jax import WheelParams, parameter_sets
 from vrw_jax.app.config import Config, load_config, parse_assignments, parse_config
-from vrw_jax.wheel.parameter_sets import parameter_sets
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.wheel import PARAMETER_NAMES
 
 CONFIG_FOLDER = Path(__file__).parents[2] / "configs"
 

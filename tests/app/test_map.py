@@ -4,8 +4,8 @@ import numpy as np
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.app._scan_figures import map_figure
 from vrw_jax.branches.branch import Codim2Point
+from vrw_jax.plot import map_figure
 
 C, K = np.linspace(50.0, 150.0, 5), np.linspace(400.0, 600.0, 4)
 

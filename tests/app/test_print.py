@@ -20,11 +20,9 @@ import vrw_jax as vrw
 import vrw_jax.continuation
 import vrw_jax.hybrid
 from vrw_jax.app import _contact_figures as _contact
-from vrw_jax.app import figure_style as style
-from vrw_jax.app._walk_figures import ground_forces
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches import Branch, SpecialPoint
 from vrw_jax.branches.branch import FixedPoint
+from vrw_jax.plot import ground_forces, style
 from vrw_jax.wheel import ContactMode
 
 ROOT = Path(__file__).parents[2]
@@ -62,7 +60,7 @@ def make_branch(n_components: int, ends: tuple[str, str]) -> Branch:
     )
     point = FixedPoint(np.full(n_components, 2.0 / 3.0), 3.0, -np.eye(n_components))
     doubling = SpecialPoint("period_doubling", "period_doubling", 3.0, point, False)
-    return Branch("r", dataset, (doubling,), ends, Outcome.STEPPED)
+    return Branch("r", dataset, (doubling,), ends, vrw.Outcome.STEPPED)
 
 
 RANGE_END = "The parameter's range ended."
@@ -218,7 +216,7 @@ def test_the_branch_of_a_map_is_drawn_with_each_component_of_its_fixed_points():
     (line, *_) = states.lines
     np.testing.assert_allclose(line.get_ydata(), 1.0 - 1.0 / line.get_xdata(), atol=1e-15)
     empty = Branch(
-        "r", xr.Dataset(coords={"r": ("point", [])}), (), ("", ""), Outcome.NO_CYCLE_FOUND
+        "r", xr.Dataset(coords={"r": ("point", [])}), (), ("", ""), vrw.Outcome.NO_CYCLE_FOUND
     )
     with pytest.raises(ValueError, match="the branch has no point to draw"):
         vrw.plot.branch_figure(empty)

@@ -13,11 +13,11 @@ import xarray as xr
 from PIL import Image
 from typer.testing import CliRunner
 
+from vrw_jax import Outcome
 from vrw_jax import plot as plots
 from vrw_jax.app import commands as cli
 from vrw_jax.app import paper_reproduction as reproduce
 from vrw_jax.app.paper_evidence import PaperEvidence
-from vrw_jax.base.outcomes import Outcome
 
 FIGURE_NAMES = (
     "fig06_gait",

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from vrw_jax.app._scan_figures import scan_figures
-from vrw_jax.app.figure_style import OUTCOME_LABELS_AND_COLORS, format_axis_label
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax import Outcome
+from vrw_jax.plot import scan_figures, style
 
 
 @pytest.mark.parametrize("second", ["friction", "gravity"])
@@ -22,7 +21,7 @@ def test_a_scan_is_drawn_over_both_its_axes(second):
     )
     (figure,) = scan_figures(scan).values()
     speed, outcome, _ = figure.axes
-    assert outcome.get_ylabel() == format_axis_label(second, "{symbol}")
+    assert outcome.get_ylabel() == style.format_axis_label(second, "{symbol}")
     assert speed.collections[0].get_array().shape == (4, 3)
 
 
@@ -54,7 +53,7 @@ def test_colors_show_why_there_is_no_gait(code):
     outcome[0, 0] = code
     (figure,) = scan_figures(make_scan(outcome, np.ones((3, 2)), np.full((3, 2), 0.5))).values()
     names = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert OUTCOME_LABELS_AND_COLORS[code][0] in names
+    assert style.OUTCOME_LABELS_AND_COLORS[code][0] in names
 
 
 def test_mean_numbers_of_steps_have_a_logarithmic_color_scale():

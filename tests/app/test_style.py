@@ -6,10 +6,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.mathtext import MathTextParser
 
-from vrw_jax import plot
-from vrw_jax.app import figure_style as style
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax import Outcome, plot
 from vrw_jax.models import MEASURES
+from vrw_jax.plot import style
 
 MATHTEXT_PARSER = MathTextParser("path")
 

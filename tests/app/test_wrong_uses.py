@@ -12,7 +12,7 @@ from support.scanning import evaluate_arithmetically
 from typer.testing import CliRunner
 
 from vrw_jax.app.commands import app
-from vrw_jax.studies.scan_planning import ScanPlan
+from vrw_jax.studies import ScanPlan
 
 WRONG_CONFIGS: dict[str, tuple[str, str]] = {
     "not TOML": ("[wheel", "not valid TOML"),

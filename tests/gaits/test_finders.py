@@ -8,8 +8,12 @@ import pytest
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.gaits import CYCLE_MEASURE_FUNCTIONS, confirm_outcome_by_step, make_finder
-from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE
+from vrw_jax.gaits import (
+    CYCLE_MEASURE_FUNCTIONS,
+    STATE_AGREEMENT_TOLERANCE,
+    confirm_outcome_by_step,
+    make_finder,
+)
 from vrw_jax.gaits.return_map_finder import ReturnMapFinder
 from vrw_jax.models import MEASURES, AbstractWheel
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES

@@ -18,10 +18,9 @@ from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax import lanes
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax import Outcome, lanes
 from vrw_jax.gaits import floquet, solve_fixed_point_implicit
-from vrw_jax.wheel.params import PARAMETER_NAMES, make_wheel_from_parameters
+from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
 
 TIGHT_OPTIONS = vrw.CycleOptions.tight()
 MASS_NAMES = [PARAMETER_NAMES.index(name) for name in ("hub_mass", "leg_mass")]

@@ -11,8 +11,8 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.flow.event_location import _propose_earliest_event
+from vrw_jax.models import compute_leg_directions
 from vrw_jax.models.contact_integrator import PAINLEVE_ATOL, PAINLEVE_RTOL_FACTOR
-from vrw_jax.models.contact_mechanics import compute_leg_directions
 
 N_WHEELS, N_STEPS = 128, 60
 HIGH_FRICTION, INFINITE_FRICTION = np.linspace(1.0, 3.0, N_WHEELS), np.full(N_WHEELS, math.inf)

@@ -17,9 +17,8 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, lanes
-from vrw_jax.base import batch_sizes
-from vrw_jax.base.elementwise import compute_sine_cosine
-from vrw_jax.flow.integrate import integrate_batch_phase
+from vrw_jax.base import batch_sizes, compute_sine_cosine
+from vrw_jax.flow import integrate_batch_phase
 from vrw_jax.flow.tableaus import (
     StageAccelerations,
     StageState,

@@ -10,7 +10,7 @@ import xarray as xr
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.models.measures import MEASURES, TRAJECTORY_MEASURES
+from vrw_jax.models.measures import TRAJECTORY_MEASURES
 from vrw_jax.wheel.dynamics import Motion, compute_momentum
 
 N_SAMPLES = 1001
@@ -47,7 +47,7 @@ def _momentum(params: vrw.WheelParams, part: xr.Dataset) -> np.ndarray:
 def test_every_variable_has_unit_long_name_and_symbol(sampled_walk: xr.Dataset) -> None:
     assert set(sampled_walk.variables) == set(TRAJECTORY_MEASURES)
     for name, variable in sampled_walk.variables.items():
-        assert variable.attrs["units"] == MEASURES[str(name)].unit
+        assert variable.attrs["units"] == vrw.MEASURES[str(name)].unit
         assert variable.attrs["long_name"]
         assert variable.attrs["symbol"]
     assert sampled_walk.phase.attrs["flag_meanings"] == "DLS SLS-I SLS-II"

@@ -14,7 +14,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import lanes
-from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
+from vrw_jax.hybrid import GuardsAndMargins, integrate_phase
 from vrw_jax.models.contact_impacts import ContactLaw, classify_event, resolve_event
 from vrw_jax.models.contact_mechanics import (
     WheelMotion,

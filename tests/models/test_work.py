@@ -8,7 +8,7 @@ from support.batched import compute_states_and_work
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.flow.tableaus import compute_real_stability_limit, load_explicit_tableau
+from vrw_jax.flow import compute_real_stability_limit, load_explicit_tableau
 
 STARTS = reference_values.stack_quantity("step", "start")
 VALUES = np.concatenate(

@@ -5,9 +5,9 @@ import pytest
 from support.files import assert_netcdf_round_trip
 
 import vrw_jax as vrw
-from vrw_jax.app._gait_figures import basin_figure
 from vrw_jax.gaits.gait_walks import PeriodicWalkEnds, find_distinct_orbits
 from vrw_jax.models import POST_LANDING_COMPONENT_NAMES, PRE_TOUCHDOWN_COMPONENT_NAMES
+from vrw_jax.plot import basin_figure
 
 OPTIONS = vrw.StepOptions(rtol=1e-9, atol=1e-9)
 

@@ -21,13 +21,12 @@ from support.scanning import (
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
+from vrw_jax import open_scan
+from vrw_jax.studies import plan_scan, scan_store
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies import scan_execution as running
 from vrw_jax.studies import scan_planning as planning
-from vrw_jax.studies import scan_store
 from vrw_jax.studies import store_integrity as soundness
-from vrw_jax.studies.scan_planning import plan_scan
-from vrw_jax.studies.scan_store import open_scan
 
 
 def list_files(complete_store: Path) -> dict[str, bytes]:

@@ -5,7 +5,6 @@ import pytest
 import xarray as xr
 
 import vrw_jax as vrw
-from vrw_jax.base.outcomes import Outcome
 
 ISHIGAMI_RANGES = {"damping": (100.0, 200.0), "slope": (0.2, 0.3), "stiffness": (400.0, 500.0)}
 
@@ -21,7 +20,7 @@ def make_ishigami_scan(n: int = 4096) -> tuple[xr.Dataset, np.ndarray]:
         "speed": ("sample", value),
         "period": ("sample", 2.0 * unit[:, 0] + unit[:, 1]),
     }
-    outcome = np.full(design.size, int(Outcome.STEPPED))
+    outcome = np.full(design.size, int(vrw.Outcome.STEPPED))
     attrs = {"scan": {"design": design.describe_design()}}
     return xr.Dataset(
         result_by_name | {"outcome": ("sample", outcome)}, design.make_result_coordinates(), attrs
@@ -72,7 +71,7 @@ def test_a_spread_of_a_ten_thousand_millionth_is_no_round_off() -> None:
 def test_rows_without_a_gait_are_omitted_and_counted() -> None:
     scan, unit = make_ishigami_scan()
     fails = unit[:, 2] > 0.9
-    scan.outcome.values[fails] = Outcome.NO_CYCLE_FOUND
+    scan.outcome.values[fails] = vrw.Outcome.NO_CYCLE_FOUND
     for name in ("speed", "period"):
         scan[name].values[fails] = np.nan
     result = vrw.sobol_indices(scan, ["period"])
@@ -165,6 +164,6 @@ def test_invalid_requests_for_indices_are_refused_in_one_sentence() -> None:
         vrw.sobol_indices(scan, ["sped"])
     with pytest.raises(ValueError, match=r"kind None.*saltelli"):
         vrw.sobol_indices(scan.drop_attrs(), ["speed"])
-    scan.outcome.values[0] = Outcome.NO_CYCLE_FOUND
+    scan.outcome.values[0] = vrw.Outcome.NO_CYCLE_FOUND
     with pytest.raises(ValueError, match="only 63 of 64 rows walk throughout"):
         vrw.sobol_indices(scan, ["speed"])

@@ -7,7 +7,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from support import reference_values
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax import Outcome
 from vrw_jax.wheel import PARAMETER_NAMES
 
 BATCH_SIZE = 16

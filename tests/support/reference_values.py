@@ -10,7 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax import WheelParams
+from vrw_jax.wheel import PARAMETER_NAMES
 
 REFERENCE_CASES: list[dict[str, Any]] = json.loads(
     (Path(__file__).parents[1] / "reference_code" / "reference_values.json").read_text()
