@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 import vrw_jax as vrw
 from vrw_jax.app.commands import app
-from vrw_jax.app.explorer import make_page_address
 
 
 @pytest.fixture
@@ -111,20 +110,25 @@ def test_the_documentation_page_of_explore_runs_unchanged():
     assert int(known_by_name["cycle"].outcome) == vrw.Outcome.STEPPED
 
 
-def test_the_address_holds_the_wheel():
-    assert make_page_address(vrw.WheelParams()).endswith("wheel.html")
-    address = urlsplit(make_page_address(vrw.WheelParams(damping=150.0, n_legs=6)))
-    assert parse_qs(address.fragment) == {"damping": ["150.0"], "n_legs": ["6"]}
-    assert make_page_address(vrw.WheelParams(), "rigid").endswith("wheel.html#rung=rigid")
-
-
-def test_the_command_opens_the_page(monkeypatch):
+@pytest.mark.parametrize(
+    ("arguments", "values"),
+    [
+        ((), {}),
+        (("--set", "damping=150", "--set", "n_legs=6"), {"damping": ["150.0"], "n_legs": ["6"]}),
+        (("--model", "rigid"), {"rung": ["rigid"]}),
+    ],
+)
+def test_the_command_opens_the_page_at_an_address_that_holds_the_wheel(
+    arguments, values, monkeypatch
+):
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
-    result = CliRunner().invoke(app, ["explore", "--set", "damping=150"])
+    result = CliRunner().invoke(app, ["explore", *arguments])
     assert result.exit_code == 0
     assert opened == [result.output.strip()]
-    assert opened[0].endswith("wheel.html#damping=150.0")
+    address = urlsplit(opened[0])
+    assert address.path.endswith("wheel.html")
+    assert parse_qs(address.fragment) == values
 
 
 def test_import_of_the_library_does_not_import_the_widget():

@@ -13,16 +13,12 @@ from support.machine_code import disable_machine_code
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import evaluate_bifurcations
+from vrw_jax.continuation import floquet_multipliers
 from vrw_jax.gaits import unilateral_finder as on_ground
-from vrw_jax.gaits.floquet import (
-    compute_jury_margins,
-    floquet_multipliers,
-)
+from vrw_jax.gaits.floquet import compute_jury_margins
 from vrw_jax.models import contact_walks as ground_lanes
 from vrw_jax.models import embed_section_states, step_batch_with_jacobian
-from vrw_jax.models.ladder import ModelCode
 from vrw_jax.wheel import PARAMETER_NAMES
 
 START = (0.1, 1.6, -0.1)
@@ -128,9 +124,10 @@ def test_a_scan_gives_each_sample_its_simplest_valid_model():
     design = vrw.grid(damping=[150.0, 300.0], friction=[0.7, math.inf])
     measures = ("dls_fraction", "period", "slip")
     scan = vrw.scan(design, measures, model="auto")
-    assert scan.rung.values.tolist() == [
-        [ModelCode.UNILATERAL, ModelCode.VISCOELASTIC],
-        [ModelCode.UNILATERAL, ModelCode.UNILATERAL],
+    model_names = np.array(scan.rung.attrs["flag_meanings"].split())
+    assert model_names[scan.rung].tolist() == [
+        ["UnilateralWheel", "ViscoelasticWheel"],
+        ["UnilateralWheel", "UnilateralWheel"],
     ]
     paper = vrw.limit_cycle(vrw.WheelParams(damping=150.0))
     np.testing.assert_allclose(scan.period[0, 1], paper.period, atol=1e-9)
@@ -169,7 +166,7 @@ def test_a_unilateral_branch_consists_of_gaits_that_repeat(gait_near_slow_start)
     branch = vrw.continue_branch(
         SLOW_WHEEL, "friction", (0.65, 0.75), cycle=cycle, model=GROUND_MODEL,
         step_options=TIGHT_OPTIONS,
-        options=ArclengthOptions(initial_ds=0.1, max_ds=0.1),
+        options=vrw.ArclengthOptions(initial_ds=0.1, max_ds=0.1),
     )  # fmt: skip
     assert branch.outcome == vrw.Outcome.STEPPED
     assert branch.values.min() == pytest.approx(0.65)
@@ -199,7 +196,7 @@ def test_a_unilateral_branch_turns_at_its_fold_and_returns_unstable():
     cycle = vrw.limit_cycle(params, guess=state, model=high, options=TIGHT_OPTIONS)
     branch = vrw.continue_branch(
         params, "friction", (0.95, 1.0), cycle=cycle, model=high, step_options=TIGHT_OPTIONS,
-        options=ArclengthOptions(initial_ds=0.1, max_ds=0.2),
+        options=vrw.ArclengthOptions(initial_ds=0.1, max_ds=0.2),
     )  # fmt: skip
     assert float(branch.dataset.closure.max()) < 1e-8
     (fold,) = (border.value for border in branch.special_points if border.kind == "fold")

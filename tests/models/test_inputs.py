@@ -11,7 +11,6 @@ from support.batched import compute_full_steps, make_parameter_rows
 
 import vrw_jax as vrw
 from vrw_jax.models import embed_section_states
-from vrw_jax.models.stepping import convert_step_arguments
 
 
 @pytest.mark.parametrize(
@@ -70,9 +69,13 @@ def test_float32_is_refused_at_tolerances_it_cannot_resolve():
 
 
 def test_arguments_of_both_precisions_are_computed_in_double_precision():
-    params = vrw.WheelParams(damping=np.float32(150.0))
-    converted = convert_step_arguments(params, np.ones(3, np.float32), None, None)
-    assert {leaf.dtype for leaf in jax.tree.leaves(converted)} == {np.dtype(float)}
+    start = np.array([0.125, 1.5, -0.125])
+    mixed, double = (
+        vrw.step(vrw.WheelParams(damping=precision(150.0)), start.astype(precision))
+        for precision in (np.float32, np.float64)
+    )
+    assert int(double.outcome) == vrw.Outcome.STEPPED
+    jax.tree.map(functools.partial(np.testing.assert_array_equal, strict=True), mixed, double)
 
 
 def test_a_batch_with_a_slope_for_each_step_is_printed_with_its_domain():

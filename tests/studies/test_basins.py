@@ -23,7 +23,6 @@ from support.walkers import (
 )
 
 import vrw_jax as vrw
-from vrw_jax.studies.basins import compute_share_error
 
 TABLE_1 = vrw.WheelParams()
 GRAVITY, HALF_ANGLE, SLOPE = 9.81, np.pi / 8, 0.1
@@ -97,7 +96,7 @@ def test_the_share_of_the_papers_wheel_is_that_of_a_larger_count():
     walks = vrw.step_batch(TABLE_1, starts, n_steps)
     distance = np.abs(walks.section_state - vrw.limit_cycle(TABLE_1).section_state).max(1)
     counted = np.mean((walks.outcome == vrw.Outcome.STEPPED) & (distance < 1e-4))
-    error = np.hypot(result.share_error, compute_share_error(counted, n))
+    error = np.hypot(result.share_error, np.sqrt(counted * (1.0 - counted) / n))
     assert 0.4 < counted < 0.6
     assert abs(result.share - counted) < 3.0 * error
     for k in (1, 2, 5):
@@ -130,7 +129,10 @@ def test_errors_of_shares_are_standard_deviations_over_seeds():
     # The standard deviation of 24 draws has a standard error of 15 %.
     assert 0.6 < deviations["random"] / error < 1.5
     assert deviations["sobol"] < 0.8 * error
-    assert compute_share_error(1.0, 100) > 0.0
+    fast_starts = RATE_BOX | {"dtheta_touchdown": (2.0, 2.5)}
+    certain = vrw.basin_share(POINT_MASS, fast_starts, model=RIGID, n_starts=64)
+    assert certain.share == 1.0
+    assert certain.share_error > 0.0
 
 
 def test_starts_after_landing_and_starts_to_which_no_landing_leads():
@@ -419,7 +421,7 @@ def test_shares_with_unilateral_contact_are_plain_counts():
     gait = vrw.limit_cycle(params, model=model).section_state
     distance = np.abs(walks.section_state[:, :2] - np.asarray(gait)[:2]).max(1)
     counted = np.mean((walks.outcome == vrw.Outcome.STEPPED) & (distance < 1e-5))
-    error = np.hypot(result.share_error, compute_share_error(counted, 256))
+    error = np.hypot(result.share_error, np.sqrt(counted * (1.0 - counted) / 256))
     assert abs(result.share - counted) < 3.0 * error
     with pytest.raises(ValueError, match="UnilateralWheel cannot begin within a step"):
         vrw.smallest_disturbance(params, model=model)

@@ -28,26 +28,18 @@ from support.scanning import (
 )
 
 import vrw_jax as vrw
+from vrw_jax import Outcome, WheelParams
 from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits import finder
 from vrw_jax.lanes.keys import make_key
+from vrw_jax.models import MARGIN_MEASURES
+from vrw_jax.studies import ScanPlan, ScanProgress, plan_scan, scan_engines, scan_store
 from vrw_jax.studies import scan_dask as dask
 from vrw_jax.studies import scan_design as designs
-from vrw_jax.studies import scan_engines, scan_store
 from vrw_jax.studies import scan_planning as planning
-from vrw_jax.studies.measure_catalog import ALWAYS_INCLUDED_VARIABLES
-from vrw_jax.studies.scan_dask import connect_dask_workers
 from vrw_jax.studies.scan_engines import CollocationScanEngine
-from vrw_jax.studies.scan_execution import ScanProgress
-from vrw_jax.studies.scan_planning import (
-    ChunkResult,
-    ScanPlan,
-    describe_settings_difference,
-    plan_scan,
-)
-from vrw_jax.studies.scan_store import choose_chunk_shape, open_scan
-from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
+from vrw_jax.studies.scan_planning import describe_settings_difference
+from vrw_jax.wheel import PARAMETER_NAMES
 
 
 def list_files(store: Path) -> dict[str, bytes]:
@@ -205,11 +197,11 @@ def test_a_scan_killed_with_signal_9_ends_bitwise_the_same(tmp_path: Path) -> No
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stdout.readline() == b"ready\n"
-    while not store.exists() or not np.any(open_scan(store).outcome.values != -1):
+    while not store.exists() or not np.any(vrw.open_scan(store).outcome.values != -1):
         time.sleep(0.1)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    done = int(np.sum(open_scan(store).outcome.values != -1))
+    done = int(np.sum(vrw.open_scan(store).outcome.values != -1))
     assert 0 < done < SMALL_GRID.size
     rest = CountingEngine()
     run_plan(make_plan(1), store, evaluate=rest)
@@ -295,10 +287,19 @@ def test_every_sample_is_in_exactly_one_chunk() -> None:
         assert np.all(n_chunks_of_sample == 1)
 
 
-def test_chunks_are_slabs() -> None:
-    assert choose_chunk_shape((16, 8, 4, 8), 1024) == (4, 8, 4, 8)
-    assert choose_chunk_shape((10_000,), 4096) == (4096,)
-    assert choose_chunk_shape((3, 5), 4096) == (3, 5)
+@pytest.mark.parametrize(
+    ("shape", "chunk", "expected"),
+    [
+        ((16, 8, 4, 8), 1024, (4, 8, 4, 8)),
+        ((10_000,), 4096, (4096,)),
+        ((3, 5), 4096, (3, 5)),
+    ],
+)
+def test_chunks_are_slabs(shape, chunk, expected) -> None:
+    names = ("damping", "slope", "stiffness", "gravity")
+    axes = {name: np.linspace(1.0, 1.5, n) for name, n in zip(names, shape, strict=False)}
+    plan = plan_scan(vrw.grid(**axes), SCANNED_MEASURES, chunk=chunk)
+    assert plan.result_layout.chunk_shape == expected
 
 
 def test_values_match_their_coordinates() -> None:
@@ -311,15 +312,11 @@ def test_values_match_their_coordinates() -> None:
 
 def test_every_variable_is_described() -> None:
     scan_result = run_plan(make_plan(), evaluate=evaluate_arithmetically)
-    for name in (
-        *ALWAYS_INCLUDED_VARIABLES,
-        "dls_fraction",
-        "d dls_fraction / d damping",
-        "damping",
-        "slope",
-    ):
-        assert scan_result[name].attrs["units"]
-        assert scan_result[name].attrs["long_name"]
+    names = {"outcome", "spectral_radius", *MARGIN_MEASURES, *SCANNED_MEASURES, *SMALL_GRID.dims}
+    assert names <= set(scan_result.variables)
+    for variable in scan_result.variables.values():
+        assert variable.attrs["units"]
+        assert variable.attrs["long_name"]
     assert len(scan_result.outcome.attrs["flag_values"]) == len(Outcome)
     assert scan_result.outcome.attrs["flag_meanings"].split()[0] == "STEPPED"
     assert json.loads(scan_result.attrs["scan"])["wheel"]["stiffness"] == 500.0
@@ -608,6 +605,20 @@ def test_two_devices_give_bitwise_the_results_of_one(
         )
 
 
+def scan_on_cluster(
+    store: Path | None, address: str, chunk: int = 4, on_progress: Callable | None = None
+) -> xr.Dataset:
+    """Return the scan of `make_plan`, computed by the workers of a cluster."""
+    return vrw.scan(
+        SMALL_GRID,
+        SCANNED_MEASURES,
+        store=store,
+        chunk=chunk,
+        on_progress=on_progress,
+        dask=address,
+    )
+
+
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     engine: CollocationScanEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -624,7 +635,6 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster) as client,
-        connect_dask_workers(cluster.scheduler_address) as executor,
     ):
         places = client.run(os.getpid)
 
@@ -637,7 +647,7 @@ def test_a_cluster_that_loses_a_worker_gives_bitwise_the_serial_scan(
                     killed.append(places[victim])
                     os.kill(places[victim], signal.SIGKILL)
 
-        result = run_plan(make_plan(1), shared, on_progress=report, chunk_executor=executor)
+        result = scan_on_cluster(shared, cluster.scheduler_address, 1, report)
         assert len(killed) == 1
         assert killed[0] not in client.run(os.getpid).values()
     assert reports[-1].n_done == SMALL_GRID.size
@@ -654,7 +664,7 @@ def test_a_worker_uses_the_trace_keys_of_the_calling_process() -> None:
         assert make_key(getattr(own, name)) == make_key(getattr(of_worker, name))
 
 
-def compute_backwards(planned: ScanPlan, missing: Sequence[int]) -> Iterator[ChunkResult]:
+def compute_backwards(planned: ScanPlan, missing: Sequence[int]) -> Iterator[tuple[int, dict]]:
     for index in reversed(missing):
         yield (
             index,
@@ -688,11 +698,10 @@ def test_workers_with_another_environment_are_refused(
     monkeypatch.setattr(scan_dask, "make_worker_engine", lambda _: evaluate_arithmetically)
     with (
         LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
-        connect_dask_workers(cluster.scheduler_address) as executor,
         pytest.raises(ValueError, match="the library's code differs"),
     ):
-        run_plan(make_plan(), tmp_path / "s.zarr", chunk_executor=executor)
-    assert np.all(open_scan(tmp_path / "s.zarr").outcome.values == -1)
+        scan_on_cluster(tmp_path / "s.zarr", cluster.scheduler_address)
+    assert np.all(vrw.open_scan(tmp_path / "s.zarr").outcome.values == -1)
     assert jax.config.jax_compilation_cache_dir == cache  # type: ignore[attr-defined]
 
 
@@ -714,11 +723,8 @@ def test_an_address_without_a_scheduler_gets_one_sentence(
 ) -> None:
     monkeypatch.setattr(dask, "DASK_SCHEDULER_TIMEOUT", "1s")
     for address in ("nonsense://there", "tcp://127.0.0.1:9"):
-        with (
-            pytest.raises(ValueError, match="no dask scheduler answers"),
-            connect_dask_workers(address),
-        ):
-            pass
+        with pytest.raises(ValueError, match="no dask scheduler answers"):
+            scan_on_cluster(None, address)
 
 
 def test_a_cluster_without_workers_is_reported_and_continues_with_the_first_one(
@@ -736,10 +742,10 @@ def test_a_cluster_without_workers_is_reported_and_continues_with_the_first_one(
             messages.append(str(message))
             cluster.scale(1)
 
-        with connect_dask_workers(cluster.scheduler_address) as executor, warnings.catch_warnings():
+        with warnings.catch_warnings():
             warnings.simplefilter("always")
             monkeypatch.setattr("warnings.showwarning", show)
-            run_plan(make_plan(), tmp_path / "s.zarr", chunk_executor=executor)
+            scan_on_cluster(tmp_path / "s.zarr", cluster.scheduler_address)
     assert len([text for text in messages if "has no workers" in text]) == 1
     assert list_files(tmp_path / "s.zarr") == list_files(tmp_path / "alone.zarr")
 
@@ -758,14 +764,9 @@ def test_a_lost_cluster_gets_one_sentence_and_the_scan_continues_without_it(
             n_done_at_loss.append(progress.n_done)
             cluster.close()
 
-    with (
-        pytest.raises(ValueError, match=r"the dask cluster at .* is gone: start it again"),
-        connect_dask_workers(cluster.scheduler_address) as executor,
-    ):
-        run_plan(
-            make_plan(1), tmp_path / "s.zarr", on_progress=close_cluster, chunk_executor=executor
-        )
-    n_kept = np.count_nonzero(open_scan(tmp_path / "s.zarr").outcome.values != -1)
+    with pytest.raises(ValueError, match=r"the dask cluster at .* is gone: start it again"):
+        scan_on_cluster(tmp_path / "s.zarr", cluster.scheduler_address, 1, close_cluster)
+    n_kept = np.count_nonzero(vrw.open_scan(tmp_path / "s.zarr").outcome.values != -1)
     assert n_done_at_loss[0] <= n_kept < SMALL_GRID.size
     run_plan(make_plan(1), tmp_path / "whole.zarr", evaluate=evaluate_arithmetically)
     run_plan(make_plan(1), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)

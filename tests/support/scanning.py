@@ -5,18 +5,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 import xarray as xr
 
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.models.measures import MARGIN_MEASURES
+from vrw_jax import Outcome
+from vrw_jax.models import MARGIN_MEASURES
+from vrw_jax.studies import ScanPlan, plan_scan
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies import scan_execution as running
-from vrw_jax.studies.scan_design import ParameterSamples
-from vrw_jax.studies.scan_planning import ChunkResult, ScanPlan, plan_scan
 
 SCANNED_MEASURES = ("dls_fraction", "speed", "d dls_fraction / d damping")
 SMALL_GRID = designs.grid(damping=np.linspace(100.0, 200.0, 5), slope=np.linspace(0.28, 0.31, 4))
 
 
-def evaluate_arithmetically(columns: ParameterSamples) -> Mapping[str, np.ndarray]:
+def evaluate_arithmetically(columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
     """Return every variable as a function of the sample, in place of the engine."""
     total = np.sum([np.sin(column) for column in columns.values()], axis=0)
     results = {name: total * (i + 1) for i, name in enumerate(MARGIN_MEASURES)}
@@ -36,7 +35,7 @@ class CountingEngine:
     ) -> None:
         self.n_calls, self.failing_call, self.error = 0, failing_call, error
 
-    def __call__(self, columns: ParameterSamples) -> Mapping[str, np.ndarray]:
+    def __call__(self, columns: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         self.n_calls += 1
         if self.n_calls == self.failing_call:
             raise self.error
@@ -51,7 +50,9 @@ def run_plan(
 ) -> xr.Dataset:
     """Return a scan whose samples `evaluate` computes in order, in place of the engine."""
 
-    def compute_in_order(running_plan: ScanPlan, missing: Sequence[int]) -> Iterator[ChunkResult]:
+    def compute_in_order(
+        running_plan: ScanPlan, missing: Sequence[int]
+    ) -> Iterator[tuple[int, dict]]:
         for index in missing:
             yield (
                 index,
