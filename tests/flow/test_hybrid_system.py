@@ -223,6 +223,24 @@ def test_a_guard_that_is_zero_with_armed_ends_the_mode_only_if_it_falls(
     assert step.duration == pytest.approx(0.0 if ends_at_start else 2.0, abs=1e-12)
 
 
+def test_a_start_that_is_not_finite_is_a_bad_input():
+    outcome = SPRING_BIPED.step(SPRING_PARAMS, [np.nan, *SPRING_START[1:]]).outcome
+    assert outcome == vrw.Outcome.BAD_INPUT
+
+
+def test_a_guard_that_ends_the_walk_adds_no_phase():
+    guards = {
+        "fall": Guard(lambda y, p: p["level"] - y[0], ends_walk=True),
+        "late": Guard(lambda y, p: 2.0 - y[0]),
+    }
+    system = vrw.HybridSystem(
+        modes={"run": Mode(lambda y, p: 1.0 + 0.0 * y, guards)}, section="late", state=("time",)
+    )
+    walk = vrw.simulate({"level": 1.5}, [0.0], 1, model=system, n_samples=5)
+    np.testing.assert_allclose(walk.time, np.linspace(0.0, 1.5, 5), atol=1e-12)
+    np.testing.assert_allclose(walk.state_time, walk.time, atol=1e-12)
+
+
 def test_there_is_no_gait_if_a_declared_invariant_changes():
     """x[1] grows by `drift` in each step, so that no state repeats unless the drift is zero."""
 

@@ -53,6 +53,11 @@ def test_the_margin_is_differentiable_at_equal_eigenvalues():
     defective = jnp.array([[0.5, 1.0], [0.0, 0.5]])
     assert bool(floquet.has_double_multiplier(defective))
     assert not bool(floquet.has_double_multiplier(jnp.diag(jnp.array([0.5, 0.4]))))
+    # Only the two largest moduli count, in any basis.
+    bases = np.random.default_rng(0).normal(size=(50, 3, 3))
+    for values, is_double in (((0.9, 0.1, 0.1), False), ((0.1, 0.9, -0.9), True)):
+        matrices = bases @ np.diag(values) @ np.linalg.inv(bases)
+        assert (floquet.has_double_multiplier(matrices, 1e-5) == is_double).all()
     gradient = jax.grad(floquet.compute_stability_margin)(defective)
     step = 1e-6
     direction = jnp.array([[0.3, -0.2], [0.7, 0.4]])

@@ -104,6 +104,31 @@ def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
     assert tuned.value == pytest.approx(3.0, rel=1e-9)
 
 
+def test_starts_may_be_lists_and_belong_to_each_element_of_a_batch():
+    class Logistic(vrw.AbstractWalker):
+        def advance(self, params, x, options):
+            return vrw.AdvanceResult(params["r"] * x * (1.0 - x), jnp.ones(1))
+
+        def starts(self, params):
+            return [[0.6], [0.3]]
+
+    r = np.array([2.5, 2.6])
+    gaits = vrw.limit_cycles({"r": r}, model=Logistic())
+    np.testing.assert_allclose(gaits.section_state[:, 0], 1.0 - 1.0 / r, rtol=1e-12)
+
+
+def test_a_measure_has_a_name_of_its_own():
+    @vrw.measure("velocity", unit="m/s", meaning="Another velocity.")
+    def velocity(step, params):
+        return step.duration
+
+    for measures in ((velocity, velocity), (velocity,)):  # of two measures, and of a coordinate
+        with pytest.raises(ValueError, match="2 measures or coordinates have the name 'velocity'"):
+            vrw.sensitivities(
+                BALL_PARAMS, model=dataclasses.replace(BALL_SYSTEM, measures=measures)
+            )
+
+
 def test_the_name_of_a_parameter_may_contain_a_space():
     class Decay(vrw.AbstractWalker):
         """x -> x / 2 + s has the fixed point 2 s."""

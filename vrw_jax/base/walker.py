@@ -4,7 +4,8 @@ import abc
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, TypeGuard
 
 import equinox as eqx
@@ -253,6 +254,28 @@ def name_missing_parameters(params: Any) -> Iterator[None]:
             f"a function of the walker reads {missing}, but params is a {kind}, which contains "
             f"{', '.join(names)}: add it to params, or correct the function."
         ) from error
+
+
+def check_measure_names(walker: AbstractWalker, coordinates: Iterable[str]) -> None:
+    """Raise an error if a measure has the name of another one or of a coordinate."""
+    names = Counter((*coordinates, *(measure.name for measure in walker.measures)))
+    (name, count), *_ = names.most_common(1) or [("", 0)]
+    if count > 1:
+        raise ValueError(
+            f"{count} measures or coordinates have the name {name!r}, but each has its own: rename "
+            "the measure, as @vrw.measure(name)."
+        )
+
+
+def propose_starts(walker: AbstractWalker, params: Any) -> Array:
+    """Return the starts of a walker with these parameters, shape (starts, n)."""
+    if walker.starts is None:
+        raise ValueError(
+            "this walker has no starts, from which a search or a walk begins: give section "
+            "coordinates, or starts= in the definition of the walker."
+        )
+    with name_missing_parameters(params):
+        return jnp.atleast_2d(check_reals("starts", walker.starts(params)))
 
 
 def _is_node(tree: Any, structure: Any) -> bool:

@@ -42,6 +42,7 @@ from vrw_jax.base.walker import (
     AbstractWalker,
     AdvanceResult,
     check_arguments,
+    check_measure_names,
     compile_step,
     find_batch_axes,
     make_return_map,
@@ -252,6 +253,7 @@ class HybridSystem(AbstractWalker):
         for measure in self.measures:
             check_type("a measure", measure, Measure, "decorate its function with vrw.measure")
             self.find_modes(measure)
+        check_measure_names(self, ())
         if any(
             guard.ends_walk
             for mode in self.modes.values()
@@ -265,7 +267,8 @@ class HybridSystem(AbstractWalker):
         if len(self._start_modes) > 1:
             raise ValueError(
                 f"{self.section!r} leads to the modes {sorted(self._start_modes)}, but each step "
-                "begins in one mode: give the other guards another name."
+                "begins in one mode: give the other guards another name, or let the section lead "
+                "to a mode whose guards, with `armed`, lead on to these modes at once."
             )
 
     def evaluate_invariants(self, params: Any, x: Array) -> Array:
@@ -385,7 +388,7 @@ class HybridSystem(AbstractWalker):
         """Return one step of one element; `compile_step` compiles this function."""
         mode_index = jnp.asarray(self._find_mode(None), jnp.int32)
         step = self.finish_step(params, self.embed(x, params), mode_index, options)
-        return dataclasses.replace(step, termination=_check_domains(params, step.termination))
+        return dataclasses.replace(step, termination=_check_input(params, x, step.termination))
 
     def finish_step(
         self, params: Any, start: StateArray, mode_index: Array, options: StepOptions
@@ -706,12 +709,14 @@ def compile_simulation(
         solution = simulate_modes(
             modes, options, start, jnp.asarray(first_mode, jnp.int32), ends_at_event
         )
-        return solution._replace(termination=_check_domains(params, solution.termination))
+        return solution._replace(termination=_check_input(params, start, solution.termination))
 
     return lanes.jit(simulate)
 
 
-def _check_domains(params: Any, termination: Array) -> Array:
-    """Return the reason why a simulation ended, or BAD_INPUT for parameters out of domain."""
-    bad_input = jnp.asarray(Termination.BAD_INPUT, termination.dtype)
-    return jnp.where(is_tree_in_domain(params), termination, bad_input)
+def _check_input(params: Any, start: Array, termination: Array) -> Array:
+    """Return the reason why a simulation ended, or BAD_INPUT for parameters out of domain or a
+    start that is not finite.
+    """
+    is_valid = is_tree_in_domain(params) & jnp.all(jnp.isfinite(start))
+    return jnp.where(is_valid, termination, jnp.asarray(Termination.BAD_INPUT, termination.dtype))

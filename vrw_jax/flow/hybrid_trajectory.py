@@ -43,7 +43,7 @@ def sample_walk_of_system(
         outcome = Outcome(OUTCOME_BY_TERMINATION[motion.termination])
         ending = describe_step_ending(Termination(int(motion.termination)))
         end_times, modes = motion.times[:n_events], motion.modes[:n_events]
-        if outcome != Outcome.STEPPED:
+        if outcome != Outcome.STEPPED and not (n_events and end_times[-1] == motion.time):
             end_times, modes = np.append(end_times, motion.time), np.append(modes, motion.mode)
         starts = [start, *motion.states_after[: len(modes) - 1]]
         for begin, end, state, mode in zip(
@@ -61,16 +61,21 @@ def sample_walk_of_system(
     units = system.state_units
     columns = dict(zip(system.state, np.concatenate(states).T, strict=True))
     flags = {"flag_values": list(range(len(mode_names))), "flag_meanings": " ".join(mode_names)}
+    coordinates = {
+        "time": ("time", np.concatenate(times), {"units": "s"}),
+        "step": ("time", repeat(steps)),
+        "phase": ("time", repeat(modes), {"long_name": "mode", **flags}),
+    }
     return xr.Dataset(
         {
-            name: ("time", column, {"units": units[name]} if name in units else {})
+            f"state_{name}" if name in coordinates else name: (
+                "time",
+                column,
+                {"units": units[name]} if name in units else {},
+            )
             for name, column in columns.items()
         },
-        {
-            "time": ("time", np.concatenate(times), {"units": "s"}),
-            "step": ("time", repeat(steps)),
-            "phase": ("time", repeat(modes), {"long_name": "mode", **flags}),
-        },
+        coordinates,
         {
             "title": "Walk of a HybridSystem",
             "section": system.section,

@@ -286,12 +286,11 @@ def has_double_multiplier(
     has_equal_real_moduli = (
         eigenvalue_moduli[..., -1] - eigenvalue_moduli[..., -2] <= modulus_tolerance
     )
-    has_equal_moduli = jnp.where(
-        is_complex_pair, imaginary_eigenvalue_offset <= modulus_tolerance, has_equal_real_moduli
-    )
+    has_equal_moduli = imaginary_eigenvalue_offset <= modulus_tolerance
     for x in isolated_eigenvalues:
-        has_equal_moduli = has_equal_moduli | (
-            is_complex_pair
-            & (jnp.abs(jnp.abs(x) - remaining_pair.pair_modulus) <= modulus_tolerance)
+        distance = jnp.abs(x) - remaining_pair.pair_modulus
+        # A larger real multiplier is the only one of its modulus.
+        has_equal_moduli = (jnp.abs(distance) <= modulus_tolerance) | (
+            has_equal_moduli & (distance < 0.0)
         )
-    return has_equal_moduli
+    return jnp.where(is_complex_pair, has_equal_moduli, has_equal_real_moduli)

@@ -35,13 +35,14 @@ from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import (
     AbstractWalker,
     check_arguments,
+    check_measure_names,
     check_one_walker,
     check_parameters,
     compile_step,
     find_batch_length,
     make_return_map,
     name_coordinates,
-    name_missing_parameters,
+    propose_starts,
 )
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import (
@@ -335,19 +336,11 @@ def _check_search(
             if is_batch:
                 rule = "a batch has one axis: give numbers or lists of numbers."
             raise ValueError(f"a parameter has shape {leaf.shape}, but {rule}")
-    if guess is None and walker.starts is None:
-        raise ValueError(
-            "guess is None, but the search for a gait of this walker starts there: give section "
-            "coordinates near the gait, or starts= in the definition of the walker."
-        )
     if guess is None:
         has_batch = any(leaf.ndim for leaf in jax.tree.leaves(params))
         axes = jax.tree.map(lambda leaf: 0 if leaf.ndim else None, params)
-        propose = jax.vmap(walker.starts, (axes,)) if has_batch else walker.starts
-        with name_missing_parameters(params):
-            guesses = check_reals("starts", propose(params))
-        if guesses.ndim - has_batch == 1:
-            guesses = guesses[..., None, :]
+        propose = functools.partial(propose_starts, walker)
+        guesses = jax.vmap(propose, (axes,))(params) if has_batch else propose(params)
     else:
         guesses = check_reals("guess", guess)[..., None, :]
     one_guess = guesses[(0,) * (guesses.ndim - 1)]
@@ -556,14 +549,14 @@ class WalkerFinder(AbstractGaitFinder):
         )
 
     def find_cycle(self, params: Any, cycle_guess: Any = None) -> HybridGait:  # type: ignore[override]
-        guesses = self.model.walker.starts(params) if cycle_guess is None else cycle_guess  # type: ignore[misc]
+        guesses = propose_starts(self.model.walker, params) if cycle_guess is None else cycle_guess
         return find_gait_from_guesses(
             (self.model.walker, self.period_n), params, jnp.atleast_2d(guesses), self.step_options
         )
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
         _, params = self.model.from_parameter_values(parameter_values, 0)
-        return jnp.atleast_2d(self.model.walker.starts(params))  # type: ignore[misc]
+        return propose_starts(self.model.walker, params)
 
     def find_gait_by_walk(self, params: Any) -> Array | None:
         """Return the section state of a gait to which a walk leads, shape (1, n).
@@ -612,14 +605,9 @@ def make_walker_finder(
     """
     params, guess = check_one_walker(params), convert_gait_guess(guess)
     named_domains = [(x.name, x.domain) for x in list_tree_parameters(params)]
-    if walker.starts is None and guess is None:
-        raise ValueError(
-            "this walker has no starts, but the search for its gaits begins there: give a function "
-            "starts= of its parameters in its definition, which returns section coordinates."
-        )
-    with name_missing_parameters(params):
-        start = walker.starts(params) if guess is None else guess
+    start = propose_starts(walker, params) if guess is None else guess
     coordinates = name_coordinates(walker, jnp.shape(start)[-1])
+    check_measure_names(walker, coordinates)
     described_measures = {
         "period": Measure("period", "s", "T", "period", "Duration of all steps of the gait."),
         **{

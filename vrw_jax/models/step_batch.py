@@ -226,6 +226,11 @@ def _step_batch_of_own_walker(
     walker: Any, params: Any, states: Any, n_steps: int, options: StepOptions
 ) -> StepBatchResult:
     params, states = jax.tree.map(np.asarray, (check_parameters(params), check_reals("x", states)))
+    if states.ndim == 0:
+        raise ValueError(
+            "states is one number, but a start has section coordinates: give a row of them, or one "
+            "row for each element of the batch."
+        )
     n_elements = find_batch_length(params, states, "states")
     for leaf in jax.tree.leaves(params):
         if leaf.ndim > 1 and leaf.shape[1:] != (n_steps,):

@@ -22,7 +22,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.walker import check_parameters, is_own_walker, name_missing_parameters
+from vrw_jax.base.walker import check_parameters, is_own_walker, propose_starts
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.flow.hybrid_trajectory import sample_walk_of_system
 from vrw_jax.models.contact_mechanics import (
@@ -82,7 +82,8 @@ def simulate(
     Numerical errors are those of `vrw.step`.
 
     For a `HybridSystem`, `params` are its parameters. One that is an array has a value for each
-    step. The variables are the coordinates of its state, and `phase` is the number of the mode.
+    step. The variables are the coordinates of its state, one that is called "time" as "state_time",
+    and `phase` is the number of the mode.
 
     Args:
         params: the wheel.
@@ -201,13 +202,8 @@ def _simulate_own_walker(
     check_type(
         "model", walker, HybridSystem, "only its motion within a step is known; take vrw.walk"
     )
-    if x is None and walker.starts is None:
-        raise ValueError(
-            "x is None, but this walker has no starts: give section coordinates at the start."
-        )
     first_params = jax.tree.map(lambda leaf: jnp.ravel(leaf)[0], check_parameters(params))
-    with name_missing_parameters(params):
-        x = jnp.atleast_2d(walker.starts(first_params))[0] if x is None else x
+    x = propose_starts(walker, first_params)[0] if x is None else x
     params, x, _, options, stepwise = convert_own_walk_arguments(
         params, x, n_steps, walker, options, "auto", heights
     )

@@ -358,9 +358,12 @@ class StableGait(NamedTuple):
         if is_own and model.invariants:  # Each has a multiplier of 1, which round-off may reduce.
             spectral_radius = max(spectral_radius, 1.0)
         if not spectral_radius < 1.0:
+            remedy = "take parameters whose gait has a spectral radius below 1."
+            if is_own and model.invariants:
+                remedy = "a walker that conserves a quantity has no stable gaits, so take another."
             raise ValueError(
                 f"the gait has spectral radius {spectral_radius:.6g}, so that it is not stable: "
-                "take parameters whose gait has a spectral radius below 1."
+                f"{remedy}"
             )
         period_n = int(cycle.period_n)
         return cls.from_section_state(

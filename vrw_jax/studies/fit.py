@@ -28,7 +28,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.parameters import list_parameters, parameter
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.walker import is_own_walker
+from vrw_jax.base.walker import is_own_walker, propose_starts
 from vrw_jax.gaits.finder_selection import resolve_finder
 from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_model
 from vrw_jax.studies import fit_data, fit_problem
@@ -233,11 +233,6 @@ def _resolve_walker(
     """
     if is_own_walker(model):
         guess = None if start is None or isinstance(start, str) else np.atleast_2d(start)[0]
-        if guess is None and model.starts is None:
-            raise ValueError(
-                "start is None, but this walker has no starts from which a search begins: give "
-                "section coordinates, or one row of them for each walk."
-            )
         finder: Any = resolve_finder(params, model, options, guess=guess)
         own_units = [(measure.name, measure.unit) for measure in finder.described_measures]
         own_units += [(name, x.unit) for name, x in finder.model.named_domains]
@@ -356,7 +351,7 @@ def _find_first_states(
         gait: Any = limit_cycle(params, model=walker, options=finder.step_options)
         states = np.asarray(gait.section_state)[None]
         if not bool(gait.found):
-            states = np.atleast_2d(walker.starts(params))[:1]
+            states = np.asarray(propose_starts(walker, params))[:1]
     return np.broadcast_to(states, (n_walks, states.shape[1])).astype(float)
 
 
