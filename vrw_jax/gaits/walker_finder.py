@@ -122,7 +122,10 @@ class HybridGait(NamedTuple):
 
     @property
     def multipliers(self) -> Complex[Array, "... n"]:
-        """Return the Floquet multipliers in the order of decreasing modulus, shape (n,)."""
+        """Return the Floquet multipliers in the order of decreasing modulus, shape (n,).
+
+        Their derivatives are NaN; those from `vrw.solve_fixed_point` of the return map are not.
+        """
         return self.fixed_point.multipliers
 
     @property
