@@ -126,7 +126,8 @@ class UnilateralFinder(AbstractReturnMapFinder):
         period_map.evaluate_period(self.step_options, section_states, False)
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
-        return _remove_batch_axis(self.make_initial_guesses(_add_batch_axis(parameter_values)))
+        guesses = self.make_initial_guesses(select_rows_on_device(parameter_values, None))
+        return select_rows_on_device(guesses, 0)
 
     def make_initial_guesses(self, parameter_values: Array) -> Array:
         """Return the section state of a slow attracting gait for each wheel, or NaN if
@@ -137,9 +138,8 @@ class UnilateralFinder(AbstractReturnMapFinder):
         return jax.device_put(np.where(is_gait_found[:, None], slow_gaits.section_state, np.nan))
 
     def find_gait(self, parameter_values: ParameterValues, cycle_guess: Array) -> Gait:
-        return _remove_batch_axis(
-            self.find_gaits(_add_batch_axis(parameter_values), _add_batch_axis(cycle_guess))
-        )
+        batch = select_rows_on_device((parameter_values, cycle_guess), None)
+        return select_rows_on_device(self.find_gaits(*batch), 0)
 
     def find_gaits(self, parameter_values: Array, cycle_guess: Any) -> Gait:
         return self._solve_and_evaluate(
@@ -186,7 +186,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
             self.n_legs,
             (),
         )
-        return _remove_batch_axis(steps)
+        return select_rows_on_device(steps, 0)
 
     def refine_cycle_guess(self, parameter_values: ParameterValues, cycle_guess: Any) -> Array:
         model, params = self.model.from_parameter_values(
@@ -194,19 +194,6 @@ class UnilateralFinder(AbstractReturnMapFinder):
         )
         section_state = getattr(cycle_guess, "section_state", cycle_guess)
         return convert_step_arguments(params, section_state, model, self.step_options)[1]
-
-
-def _add_batch_axis(x: Array) -> Array:
-    """Return the array with a batch axis of length one.
-
-    NumPy adds the axis, because JAX would compile a program for each shape.
-    """
-    return jax.device_put(np.asarray(x)[None])
-
-
-def _remove_batch_axis(batched_tree: Any) -> Any:
-    """Return the first element of every array, which inverts `_add_batch_axis`."""
-    return select_rows_on_device(batched_tree, 0)
 
 
 class PeriodMap(NamedTuple):
