@@ -1,7 +1,6 @@
 """Walkers and other systems of a user: steps, batches, derivatives and gaits with known answers."""
 
-import dataclasses
-
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -312,7 +311,8 @@ def test_a_step_that_never_reaches_the_section_has_a_code_and_finite_numbers():
         Termination.MAX_TIME_REACHED,
     ]
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(rising))
-    endless = dataclasses.replace(rising, termination=np.full(2, Termination.MAX_EVENTS_REACHED))
+    codes = np.full(2, Termination.MAX_EVENTS_REACHED)
+    endless = eqx.tree_at(lambda step: step.termination, rising, codes)
     assert all("max_events events: raise it" in ending for ending in endless.ending)
 
 
