@@ -448,6 +448,30 @@ def test_a_scan_has_the_closed_form_and_its_derivatives_and_knows_the_code(tmp_p
         scan(OtherBall())
 
 
+class Racket(eqx.Module):
+    kick: float
+    gain: float = eqx.field(static=True, default=1.0)
+
+
+class GainedBall(vrw.AbstractWalker):
+    coordinates = {"velocity": "m/s"}  # noqa: RUF012
+    starts = JuggledBall.starts
+
+    def advance(self, params, x, options):
+        return vrw.AdvanceResult(0.5 * x + params.gain * params.kick, jnp.ones(1))
+
+
+def test_a_stored_scan_knows_the_static_fields_of_the_parameters(tmp_path):
+    scan = lambda gain: vrw.scan(
+        vrw.grid(kick=[0.5, 1.0]), ["velocity"], base=Racket(1.0, gain), model=GainedBall(),
+        store=tmp_path / "scan",
+    )  # fmt: skip
+    np.testing.assert_allclose(scan(1.0).velocity, [1.0, 2.0], rtol=1e-10)
+    xr.testing.assert_identical(scan(1.0), scan(1.0))
+    with pytest.raises(ValueError, match="the walker's parameters or one of their static fields"):
+        scan(1.5)
+
+
 def test_a_sample_of_a_scan_does_not_depend_on_others():
     kicks = np.linspace(0.5, 1.0, 70)
     scan = lambda kicks: (

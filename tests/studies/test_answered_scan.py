@@ -17,7 +17,8 @@ def test_a_scan_to_a_tolerance_has_value_error_and_model(tmp_path: Path) -> None
     scan_result = vrw.scan(
         TOLERANCE_DESIGN, ["speed", "period"], **given, store=tmp_path / "a", chunk=1
     )
-    scan_with_tolerance = vrw.scan(TOLERANCE_DESIGN, ["speed", "period"], **given)
+    names = ["speed", "period", "rung", "outcome"]  # The last two are exact.
+    scan_with_tolerance = vrw.scan(TOLERANCE_DESIGN, names, **given)
     for name in ("speed", "speed_error", "period_error", "rung", "outcome"):
         assert np.array_equal(
             scan_result[name].values, scan_with_tolerance[name].values, equal_nan=True
@@ -53,6 +54,9 @@ def test_a_tolerance_requires_the_unilateral_model() -> None:
         vrw.scan(TOLERANCE_DESIGN, ["speed"], model=vrw.UnilateralWheel(restitution=0.1), tol=1e-2)
     with pytest.raises(ValueError, match="scan without tol"):
         vrw.scan(TOLERANCE_DESIGN, ["d speed / d damping"], model=REFERENCE_MODEL, tol=1e-2)
+    options = vrw.StepOptions(max_phase_time=0.01)
+    with pytest.raises(ValueError, match="tol and options are both given, but a tolerance"):
+        vrw.scan(TOLERANCE_DESIGN, ["speed"], model=REFERENCE_MODEL, tol=1e-2, options=options)
     with pytest.raises(ValueError, match="tol is 0, but it must be positive"):
         vrw.scan(TOLERANCE_DESIGN, ["speed"], model=REFERENCE_MODEL, tol=0.0)
 

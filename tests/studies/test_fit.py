@@ -416,6 +416,14 @@ BAD_DATA = {
     "lengths": ({"period": [0.3, 0.3], "speed": [1.0] * 3}, "lengths"),
     "text": ({"period": ["fast"], "period_error": [0.1]}, "numbers"),
     "nothing": ({}, "columns"),
+    "errors of data sets": (
+        {"period": [[0.3], [0.31]], "period_error": [[0.1], [0.2]]},
+        r"period_error has shape \(2, 1\), but all data sets of a batch share",
+    ),
+    "slopes of data sets": (
+        {"period": [[0.3], [0.31]], "period_error": [0.1], "slope": [[0.3], [0.2]]},
+        "slope has shape",
+    ),
     "no table": (3, "table"),
 }
 
@@ -449,7 +457,58 @@ def test_bad_data_get_one_sentence(name):
     assert str(error.value).count(". ") == 0
 
 
+BAD_STEPS = {
+    "a step without ground": ({"step": [0, 1, 3], "height": [0.1, 0.0, 0.2]}, "height of step 2"),
+    "no first step": (
+        {"step": [1, 2, 2], "walk": [4, 4, 7], "height": [0.1, 0.0, 0.2]},
+        "height of step 1 of walk 7 is missing",
+    ),
+    "two grounds": ({"step": [0, 1, 1], "height": [0.1, 0.0, 0.2]}, "differs between the rows"),
+    "parts of steps": ({"step": [0.7, 1.7, 2.7]}, "step is 0.7, but"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_STEPS)
+def test_steps_and_ground_that_are_missing_get_one_sentence(name):
+    data, message = BAD_STEPS[name]
+    data = data | {"period": [0.7] * 3, "period_error": [0.01]}
+    with pytest.raises(ValueError, match=message) as error:
+        vrw.fit(data, WHEEL, ["damping"], start=START)
+    assert str(error.value).count(". ") == 0
+
+
+def test_ground_goes_on_behind_the_last_step_of_a_walk_in_any_order_of_rows():
+    """The reference is the walk in closed form, whose second walk ends on the second stair."""
+    heights, speeds = np.array([0.1, 0.05, 0.2]), [4.0]
+    for rise in np.diff(heights, prepend=0.0):
+        speeds.append(0.8 * np.sqrt(speeds[-1] ** 2 - 2.0 * GRAVITY * rise))
+    rows = np.array([[0, 1, 2, 0, 1], [0, 0, 0, 1, 1]])[:, [4, 2, 0, 3, 1]]
+    durations = (np.array(speeds[:-1]) + np.array(speeds[1:]) / 0.8) / GRAVITY
+    data = {"step": rows[0], "walk": rows[1], "height": heights[rows[0]]}
+    data |= {"period": durations[rows[0]], "period_error": [0.01]}
+    params = {"restitution": 0.7, "rise": 0.0}
+    result = vrw.fit(data, params, ["restitution"], model=BallOnStairs(), start=[4.0], n_starts=1)
+    assert result["restitution"] == pytest.approx(0.8, abs=1e-5)
+
+
+@pytest.mark.parametrize("text", ["", "period,period_error\n", "period,period_error\n0.7\n"])
+def test_an_incomplete_csv_file_gets_one_sentence(tmp_path, text):
+    path = tmp_path / "gaits.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"gaits.csv has \d lines, with .*: complete its lines"):
+        vrw.fit(path, SMALL_WHEEL)
+
+
+def test_a_csv_file_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "gaits.csv"
+    path.write_text("period [m]\n0.7\n", encoding="utf-8-sig")
+    with pytest.raises(ValueError, match=r"^period has the unit 'm'"):
+        vrw.fit(path, SMALL_WHEEL)
+
+
 def test_names_of_unknowns_are_checked():
+    with pytest.raises(ValueError, match="'dampin' is no parameter"):
+        vrw.compare_laws(SMALL_GAIT, SMALL_WHEEL, "dampin")
     for keywords, message in (
         ({"free": ["dampin"]}, "did you mean 'damping'"),
         ({"free": []}, "unknowns"),

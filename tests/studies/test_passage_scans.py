@@ -43,6 +43,16 @@ def test_an_interrupted_scan_of_lives_continues_with_the_same_numbers(tmp_path: 
         vrw.scan(design, MEASURES, store=store, chunk=1, slope_sd=0.02)
 
 
+def test_walks_have_the_options_of_the_scan() -> None:
+    """Some steps take longer than the largest duration, which ends the walk."""
+    params, options = vrw.WheelParams(damping=150.0), vrw.StepOptions(max_phase_time=0.45)
+    data = vrw.scan(
+        vrw.grid(slope=[0.3]), ["mean_steps"], base=params, slope_sd=SLOPE_SD, options=options
+    )
+    passage = vrw.first_passage(params, SLOPE_SD, options=options)
+    assert float(data.mean_steps[0]) == float(passage.mean_steps)
+
+
 @pytest.mark.parametrize(
     ("choices", "sentence"),
     [

@@ -177,7 +177,7 @@ def fit(
         jnp.asarray,
         {
             "base_values": tuple(base_values),
-            "conditions": _arrange_conditions(table, model, row_walks, row_steps, n_steps),
+            "conditions": _arrange_conditions(table, model, walks, row_walks, row_steps, n_steps),
             "row_walks": row_walks,
             "row_steps": row_steps,
             "times": table.labels.get("time"),
@@ -260,6 +260,10 @@ def _arrange_steps(
     row_steps, times = table.labels.get("step"), table.labels.get("time")
     n_steps = 1
     if row_steps is not None:
+        if (parts := row_steps[row_steps % 1.0 != 0.0]).size:
+            raise ValueError(
+                f"step is {parts[0]:g}, but the steps of a walk are numbered: give whole numbers."
+            )
         row_steps = row_steps.astype(int) - int(row_steps.min())
         n_steps = int(row_steps.max()) + 1
     if times is None:
@@ -451,14 +455,18 @@ def _describe_unknowns(
 def _arrange_conditions(
     table: fit_data.FitData,
     model: Any,
+    walks: np.ndarray,
     row_walks: np.ndarray,
     row_steps: np.ndarray | None,
     n_steps: int,
 ) -> dict[str, Any]:
-    """Return the conditions of each row of gaits, or of each walk and its steps."""
+    """Return the conditions of each row of gaits, or of each walk and its steps.
+
+    - `walks`: label of each walk.
+    """
     if table.kind == "gaits":
         return dict(table.conditions)
-    n_walks = row_walks.max() + 1
+    n_walks = len(walks)
     arranged = {}
     for name, column in table.conditions.items():
         by_walk = [column[row_walks == walk] for walk in range(n_walks)]
@@ -470,9 +478,25 @@ def _arrange_conditions(
                 f"{name} varies within a walk, but only the ground may, from step to step: give "
                 "one value for each walk, or number the steps in a column 'step'."
             )
-        # The ground goes on with the last value where a walk has fewer steps.
-        values = np.tile([[x[-1]] for x in by_walk], (1, n_steps))
+        values = np.full((n_walks, n_steps), np.nan)
         values[row_walks, row_steps] = column
+        if not (is_same := values[row_walks, row_steps] == column).all():
+            row = is_same.argmin()
+            raise ValueError(
+                f"{name} differs between the rows of step {table.labels['step'][row]:g} of walk "
+                f"{walks[row_walks[row]]:g}, but a step has one ground: give these rows one value."
+            )
+        last_steps = [row_steps[row_walks == walk].max() for walk in range(n_walks)]
+        for walk, last_step in enumerate(last_steps):
+            missing = np.flatnonzero(np.isnan(values[walk, :last_step]))
+            if missing.size:
+                raise ValueError(
+                    f"{name} of step {missing[0] + table.labels['step'].min():g} of walk "
+                    f"{walks[walk]:g} is missing, but later steps depend on this ground: give a "
+                    "row for each step, with large errors where nothing was measured."
+                )
+            # The ground goes on with the last value where a walk has fewer steps.
+            values[walk, last_step:] = values[walk, last_step]
         if name == fit_data.HEIGHT_COLUMN:
             values = np.concatenate([np.zeros((n_walks, 1)), values], 1)
         arranged[name] = values
@@ -588,6 +612,7 @@ def compare_laws(
         >>> table.attrs["best"]
         'linear'
     """
+    free = check_names("free", free, '"damping", "stiffness"')
     laws = make_leg_laws(params) | dict(laws or {})
     n_folds = check_int("n_folds", n_folds, 0)
     base_model: Any = resolve_finder(params, model, None).model

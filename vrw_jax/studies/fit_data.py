@@ -127,6 +127,13 @@ def read_data(
             "data contain no measured column, but something must be fitted: give "
             f"{', '.join(list(units)[:4])}, say."
         )
+    errors_by_name = {name: x for name, x in table.items() if name not in names}
+    for name, column in (labels | row_conditions | errors_by_name).items():
+        if column.ndim > 1:
+            raise ValueError(
+                f"{name} has shape {column.shape}, but all data sets of a batch share their errors "
+                "and conditions: give one number for each row, or fit one data set after the other."
+            )
     values = np.stack(np.broadcast_arrays(*(repeat(table[name]) for name in names)), -1)
     scales = np.array([factor_by_name.get(name, 1.0) for name in names])
     errors, whitener = _read_errors(table, names, covariance, scales, values.shape[-2:])
@@ -163,8 +170,15 @@ def _read_table(data: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Return the columns of any form of data by name, and their stated units."""
     units: dict[str, str] = {}
     if isinstance(data, str | os.PathLike):
-        with open(data, newline="") as file:
+        # Some programs put a byte-order mark before the text.
+        with open(data, newline="", encoding="utf-8-sig") as file:
             lines = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
+        n_cells = sorted({len(row) for row in lines})
+        if len(lines) < 2 or len(n_cells) > 1:
+            raise ValueError(
+                f"{data} has {len(lines)} lines, with {n_cells} cells, but a table has a heading "
+                "and at least one row with as many cells: complete its lines."
+            )
         columns: Any = dict(zip(lines[0], zip(*lines[1:], strict=True), strict=True))
     elif isinstance(data, xr.Dataset):
         variables = {str(name): x for name, x in data.variables.items()}
@@ -176,8 +190,9 @@ def _read_table(data: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:
                     f"{name} has the dimensions {x.dims}, but a column has one, and perhaps "
                     f"{DATASET_DIMENSION!r}: stack the others, as in data.stack(row=(...))."
                 )
-            # The data sets are first, and the rows last.
-            columns[name] = x.values.T if x.dims[-1:] == (DATASET_DIMENSION,) else x.values
+            columns[name] = x.values
+            if x.dims[-1:] == (DATASET_DIMENSION,):  # The data sets are first, and the rows last.
+                columns[name] = np.atleast_2d(x.values).T
         columns.pop(DATASET_DIMENSION, None)
         if COVARIANCE_NAME in columns:
             columns[COVARIANCE_NAME] = data[COVARIANCE_NAME].values

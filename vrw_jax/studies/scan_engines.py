@@ -695,13 +695,16 @@ def evaluate_passages(
         for name in evaluation_request.measure_names
         if name in PASSAGE_MEASURES
     }
+    # The default options of walks have larger tolerances.
+    given_options = evaluation_request.step_options
+    options = None if given_options == StepOptions() else given_options
     for index in np.flatnonzero(outcomes == Outcome.STEPPED) if passage_measures else ():
         model, params = evaluation_request.wheel_model, evaluation_request.base_wheel
         for name, samples in samples_by_parameter.items():
             model, params = model.with_parameter(params, name, jnp.asarray(float(samples[index])))
         # Hardly any step of the walks succeeds if `first_passage` raises an error.
         with contextlib.suppress(ValueError):
-            passage = first_passage(params, slope_sd, model=model)
+            passage = first_passage(params, slope_sd, model=model, options=options)
             for name, values in passage_measures.items():
                 values[index] = getattr(passage, "error" if name == "mean_steps_error" else name)
     return results | passage_measures

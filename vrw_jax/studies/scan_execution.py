@@ -107,7 +107,8 @@ def scan(
 
     For a walker of yours, which needs `starts`, the design has the names of its parameters, with
     dots if they are nested. The measures are the period, the section coordinates and its own
-    `measures`. A store belongs to the walker's code.
+    `measures`. A store belongs to the code of the walker and to the static fields of its
+    parameters.
 
     Args:
         design: the samples, from `grid`, `samples`, `sobol`, `uniform` or `saltelli`.
@@ -116,7 +117,8 @@ def scan(
         base: wheel with the parameters that are not swept; by default that of Table 1 of the
             paper. For a walker of yours, its parameters.
         model: model of the wheel; "auto" for the simplest valid model for each sample.
-        options: numerical options of the gait steps that check the gaits.
+        options: numerical options of the gait steps that check the gaits, and of walks over random
+            slopes. With `tol`, they cannot be given.
         cycle_options: numerical options of the search for gaits. By default, the mesh of each
             sample is refined until its gait is accurate, and otherwise the mesh is fixed.
         store: local folder to which the result is written, not a URL; may begin with `~`.

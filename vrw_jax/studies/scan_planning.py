@@ -265,6 +265,11 @@ def plan_scan(
                 "contact with no settings other than friction and stoppers: give "
                 "model=vrw.UnilateralWheel(friction=...)."
             )
+        if options != StepOptions():
+            raise ValueError(
+                "tol and options are both given, but a tolerance determines the options of each "
+                "sample: drop one of them."
+            )
     if slope_sd is not None:
         slope_sd = check_positive("slope_sd", slope_sd)
         if model.leg_period > 1:
@@ -307,7 +312,7 @@ def plan_scan(
     variable_names = []
     for requested_measure in requested_measures:
         variable_names.append(canonicalize_variable_name(requested_measure))
-        if tol is not None:
+        if tol is not None and requested_measure in measure_names:
             variable_names.append(requested_measure + ERROR_VARIABLE_SUFFIX)
     variable_names += measure_catalog.always_included_variables
     cycle_options = getattr(gait_finder, "cycle_options", cycle_options or CycleOptions())
@@ -385,6 +390,8 @@ def describe_settings_difference(
         return "the values of the swept parameters differ"
     if setting_name.startswith("own_measures."):
         return f"the code of {setting_name.removeprefix('own_measures.')} differs"
+    if setting_name == "model.parameters":
+        return "the class of the walker's parameters or one of their static fields differs"
     if setting_name == "model.walker" or setting_name.removeprefix("model.") in LAW_NAMES:
         return f"the code of {setting_name.removeprefix('model.')} differs"
     if setting_name == "code":
@@ -468,7 +475,11 @@ def _convert_settings_to_json(settings_object: object) -> JsonObject:
     """Return the class name and the fields of `settings_object` as JSON values, by field name."""
     class_name = type(settings_object).__name__
     if isinstance(settings_object, ParameterizedWalker):
-        return {"kind": class_name, "walker": _identify_code(settings_object.walker)}
+        return {
+            "kind": class_name,
+            "walker": _identify_code(settings_object.walker),
+            "parameters": _identify_code(settings_object.structure),  # code and static fields
+        }
     field_value_by_name: JsonObject = {"kind": STORED_NAME_BY_CLASS.get(class_name, class_name)}
     stored_name_by_field = STORED_NAME_BY_MODEL_FIELD | STORED_NAMES_BY_FIELD_OF_CLASS.get(
         class_name, {}
