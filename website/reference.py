@@ -8,6 +8,7 @@ from typing import Any
 
 from vrw_jax.app.config import (
     DESIGN_TABLE_NAMES,
+    FIELDS_WITHOUT_KEY,
     BranchConfig,
     FigureConfig,
     GaitConfig,
@@ -140,6 +141,8 @@ def _settings(settings_class: Any) -> Iterable[tuple[str, str, str]]:
     """Yield name, default and meaning of each field of a settings class."""
     descriptions = describe_fields(settings_class)
     for field in dataclasses.fields(settings_class):
+        if field.name in FIELDS_WITHOUT_KEY:
+            continue
         yield field.name, _format_default(field), descriptions.get(field.name, "")
 
 

@@ -187,7 +187,10 @@ def test_a_gait_is_printed_on_a_terminal_without_greek_letters(encoding: str) ->
 def test_a_map_prints_its_stages_after_the_scan(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config.write_text("[grid]\ndamping = [100.0, 150.0]\nslope = [0.28, 0.3]\n")
+    config.write_text(
+        "[grid]\ndamping = [100.0, 150.0]\nslope = [0.28, 0.3]\n"
+        '[scan]\nmeasures = ["dls_fraction"]\n'
+    )
     evaluate = lambda columns: {
         **evaluate_arithmetically(columns),
         "lambda_4_plus": columns["slope"],
@@ -207,6 +210,9 @@ def test_a_map_prints_its_stages_after_the_scan(
     assert stages == ["following special points: fold ...", "drawing the map ..."]
     folder = config.parent / "results" / "small"
     assert (folder / "map.md").read_text().startswith("0 changes of sign")
+    # A scan of the same config has other measures and its own store.
+    assert run_command("scan", config, "--no-picture").exit_code == 0
+    assert run_command("map", config).exit_code == 0
 
 
 @pytest.mark.slow  # force peaks compile for a minute on a busy machine
@@ -226,7 +232,7 @@ def test_a_map_of_force_peaks_has_those_of_each_gait_on_the_mesh_of_the_config(
     )
     result = run_command("map", config, "--out", tmp_path)
     assert result.exit_code == 0, result.output
-    data = vrw.open_scan(tmp_path / "scan.zarr")
+    data = vrw.open_scan(tmp_path / "map.zarr")
     assert set(data.n_force_peaks.values.ravel()) == {1.0, 2.0}
     for i, j in ((0, 1), (1, 0)):
         wheel = vrw.WheelParams(
@@ -280,6 +286,9 @@ def test_figures_are_drawn_again_only_if_results_or_code_have_changed(
     monkeypatch.setattr(scanning, "compute_source_digest", lambda: "other code")
     assert scan_and_list_drawn_figures() == both
     assert scan_and_list_drawn_figures() == []
+    for damaged in ('{"files": 5}', '{"files": [5]}', "[]"):
+        (folder / "figures.json").write_text(damaged)
+        assert scan_and_list_drawn_figures() == both
 
 
 def test_a_tilde_is_the_home_folder_in_paths_of_configs_and_results(
@@ -307,6 +316,8 @@ def test_a_figure_is_written_to_the_given_file_and_the_data_to_the_usual_folder(
     assert result.exit_code == 0, result.output
     assert "paper/fig3.pdf" in result.stdout
     assert [path.name for path in Path("paper").iterdir()] == ["fig3.pdf"]
+    assert run_command("scan", config, "--out", "Fig3.PNG").exit_code == 0
+    assert Path("Fig3.PNG").read_bytes().startswith(b"\x89PNG")
     assert b"/MediaBox [ 0 0 244.8 " in Path("paper/fig3.pdf").read_bytes()  # 3.4 inches
     stored = sorted(path.name for path in Path("results/small").iterdir())
     assert stored == ["figures.json", "scan.zarr"]
@@ -320,6 +331,7 @@ def test_a_figure_is_written_to_the_given_file_and_the_data_to_the_usual_folder(
     ("table", "options", "sentence"),
     [
         ("", ("--out", "x.eps"), "figures are written as .pdf, .svg or .png"),
+        ("", ("--out", "folder.pdf"), "folder.pdf is a folder, but the figure"),
         ("", ("--out", "x.pdf", "--no-picture"), "drop one of the two"),
         ("width = 30", (), "80 to 500 mm wide"),
         ("width = true", (), "width is True"),
@@ -334,10 +346,11 @@ def test_wrong_settings_of_figures_are_refused_before_the_scan(
     config: Path, table: str, options: tuple[str, ...], sentence: str
 ) -> None:
     config.write_text(f"{SCAN_CONFIG}[figures]\n{table}\n")
+    (config.parent / "folder.pdf").mkdir()
     result = run_command("scan", config, *options)
     assert result.exit_code == 2
     assert sentence in " ".join(result.stderr.split())
-    assert [path.name for path in config.parent.iterdir()] == [config.name]
+    assert {path.name for path in config.parent.iterdir()} == {config.name, "folder.pdf"}
 
 
 def test_a_stopped_scan_names_the_command_that_continues_it(
@@ -354,6 +367,18 @@ def test_a_stopped_scan_names_the_command_that_continues_it(
         assert done.exit_code == 0
         assert output in done.stdout
         assert rest.n_calls == 2
+
+
+def test_a_scan_stopped_before_its_store_exists_has_written_nothing(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(scanning, "open_or_create_store", stop)
+    stopped = run_command("scan", config)
+    assert stopped.exit_code == 130
+    assert "stopped; nothing was written" in stopped.stderr
 
 
 def test_a_scan_with_other_settings_is_refused_in_the_same_place(config: Path) -> None:

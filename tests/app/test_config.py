@@ -1,10 +1,12 @@
 """The configs of the library are valid, and every mistake in a config raises one sentence."""
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import vrw_jax as vrw
 from vrw_jax import WheelParams, parameter_sets
 from vrw_jax.app.config import Config, load_config, parse_assignments, parse_config
 from vrw_jax.wheel import PARAMETER_NAMES
@@ -54,6 +56,48 @@ def test_table_1_as_a_config_is_the_default_wheel() -> None:
     result, default = load_config(CONFIG_FOLDER / "table1.toml").make_wheel(), WheelParams()
     for name in PARAMETER_NAMES:
         assert float(getattr(result, name)) == float(getattr(default, name))
+
+
+def test_a_restitution_of_zero_is_a_setting_and_uneven_is_none() -> None:
+    text = '[model]\nname = "unilateral"\n'
+    model = parse_config(text + "restitution = 0.0").make_model()
+    assert repr(model) == repr(vrw.UnilateralWheel(restitution=0.0))
+    with pytest.raises(ValueError, match="restitution"):
+        parse_config(text + "restitution = 2.0")
+    with pytest.raises(ValueError, match="unknown key 'uneven'"):
+        parse_config(text + "uneven = 1.0")
+
+
+LAW_FILE = """
+from __future__ import annotations
+import dataclasses
+import equinox as eqx
+
+class Leg(eqx.Module):
+    k3: float = 10.0
+
+    def __call__(self, L, dL, params):
+        x = params.natural_length - L
+        return params.stiffness * x + self.k3 * x**3 - params.damping * dL
+
+@dataclasses.dataclass
+class Gains:
+    k3: float = 10.0
+
+leg = Leg(Gains().k3)
+"""
+
+
+@pytest.mark.parametrize("name", ["leg", "Leg"])
+def test_a_law_is_a_class_of_a_file_with_postponed_annotations(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_leg.py").write_text(LAW_FILE)
+    config = parse_config(f'[model]\nleg_force = "my_leg.py:{name}"\n')
+    assert config.make_model().leg_force.k3 == 10.0
+    # Workers of dask, which do not have the file, would import the module.
+    assert not any("my_leg" in module for module in sys.modules)
 
 
 def test_an_empty_config_is_table_1() -> None:

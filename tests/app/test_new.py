@@ -46,6 +46,9 @@ def test_files_have_the_name_and_are_never_overwritten(tmp_path):
         ("a-b", "letters, digits and underscores"),
         ("class", "letters, digits"),
         ("numpy", "another"),
+        ("np", "is a name in the skeleton itself"),
+        ("params", "is a name in the skeleton itself"),
+        ("__main__", "of an installed module or of Python"),
     ],
 )
 def test_a_name_that_python_cannot_import_is_refused(name, message, tmp_path):

@@ -183,6 +183,7 @@ def test_the_config_of_a_tuned_wheel_has_its_model_and_options(tune_result, tmp_
     model = vrw.UnilateralWheel(friction=0.9, hub_torque=3.0)
     result = dataclasses.replace(tune_result, model=model)
     write_tuning_report(result, tmp_path, config, draws_figure=False)
+    assert (tmp_path / "tuning.md").read_text().startswith("# Tuned: ")
     written = load_config(tmp_path / "wheel.toml")
     assert float(written.make_wheel().damping) == 200.0
     written_model = written.make_model()

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from vrw_jax import Outcome
-from vrw_jax.plot import scan_figures, style
+from vrw_jax.plot import map_figure, scan_figures, style
 
 
 @pytest.mark.parametrize("second", ["friction", "gravity"])
@@ -64,3 +64,48 @@ def test_mean_numbers_of_steps_have_a_logarithmic_color_scale():
     mesh = figure.axes[0].collections[0]
     shades = np.linspace(0.0, 1.0, 6).reshape(3, 2).T
     np.testing.assert_allclose(mesh.norm(mean_steps.T), shades, atol=1e-12)
+
+
+def make_leg_scan(values: dict[str, list[float]], is_grid: bool) -> xr.Dataset:
+    """Return a scan of a measure with one value per leg, whose smallest is 1."""
+    dims = tuple(values) if is_grid else ("sample",)
+    shape = tuple(map(len, values.values()))[: len(dims)]
+    force = np.broadcast_to([3.0, 1.0, 2.0, 4.0, 5.0], (*shape, 5))
+    columns = {
+        "locked_stopper_force": ((*dims, "leg"), force),
+        "outcome": (dims, np.zeros(shape, int)),
+    }
+    coordinates = {name: (name if is_grid else "sample", x) for name, x in values.items()}
+    return xr.Dataset(columns, coordinates)
+
+
+@pytest.mark.parametrize("is_grid", [True, False])
+@pytest.mark.parametrize("n_parameters", [1, 2, 3])
+def test_the_least_value_over_the_legs_is_drawn(is_grid, n_parameters):
+    names = ["damping", "slope", "stiffness"][:n_parameters]
+    scan = make_leg_scan({name: [0.1, 0.2, 0.4] for name in names}, is_grid)
+    figure, *_ = scan_figures(scan).values()
+    drawn = [x for axes in figure.axes for x in (*axes.collections, *axes.lines)]
+    arrays = [x.get_ydata() if hasattr(x, "get_ydata") else x.get_array() for x in drawn]
+    assert any(x is not None and np.size(x) and np.all(x == 1.0) for x in arrays)
+    if is_grid and n_parameters == 2:
+        cells, *_ = map_figure(scan, "locked_stopper_force", []).axes[0].collections
+        assert np.all(cells.get_array() == 1.0)
+
+
+@pytest.mark.parametrize("is_grid", [True, False])
+@pytest.mark.parametrize("n_parameters", [1, 2, 3])
+def test_infinite_friction_is_left_out_with_a_warning(is_grid, n_parameters):
+    names = ["friction", "slope", "stiffness"][:n_parameters]
+    values = {name: [0.1, 0.2, 0.4] for name in names} | {"friction": [0.5, 0.7, np.inf]}
+    with pytest.warns(UserWarning, match="leaves out samples whose friction is infinite"):
+        figures = scan_figures(make_leg_scan(values, is_grid))
+    for axes in next(iter(figures.values())).axes:
+        assert np.isfinite([*axes.get_xlim(), *axes.get_ylim()]).all()
+
+
+def test_an_axis_with_infinite_friction_alone_is_not_varied(recwarn):
+    values = {"friction": [np.inf], "damping": [100.0, 150.0]}
+    (figure,) = scan_figures(make_leg_scan(values, is_grid=True)).values()
+    assert figure.axes[0].lines[0].get_xdata().tolist() == [100.0, 150.0]
+    assert not recwarn

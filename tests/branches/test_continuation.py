@@ -578,6 +578,6 @@ def test_a_branch_is_written_drawn_and_summarized(branch, tmp_path):
     assert_netcdf_round_trip(branch.dataset, tmp_path)
     assert len(branch_figure(branch).axes) == 4
     names = {path.name for path in write_branch_report(branch, tmp_path, FigureConfig())}
-    assert names == {"branch.zarr", "borders.csv", "summary.md", "branch.svg", "branch.png"}
-    assert "219.84768" in (tmp_path / "summary.md").read_text()
+    assert names == {"branch.zarr", "borders.csv", "branch.md", "branch.svg", "branch.png"}
+    assert "219.84768" in (tmp_path / "branch.md").read_text()
     assert "ends the branch" in branch._repr_html_()

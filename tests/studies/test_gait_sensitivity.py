@@ -150,7 +150,8 @@ def test_norms_along_a_branch_of_an_own_walker_are_those_of_a_geometric_series()
         BALL_PARAMS, "ball.restitution", (0.2, 0.9), model=walker,
         cycle=vrw.limit_cycle(BALL_PARAMS, model=walker),
     )  # fmt: skip
-    norms = vrw.measure_gait_sensitivity(branch, "period", model=walker, n_points=3)
+    twice = ["period", "period"]  # has one variable
+    norms = vrw.measure_gait_sensitivity(branch, twice, model=walker, n_points=3)
     expected = 2.0 / GRAVITY / np.sqrt(1.0 - norms["ball.restitution"] ** 2)
     np.testing.assert_allclose(norms.gait_sensitivity_period, expected, rtol=1e-12)
     assert norms.gait_sensitivity_period.attrs["units"] == "s per rad"

@@ -131,7 +131,8 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
     A grid with one or two axes leads to one figure. Further axes add one figure each. Narrow
     figures show fewer slices of a grid and fewer pairs of parameters. For a walker of your own, the
     figures show the first six measures that were asked for, and a warning names the others. A
-    figure of pairs of parameters shows one measure.
+    figure of pairs of parameters shows one measure. Of a measure with one value per leg, figures
+    show the smallest. Infinite values of parameters are left out with a warning.
 
     Args:
         scan: dataset that `vrw.scan` returns for a grid or for samples.
@@ -148,10 +149,11 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
     require_dataset_variables("scan", scan, ("outcome",), "give vrw.scan(design)")
     _warn_of_omitted_measures(scan)
     swept_parameters = _list_swept_parameters(scan, scan.coords)
+    scan = _take_least_over_legs(_leave_out_infinite_values(scan, swept_parameters))
     varied_parameters = [
         parameter_name
         for parameter_name in swept_parameters
-        if np.ptp(scan[parameter_name].values) > 0.0
+        if scan[parameter_name].values.max() > scan[parameter_name].values.min()
     ] or swept_parameters
     if "sample" in scan.dims:
         if len(varied_parameters) < 3:
@@ -178,6 +180,27 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
         (f"scan_over_{parameter_name}", draw_scan_slices(scan, x, y, parameter_name, width))
         for parameter_name in further_parameters
     )
+
+
+def _take_least_over_legs(scan: xr.Dataset) -> xr.Dataset:
+    return scan.min("leg", keep_attrs=True) if "leg" in scan.dims else scan
+
+
+def _leave_out_infinite_values(scan: xr.Dataset, parameter_names: Iterable[str]) -> xr.Dataset:
+    """Return the scan without samples that no axis can show, and warn of them.
+
+    A parameter without a finite value is not varied, so that it needs no axis.
+    """
+    for name in parameter_names:
+        is_finite = np.isfinite(scan[name].values)
+        if is_finite.any() and not is_finite.all():
+            warnings.warn(
+                f"scan_figures leaves out samples whose {name} is infinite or NaN, because no axis "
+                "shows them: see them in the dataset.",
+                stacklevel=4,
+            )
+            scan = scan.isel({scan[name].dims[0]: is_finite})
+    return scan
 
 
 def _warn_of_omitted_measures(scan: xr.Dataset) -> None:
@@ -576,8 +599,6 @@ def _draw_margin_zero_lines(axes: Axes, scan: xr.Dataset, x: str, y: str) -> dic
         if margin_name not in scan:
             continue
         margin_array = scan[margin_name]
-        if MARGIN_MEASURES[margin_name].leg_dimension:
-            margin_array = margin_array.min("leg")
         if margin_name == "clearance_sls1" and "takeoff_acceleration" in scan:
             # Without missing values the line has no steps.
             margin_array = margin_array.where(scan.takeoff_acceleration >= 0.0)
@@ -644,6 +665,7 @@ def map_figure(
     require_dataset_variables(
         "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
     )
+    scan = _take_least_over_legs(scan)
     x, y = (
         curves[0].parameters
         if curves

@@ -6,11 +6,13 @@ mistake is reported in one sentence on standard error, with exit code 2.
 
 import gc
 import importlib.util
+import io
 import keyword
 import os
 import signal
 import sys
 import tempfile
+import tokenize
 import webbrowser
 from dataclasses import replace
 from pathlib import Path
@@ -150,8 +152,9 @@ def configure_root_command(
     [bold]Files[/bold]   init: configs. new: two Python files. gait: none. reproduce: figures and
     tables. scan: scan.zarr (open it with vrw_jax.open_scan or xarray.open_zarr), pictures, PNG and
     SVG, and figures.json.
-    tune: path.zarr, a picture, summary.md, and wheel.toml, a config of vrw gait.
-    continue: branch.zarr, borders.csv, a picture and summary.md.
+    map: map.zarr, map.csv, map.md and a picture.
+    tune: path.zarr, a picture, tuning.md, and wheel.toml, a config of vrw gait.
+    continue: branch.zarr, borders.csv, a picture and branch.md.
 
     The first run of a command compiles for some seconds. The compiled code is stored in a cache
     folder (JAX_COMPILATION_CACHE_DIR names another), so later runs start quickly. Angles are in
@@ -300,24 +303,39 @@ def run_new_command(
                 f"the name is {name!r}, but it is the name of a Python file that others import: "
                 "give letters, digits and underscores, as my_walker."
             )
-        if name in sys.stdlib_module_names or importlib.util.find_spec(name) is not None:
-            raise ValueError(f"{name} is the name of an installed module: give another name.")
+        is_dunder = name.startswith("__")  # as __main__, whose specification does not exist
+        if (
+            is_dunder
+            or name in sys.stdlib_module_names
+            or importlib.util.find_spec(name) is not None
+        ):
+            raise ValueError(
+                f"{name} is the name of an installed module or of Python: give another name."
+            )
         folder = check_path("--out", folder, "give a folder")
-        paths = {
-            folder / f"{name}.py": "my_walker.py",
-            folder / f"test_{name}.py": "test_my_walker.py",
+        skeleton_folder = find_example_config_folder() / "new"
+        texts = {
+            folder / skeleton.name.replace(SKELETON_NAME, name): skeleton.read_text("utf-8")
+            for skeleton in sorted(skeleton_folder.glob("*.py"))
         }
-        for path in paths:
+        skeleton_names = {
+            token.string
+            for text in texts.values()
+            for token in tokenize.generate_tokens(io.StringIO(text).readline)
+        }
+        if name in skeleton_names - {SKELETON_NAME}:
+            raise ValueError(
+                f"{name} is a name in the skeleton itself, which would hide the module: give "
+                "another name."
+            )
+        for path in texts:
             if path.exists():
                 raise ValueError(f"{path} is there already: give another name or --out FOLDER.")
         _require_writable_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        for path, skeleton_file in paths.items():
-            text = (find_example_config_folder() / "new" / skeleton_file).read_text(
-                encoding="utf-8"
-            )
+        for path, text in texts.items():
             path.write_text(text.replace(SKELETON_NAME, name), encoding="utf-8")
-        printing.print_written_paths(list(paths))
+        printing.print_written_paths(list(texts))
 
 
 def find_example_config_folder() -> Path:
@@ -362,6 +380,11 @@ def _require_writable_output(
             raise ValueError(
                 f"--no-picture is given, but the figure {figure_file} is asked for: drop one of "
                 "the two."
+            )
+        if figure_file.is_dir():
+            raise ValueError(
+                f"{figure_file} is a folder, but the figure is written to a file of this name: "
+                "give another name."
             )
         _require_writable_folder(figure_file.parent)
 
@@ -528,7 +551,7 @@ def run_map_command(
         )
         require_map_grid(scan_plan.design)
         _require_writable_output(special_point_map_config, folder, draws_figure=True)
-    scan_dataset = scanning.compute_scan_with_progress(scan_plan, folder / "scan.zarr", None)
+    scan_dataset = scanning.compute_scan_with_progress(scan_plan, folder / "map.zarr", None)
 
     with (
         report_command_errors(),
@@ -558,7 +581,7 @@ def run_tune_command(
     """Tune a wheel: find the best gait within bounds that satisfies its constraints.
 
     The optimization follows the branch of gaits with exact gradients. A walk of the tuned wheel
-    then validates the result. The command writes path.zarr (every evaluated gait), summary.md,
+    then validates the result. The command writes path.zarr (every evaluated gait), tuning.md,
     wheel.toml (the tuned wheel) and figures (PNG and SVG) into the folder. The exit code is 1 if
     the run does not end at an optimum. It is 2, and nothing is written, if the start has no gait.
 
@@ -606,7 +629,7 @@ def run_continue_command(
 ) -> None:
     """Continue a branch of stable and unstable gaits along a parameter, with its special points.
 
-    The command writes branch.zarr (open it with xarray.open_zarr), borders.csv, summary.md and
+    The command writes branch.zarr (open it with xarray.open_zarr), borders.csv, branch.md and
     figures (PNG and SVG) into the folder. If there is no gait to start from, the exit code is 1 and
     the command writes nothing.
 

@@ -60,6 +60,8 @@ DESIGN_TABLE_NAMES = ("grid", "samples", *RANDOM_DESIGN_FUNCTIONS)
 CONFIG_TABLE_NAMES = (
     "wheel", "model", "options", "gait", "scan", "tune", "branch", "figures", *DESIGN_TABLE_NAMES,
 )  # fmt: skip
+FIELDS_WITHOUT_KEY = frozenset(["uneven"])
+"""Fields of models that are no keys of a config."""
 PARAMETER_SET_KEY = "parameter_set"
 """Key of `[wheel]` that names a parameter set. Other keys of the table replace values of this
 set.
@@ -253,7 +255,7 @@ def is_figure_file(path: Path) -> bool:
             f"{path} has the suffix {path.suffix}, but figures are written as .pdf, .svg or .png: "
             "give one of these suffixes, or a folder."
         )
-    return path.suffix[1:] in FIGURE_FORMATS
+    return path.suffix[1:].lower() in FIGURE_FORMATS
 
 
 def _check_width(width: Any) -> Any:
@@ -395,7 +397,11 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
     model_table = {"name": Config.model_name, **tables["model"]}
     require_known_name(model_name := model_table.pop("name"), list_model_config_names(), "model")
     model_class = MODEL_CLASSES[model_name]
-    defaults = {field.name: field.default for field in dataclasses.fields(model_class)}
+    defaults = {
+        field.name: field.default
+        for field in dataclasses.fields(model_class)
+        if field.name not in FIELDS_WITHOUT_KEY
+    }
     _require_known_keys(
         model_table, ("name", *defaults), f'[model] with name = "{model_name}"', "settings"
     )
@@ -436,11 +442,7 @@ def _parse_config_tables(config_tables: ConfigTable, config_text: str, file_name
         file_name=file_name,
     )
     config.make_wheel()
-    try:
-        config.make_model()
-    # The wheel has a setting that no file can contain, such as uneven ground.
-    except TypeError as model_error:
-        raise ValueError(str(model_error)) from model_error
+    config.make_model()
     config.make_options().check_tolerances(np.dtype(float))
     return config
 
@@ -494,11 +496,14 @@ def _load_law(model_class: type[AbstractWheel], law_name: str, location: object)
             f"{law_name} names the file {file_name}, which {Path.cwd()} does not contain: "
             "give its path from the current folder."
         )
-    module_spec = importlib.util.spec_from_file_location(Path(file_name).stem, file_name)
+    module_name = f"law_in_{Path(file_name).stem}"  # shared with no installed module
+    module_spec = importlib.util.spec_from_file_location(module_name, file_name)
     assert module_spec is not None
     assert module_spec.loader is not None  # The name of the file ends in .py.
     module = importlib.util.module_from_spec(module_spec)
     writes_no_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+    # Dataclasses need the module. Later, it must be missing: workers of dask would import it.
+    sys.modules[module_name] = module
     try:
         module_spec.loader.exec_module(module)
         if hasattr(module, name_in_file):
@@ -513,6 +518,7 @@ def _load_law(model_class: type[AbstractWheel], law_name: str, location: object)
             "default values."
         ) from error
     finally:
+        del sys.modules[module_name]
         sys.dont_write_bytecode = writes_no_bytecode
     raise ValueError(
         f"{law_name} is {location}, but {file_name} does not define {name_in_file}: write "
@@ -521,13 +527,18 @@ def _load_law(model_class: type[AbstractWheel], law_name: str, location: object)
 
 
 def _read_like_defaults(table: ConfigTable, defaults: ConfigTable) -> dict[str, Any]:
-    """Return settings with the types of their default values. Numbers must be positive."""
+    """Return settings with the types of their default values. Numbers must be positive.
+
+    The model checks numbers that have no default value.
+    """
 
     def find_kind(default: Any) -> Any:
         if isinstance(default, bool):
             return Annotated[bool, Strict(), _must_be("true or false")]
         if isinstance(default, str):
             return Annotated[str, _must_be(f'a name, "{default}"')]
+        if default is None:
+            return Finite
         return Whole if isinstance(default, int) else Positive
 
     return {

@@ -265,7 +265,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     """
     folder = check_path("folder", folder, 'give a folder, such as "figures"')
     folder.mkdir(parents=True, exist_ok=True)
-    is_file_name = Path(name).suffix[1:] in figure.canvas.get_supported_filetypes()
+    is_file_name = Path(name).suffix[1:].lower() in figure.canvas.get_supported_filetypes()
     figure_paths = (
         [folder / name] if is_file_name else [folder / f"{name}.svg", folder / f"{name}.png"]
     )
@@ -273,7 +273,7 @@ def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
     varying_keys = {".svg": "Date", ".png": "Software", ".pdf": "CreationDate"}
     with figure_style():
         for figure_path in figure_paths:
-            varying_key = varying_keys.get(figure_path.suffix)
+            varying_key = varying_keys.get(figure_path.suffix.lower())
             figure.savefig(figure_path, metadata={varying_key: None} if varying_key else None)
     return figure_paths
 

@@ -78,7 +78,7 @@ def write_tuning_report(
         tune_result.path,
         {
             "wheel.toml": "\n".join(toml_lines),
-            "summary.md": format_tuning_summary(tune_result),
+            "tuning.md": format_tuning_summary(tune_result),
         },
     )
     if draws_figure:
@@ -117,7 +117,7 @@ def write_branch_report(
         folder,
         "branch.zarr",
         branch.dataset,
-        {"borders.csv": csv_buffer.getvalue(), "summary.md": format_branch_summary(branch)},
+        {"borders.csv": csv_buffer.getvalue(), "branch.md": format_branch_summary(branch)},
     )
     if figure_config is not None and branch.values.size:
         figure = plot.branch_figure(branch, width=figure_config.width)

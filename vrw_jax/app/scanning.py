@@ -81,14 +81,17 @@ def compute_scan_with_progress(
     dataset.
     """
     interruption_message = f"stopped; what is done stays in {store_path}, run the same to go on."
-    with report_command_errors(interruption_message), resolve_executor(dask) as chunk_executor:
+    with report_command_errors(), resolve_executor(dask) as chunk_executor:
         zarr_store = open_or_create_store(scan_plan, store_path)
         if zarr_store.damage_description:
             print_error_sentence(f"{zarr_store.damage_description}: computed again.")
         elif not zarr_store.find_missing_chunks():
             stdout_console.print(f"{store_path} is complete: nothing to compute.", highlight=False)
             return zarr_store.load_dataset()
-        with printing.make_progress_bar("scan") as progress_bar:
+        with (
+            report_command_errors(interruption_message),
+            printing.make_progress_bar("scan") as progress_bar,
+        ):
             progress_task = progress_bar.add_task("compiling", total=None, note="")
             report_progress = printing.make_scan_progress_reporter(
                 progress_bar.update, progress_task
@@ -114,8 +117,9 @@ def draw_scan_figures(
         "config": repr(figure_config),
     }
     figure_record = read_metadata_file(record_path)
-    figure_paths = list(map(Path, figure_record.pop("files", [])))
-    if figure_record == figure_origin and all(map(Path.is_file, figure_paths)):
+    files = figure_record.pop("files", None)
+    figure_paths = [Path(str(file)) for file in files] if isinstance(files, list) else []
+    if figure_paths and figure_record == figure_origin and all(map(Path.is_file, figure_paths)):
         for figure_path in figure_paths:
             stdout_console.print(f"up to date: {figure_path}", highlight=False, soft_wrap=True)
         return

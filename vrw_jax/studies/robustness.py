@@ -202,8 +202,8 @@ def gait_sensitivity(
 def parse_sensitivity_measures(
     cycle_finder: AbstractGaitFinder, measures: str | Sequence[str]
 ) -> tuple[str, ...]:
-    """Return the names of measures of a gait step; raise an error for names of other kinds."""
-    measure_names = check_names("measures", measures)
+    """Return the names of measures of a gait step, each once; raise an error for other names."""
+    measure_names = tuple(dict.fromkeys(check_names("measures", measures)))
     known_names = cycle_finder.step_measures
     for measure_name in measure_names or ("nothing",):
         kind = f"measure of a step of {cycle_finder.model.model_name} wheels"
@@ -373,7 +373,7 @@ def measure_gait_sensitivity(
         gait = _make_branch_gait(branch, i, checked_model, StepOptions())
         guess = gait.section_states[0]
         cycle_finder = resolve_finder(gait.params, gait.model, options, guess=guess)
-        parse_sensitivity_measures(cycle_finder, measure_names)
+        measure_names = parse_sensitivity_measures(cycle_finder, measure_names)
         cycle: Any = limit_cycle(gait.params, guess=guess, model=gait.model, options=options)
         is_same_gait = (
             int(cycle.outcome) == Outcome.STEPPED
