@@ -29,6 +29,7 @@ from support.scanning import (
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, WheelParams
+from vrw_jax.app.config import parse_config
 from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
 from vrw_jax.gaits import finder
 from vrw_jax.lanes.keys import make_key
@@ -716,6 +717,23 @@ def test_workers_of_a_cluster_compute_laws_of_a_script() -> None:
         table = vrw.scan(design, ["period"], model=model, dask=cluster.scheduler_address)
     expected = vrw.limit_cycle(vrw.WheelParams(damping=165.0)).period
     assert float(table.period[0]) == pytest.approx(float(expected), rel=1e-9)
+
+
+@pytest.mark.slow  # starts a process
+def test_a_class_that_workers_cannot_import_gets_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "laws.py").write_text(
+        "import equinox as eqx\n"
+        "class Leg(eqx.Module):\n"
+        "    k: float = 500.0\n"
+        "    def __call__(self, L, dL, p):\n"
+        "        return self.k * (p.natural_length - L) - p.damping * dL\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    model = parse_config('[model]\nleg_force = "laws.py:Leg"\n').make_model()
+    with pytest.raises(ValueError, match="a class that the workers cannot import: define it"):
+        vrw.scan(vrw.grid(damping=[150.0]), ["period"], model=model, dask="local")
 
 
 def test_an_address_without_a_scheduler_gets_one_sentence(

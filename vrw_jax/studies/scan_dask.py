@@ -18,6 +18,8 @@ from concurrent.futures import ThreadPoolExecutor
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
+import jax
+
 from vrw_jax import lanes
 from vrw_jax.base.start import start_jax
 from vrw_jax.studies.measure_catalog import ValuesByVariable
@@ -138,7 +140,8 @@ def _compute_chunks_on_cluster(
     """Yield each missing chunk's index and results, in the order of completion."""
     from distributed.protocol.pickle import dumps  # pickles functions of a script too
 
-    pickled_request = dumps(scan_plan.evaluation_request)
+    request = scan_plan.evaluation_request
+    pickled_request = dumps((request, len(jax.tree.leaves(request))))
     local_computing_environment = describe_computing_environment()
     remaining_chunks = iter(missing_chunks)
     chunk_index_by_future: dict[Future, int] = {}
@@ -246,9 +249,16 @@ def _compute_chunk_in_worker(
 
 @functools.cache
 def make_worker_engine(pickled_request: bytes) -> SampleEvaluator:
-    """Return the scan engine for a pickled `EvaluationRequest`. Each worker creates the engine
-    once.
+    """Return the scan engine for a pickled `EvaluationRequest` and its number of leaves.
+
+    Each worker creates the engine once.
     """
     from distributed import get_worker
 
-    return make_scan_engine(pickle.loads(pickled_request), get_worker().state.nthreads)
+    request, n_leaves = pickle.loads(pickled_request)
+    if len(jax.tree.leaves(request)) != n_leaves:  # Equinox finds no fields in a pickled class.
+        raise ValueError(
+            "the model or its parameters are of a class that the workers cannot import: define it "
+            "in a module that they can import, or scan without dask."
+        )
+    return make_scan_engine(request, get_worker().state.nthreads)
