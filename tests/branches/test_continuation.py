@@ -1,5 +1,6 @@
 """Branches pass folds, and every special point on them is located to 1e-9."""
 
+import dataclasses
 import pickle
 
 import jax
@@ -56,7 +57,7 @@ def test_branches_continued_together_equal_single_ones_with_two_iterations_per_p
             return super().linearize(args, z, p)
 
     driver = ArclengthDriver(
-        CountingProblem(evaluate_henon, (1.0, 1.0)), vrw.ArclengthOptions(), np.array([-1.0, 2.0])
+        CountingProblem((1.0, 1.0), evaluate_henon), vrw.ArclengthOptions(), np.array([-1.0, 2.0])
     )
 
     def trace(owners):
@@ -552,6 +553,27 @@ def test_the_mesh_of_a_branch_resolves_its_gaits_or_ends_the_branch():
 
 
 @pytest.mark.slow
+def test_a_wheel_is_continued_beyond_a_period_doubling_by_gaits_of_two_steps():
+    """Its steps then differ by the square root of the distance, until one has no double support."""
+    wheel = vrw.WheelParams(damping=141.66)
+    branch = vrw.continue_branch(wheel, "stiffness", (560.0, 580.0))
+    (doubling,) = [x for x in branch.special_points if x.kind == "period_doubling"]
+    doubled = vrw.continue_branch(wheel, "stiffness", (560.0, 580.0), switch_at=doubling)
+    assert doubled.period_n == 2
+    assert doubled.special_points[-1].name == "duration_dls"
+    states, distances = doubled.section_states, doubled.values - doubling.value
+    sizes = np.sum((states - np.asarray(doubling.cycle.section_state)) ** 2, 1)
+    np.testing.assert_allclose(distances / sizes, distances[0] / sizes[0], rtol=0.01)
+    assert 0.0 < distances[0] < 1e-3
+    last = dataclasses.replace(wheel, stiffness=doubled.values[-1])
+    gait = vrw.limit_cycle(last, period_n=2, guess=states[-1], options=vrw.CycleOptions.tight())
+    np.testing.assert_allclose(gait.section_state, states[-1], atol=1e-9)
+    once = vrw.return_map(last, states[-1])
+    assert np.max(np.abs(np.asarray(once) - states[-1])) > 1e-4
+    with pytest.raises(ValueError, match="a branch_point or a period_doubling"):
+        vrw.continue_branch(wheel, "stiffness", (560.0, 580.0), switch_at=branch.special_points[0])
+
+
 def test_a_rigid_wheel_is_continued_with_its_own_step():
     branch = vrw.continue_branch(
         vrw.WheelParams(), "slope", (0.2, 0.35), model=vrw.RigidWheel(stop_at_lift_off=False)

@@ -11,8 +11,8 @@ from vrw_jax.branches.arclength import (
     ArclengthOptions,
     NewtonStep,
 )
+from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import continue_and_locate_special_points, find_state_jumps
-from vrw_jax.branches.map_branch import MapContinuation
 
 TAN = float(np.tan(0.3))
 
@@ -32,7 +32,7 @@ class Bent(AbstractContinuationProblem):
 @pytest.mark.parametrize("slope", [-0.3, -2.0])
 def test_a_branch_passes_a_kink_at_which_no_step_is_short_enough(slope):
     """Its tangent turns there by 76 or 121 degrees; an option forbids more than 0.2 rad."""
-    run = MapContinuation(Bent(slope), ArclengthOptions(), np.zeros(1), np.array([-1.0, 1.0]))
+    run = Continuation(Bent(slope), ArclengthOptions(), np.array([-1.0, 1.0]), np.zeros(1))
     begin = np.array([[-0.25]]), np.array([-0.5])
     (strand,) = continue_and_locate_special_points(run, *begin, np.array([True]))
     p, x = np.asarray(strand.points.p), np.asarray(strand.points.z)[:, 0]

@@ -14,12 +14,12 @@ from support.walkers import Henon
 import vrw_jax as vrw
 from experiments.gaits.both_sides import judge_curve
 from vrw_jax.branches.arclength import ArclengthOptions, ContinuationStatus
+from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import continue_and_locate_special_points
 from vrw_jax.branches.curve_problems import (
     AbstractCurveProblem,
     TwoParameterStep,
 )
-from vrw_jax.branches.map_branch import MapContinuation
 from vrw_jax.branches.special_point_curves import continue_special_points
 from vrw_jax.branches.walker_curves import check_curve_arguments
 
@@ -57,7 +57,7 @@ def trace_curve(function, quantity, z, p, bounds, seconds, second):
     """The curve through (p, second), as `continue_special_point` does for a gait."""
     problem = MapCurveProblem(second_bounds=seconds, function=function, quantity=quantity)
     start = np.array([(second - seconds[0]) / (seconds[1] - seconds[0]), *z])
-    run = MapContinuation(problem, CURVE_OPTIONS, np.zeros(1), np.array(bounds))
+    run = Continuation(problem, CURVE_OPTIONS, np.array(bounds), np.zeros(1))
     (strand,) = continue_and_locate_special_points(
         run, start[None], np.array([p]), np.array([True])
     )
@@ -95,6 +95,50 @@ def test_bifurcations_of_henon_are_on_their_parabolas(name, factor):
     np.testing.assert_allclose(a, factor * (1.0 - b) ** 2, atol=1e-9)
     assert np.ptp(b) > 1.0
     assert curve.dataset.x.shape == (len(a), 2)
+    unit = {"period_doubling": -1.0, "fold": 1.0}[name]
+    multipliers = curve.dataset.multiplier_real + 1j * curve.dataset.multiplier_imag
+    margins = np.prod(multipliers - unit, -1)
+    # The curve of the fold has an offset of this size.
+    np.testing.assert_allclose(margins, {"period_doubling": 0.0, "fold": 1e-6}[name], atol=1e-8)
+
+
+class HenonWithInvariant(vrw.AbstractWalker):
+    """Hénon's map with a + c, where c = z + x² is conserved."""
+
+    invariants = (lambda x, params: x[2] + x[0] ** 2,)
+
+    def advance(self, params, x, options):
+        (conserved,) = self.evaluate_invariants(params, x)
+        step = Henon().advance(params | {"a": params["a"] + conserved}, x[:2], options)
+        z = conserved - step.section_state[0] ** 2
+        return vrw.AdvanceResult(jnp.append(step.section_state, z), step.durations)
+
+
+@pytest.mark.parametrize("period_n", [1, 2])
+def test_walkers_with_an_invariant_or_several_steps_double_their_period_on_parabolas(period_n):
+    """The orbit of period two doubles its own where 4 a = (1 + b)² + 4 (1 - b)² (see `Henon`)."""
+    conserved, walker = 0.15, HenonWithInvariant()
+    params = {"a": {1: 0.2, 2: 0.7}[period_n] - conserved, "b": 0.3}
+    x, y = {1: (0.7, 0.2), 2: (1.32, -0.1)}[period_n]
+    gait = vrw.limit_cycle(params, model=walker, guess=[x, y, conserved - x**2], period_n=period_n)
+    evaluate = lambda b: (
+        {1: 3.0 * (1.0 - b) ** 2, 2: (1.0 + b) ** 2 + 4.0 * (1.0 - b) ** 2}[period_n] / 4.0
+    )
+    bounds = {"a": (-1.0, 3.0), "b": (0.0, 0.6)}
+    branch = vrw.continue_branch(
+        params, "a", bounds["a"], model=walker, cycle=gait, period_n=period_n
+    )
+    doubling = next(point for point in branch.special_points if point.kind == "period_doubling")
+    assert abs(doubling.value + conserved - evaluate(0.3)) < 1e-8
+    np.testing.assert_allclose(
+        doubling.cycle.section_state, doubling.point.section_state, atol=1e-8
+    )
+    curve = vrw.continue_special_point(
+        "period_doubling", ("a", "b"), gait, model=walker, params=params, bounds=bounds
+    )
+    a, b = curve.values.T
+    np.testing.assert_allclose(a + conserved, evaluate(b), atol=1e-8)
+    assert np.ptp(b) == pytest.approx(0.6, abs=1e-8)
 
 
 CURVE_PARAMETERS = ("damping", "stiffness")

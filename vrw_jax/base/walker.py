@@ -124,6 +124,10 @@ class AbstractWalker(abc.ABC):
         """Return the walker and its parameters with a new value of one of them."""
         return self, replace_tree_parameter(params, name, value)
 
+    def select_params(self, params: Any, step_index: Any) -> Any:
+        """Return the parameters in a step of a gait: the same, unless legs alternate."""
+        return params
+
     def with_step_ground(self, params: Any, step_parameters: Any) -> tuple[Any, Any]:
         """Return the walker and all its parameters in one step of a walk.
 

@@ -8,7 +8,7 @@ length is measured in the section state and in the parameter as a fraction of it
 
 import abc
 import dataclasses
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -16,12 +16,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.base.checks import check_int, check_positive
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
-from vrw_jax.branches.branch import is_multiplier_change_explained
+from vrw_jax.branches.branch import BIFURCATIONS, TestFunction, is_multiplier_change_explained
+from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.lanes.batching import select_tree_rows
 
 Unknowns = Float[np.ndarray, " unknowns"]
+
+QuantitiesByName = dict[str, np.ndarray]
+"""Arrays of quantities with one element per point, by the name of the quantity."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +91,25 @@ class AbstractContinuationProblem(abc.ABC):
     """Base class of continuation problems, in one continued parameter `p`.
 
     The unknowns `z` of a point begin with its section state, of which arc lengths are measured. The
-    argument `args` is a tree of all other inputs, such as the wheel.
+    argument `args` is a tree of all other inputs, such as the wheel. A problem also defines the
+    quantities of its points and their test functions.
     """
+
+    test_functions: ClassVar[Mapping[str, TestFunction]] = BIFURCATIONS
+    """Test functions by name; the name of one of a leg has the number of the leg in brackets."""
+
+    linear_margin_substitutes: ClassVar[Mapping[str, str]] = {}
+    """Names of margins whose roots are ill-conditioned. Each margin is mapped to the name of a
+    quantity that vanishes linearly at the same point.
+    """
+
+    location_unit: ClassVar[float | None] = None
+    """Unit of the parameter in which special points are located, or None for its range."""
+
+    @property
+    def section_units(self) -> Any:
+        """Return the units of the components of the section state among the unknowns."""
+        return 1.0
 
     has_multipliers: ClassVar[bool] = True
     """Whether the eigenvalues of `NewtonStep.return_map_jacobian` show bifurcations of the branch.
@@ -96,6 +118,9 @@ class AbstractContinuationProblem(abc.ABC):
 
     has_kinks: ClassVar[bool] = False
     """Whether branches may have kinks, at which the tangent jumps."""
+
+    may_start_singular: ClassVar[bool] = False
+    """Whether a branch starts next to a given start at which the equations are singular."""
 
     @abc.abstractmethod
     def linearize(
@@ -118,6 +143,10 @@ class AbstractContinuationProblem(abc.ABC):
         """Return whether the converged unknowns z satisfy the conditions of their branch."""
         return bool(np.isfinite(self.section_state(z)).all())
 
+    def displace(self, args: Any, z: Unknowns, p: float, section_state: np.ndarray) -> Unknowns:
+        """Return initial guesses of the unknowns near z for another section state."""
+        return np.append(section_state, z[len(section_state) :])
+
     def interpolate(self, left: np.ndarray, right: np.ndarray, fraction: np.ndarray) -> np.ndarray:
         """Return initial guesses between points of a branch, each at a fraction of the way."""
         return left + fraction[:, None] * (right - left)
@@ -125,6 +154,40 @@ class AbstractContinuationProblem(abc.ABC):
     def is_smooth_between(self, left: Unknowns, right: Unknowns) -> bool:
         """Return whether the branch has no detected kink between two neighboring points."""
         return True
+
+    def measure(self, args: Any, points: "ContinuationPoint") -> QuantitiesByName:
+        """Return quantities at many points by name, except those computed from the Jacobian."""
+        return {}
+
+    def make_point_reader(self, args: Any, point: "ContinuationPoint") -> Callable | None:
+        """Return a function that finds the gait at a point, or None if no gait can be found."""
+        return None
+
+    def describe_parameter(self, name: str) -> dict[str, str]:
+        """Return the attributes of the continued parameter in the dataset of a branch."""
+        return {"units": "1"}
+
+    def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
+        """Return whether each point is admissible, computed from the quantities at the points.
+
+        A gait is admissible if its event-driven step returns to its section state. A fixed point of
+        another map has no such step, and every finite fixed point is admissible.
+        """
+        if "outcome" not in quantities:
+            return np.asarray(True)
+        return (quantities["outcome"] == Outcome.STEPPED) & (
+            quantities.get("closure", 0.0) <= STATE_AGREEMENT_TOLERANCE
+        )
+
+    def mask_undefined_quantities(
+        self, quantities: QuantitiesByName, owners: np.ndarray
+    ) -> QuantitiesByName:
+        """Replace each quantity that is undefined for the wheel of a point by NaN."""
+        return quantities
+
+    def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
+        """Return a sentence that describes the end of a branch."""
+        return f"{end_name.replace('_', ' ')} at {parameter_value:.9g} ends it."
 
 
 class ContinuationStatus(StatusCode):

@@ -11,18 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.branches.abstract_continuation import (
-    ADMISSIBILITY,
-    BORDER_COLLISION,
-    EVENT_ORDER,
-    EVENT_ORDER_CHANGE,
-    MODULI,
-    AbstractContinuation,
-    PointTable,
-    QuantitiesByName,
-    stack_points,
-)
-from vrw_jax.branches.arclength import ContinuationPoint, ContinuationStatus
+from vrw_jax.branches.arclength import ContinuationPoint, ContinuationStatus, QuantitiesByName
 from vrw_jax.branches.branch import (
     BIFURCATIONS,
     BRANCH_POINT,
@@ -31,6 +20,16 @@ from vrw_jax.branches.branch import (
     SpecialPoint,
     classify_multipliers,
     has_unit_circle_pair,
+)
+from vrw_jax.branches.branch_continuation import (
+    ADMISSIBILITY,
+    BORDER_COLLISION,
+    EVENT_ORDER,
+    EVENT_ORDER_CHANGE,
+    MODULI,
+    Continuation,
+    PointTable,
+    stack_points,
 )
 from vrw_jax.gaits.floquet import EQUAL_MODULI_DISTANCE, UNIT_CIRCLE_DISTANCE
 from vrw_jax.lanes.batching import concatenate_tree_rows, replace_rows, select_tree_rows
@@ -196,7 +195,7 @@ MAX_EQUAL_PARAMETER_DISTANCE = 1e-7
 class _SpecialPointLocator(NamedTuple):
     """Locator of special points and branch ends between the computed points of branches."""
 
-    continuation: AbstractContinuation
+    continuation: Continuation
     table: PointTable
 
     def find_admissible_ranges(self, start_indices: Mapping[int, int]) -> list[AdmissibleRange]:
@@ -271,7 +270,7 @@ class _SpecialPointLocator(NamedTuple):
                 [requests[i].evaluate(table.tests)[row] for row, i in enumerate(indices)]
             )
 
-        accuracy = LOCATION_PARAMETER_ACCURACY * self.continuation.parameter_unit
+        accuracy = LOCATION_PARAMETER_ACCURACY * self.continuation.location_unit
         distances = np.maximum(np.abs(right.points.p - left.points.p), accuracy)
         tolerances = np.minimum(accuracy / distances, MIN_BRACKET_FRACTION)
         locations = locate_function_roots(
@@ -352,8 +351,8 @@ class _SpecialPointLocator(NamedTuple):
         """
         p, located_ends = self.table.points.p, {}
         max_distance = (
-            MAX_EXTRAPOLATED_STEPS * self.continuation.arclength_options.min_ds
-        ) * self.continuation.driver.parameter_range
+            MAX_EXTRAPOLATED_STEPS * self.continuation.options.min_ds
+        ) * self.continuation.parameter_range
         stalled = [
             (owner, end, indices[2::-1] if end == 0 else indices[-3:])
             for owner, indices, end_pairs in ranges
@@ -384,11 +383,11 @@ class _SpecialPointLocator(NamedTuple):
     def locate_inner_special_points(self) -> list[Root]:
         """Locate all special points of the branches except their ends."""
         points, tests = self.table.points, self.table.tests
-        problem, jump_pairs = self.continuation.continuation_problem, []
+        problem, jump_pairs = self.continuation.problem, []
         if problem.has_kinks:
             jump_pairs = find_state_jumps(
                 problem.section_state(points.z),
-                points.p / self.continuation.driver.parameter_range,
+                points.p / self.continuation.parameter_range,
                 points.fraction_rate,
                 self.table.find_pairs(np.arange(len(points.p))),
             )
@@ -468,7 +467,7 @@ class _SpecialPointLocator(NamedTuple):
         change is also omitted at a root of a quantity that explains it.
         """
         stepwise_kinds = [
-            t.kind for t in self.continuation.test_functions.values() if t.is_stepwise
+            t.kind for t in self.continuation.problem.test_functions.values() if t.is_stepwise
         ]
 
         def is_same_change(root: Root, earlier: Root) -> bool:
@@ -547,12 +546,12 @@ class BranchData(NamedTuple):
     quantities: QuantitiesByName
     special_points: tuple[SpecialPoint, ...]
     end_reasons: tuple[str, str]
-    # whether the mesh limits the branch, see `AbstractContinuation.is_mesh_limited`
+    # whether the mesh limits the branch, see `Continuation.is_mesh_limited`
     is_mesh_limited: bool
 
 
 def continue_and_locate_special_points(
-    continuation: AbstractContinuation,
+    continuation: Continuation,
     z: np.ndarray,
     parameter_values: np.ndarray,
     has_branch_start: np.ndarray,
@@ -599,7 +598,8 @@ def continue_and_locate_special_points(
     joined = locator.join_located_ends(admissible_ranges, located_ends)
     inner_roots = _SpecialPointLocator(continuation, joined).locate_inner_special_points()
 
-    kinds = {BRANCH_POINT, *(test.kind for test in continuation.test_functions.values())}
+    problem = continuation.problem
+    kinds = {BRANCH_POINT, *(test.kind for test in problem.test_functions.values())}
 
     def make_special_point(root: Root, ends_branch: bool) -> SpecialPoint:
         beside, name = select_tree_rows(root.beside.points, 0), root.name
@@ -612,7 +612,9 @@ def continue_and_locate_special_points(
             root.parameter,
             continuation.make_fixed_point(beside),
             ends_branch,
-            continuation.make_point_reader(int(root.beside.owners[0]), beside),
+            problem.make_point_reader(
+                select_tree_rows(continuation.wheels, root.beside.owners[0]), beside
+            ),
             root.n_multipliers,
         )
 
@@ -628,7 +630,7 @@ def continue_and_locate_special_points(
                 continue
             end_point = make_special_point(located_end, True)
             special_points.insert(0 if end == 0 else len(special_points), end_point)
-            end_reasons.append(continuation.describe_branch_end(end_point.name, end_point.value))
+            end_reasons.append(problem.describe_branch_end(end_point.name, end_point.value))
         rows = select_tree_rows(joined, joined.owners == owner)
         end_names = [point.name for point in special_points if point.ends_branch]
         branches[owner] = BranchData(

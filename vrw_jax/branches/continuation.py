@@ -10,8 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,24 +24,16 @@ from vrw_jax.base.checks import (
     check_type,
     require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure, find_own_measures, select_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import is_own_walker
-from vrw_jax.branches.abstract_continuation import (
-    BORDER_COLLISION,
-    EVENT_ORDER,
-    EVENT_ORDER_CHANGE,
-    AbstractContinuation,
-    QuantitiesByName,
-)
-from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
-from vrw_jax.branches.branch import BIFURCATIONS, Branch, SpecialPoint, TestFunction
+from vrw_jax.branches.arclength import ArclengthOptions
+from vrw_jax.branches.branch import Branch, SpecialPoint
+from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation_problems import (
-    FRICTION_SURPLUS,
     AbstractGaitProblem,
     BranchWheel,
     CollocationProblem,
@@ -51,30 +42,25 @@ from vrw_jax.branches.continuation_problems import (
 )
 from vrw_jax.branches.map_branch import (
     check_arclength_options,
-    continue_hybrid_branch,
-    make_stability_variables,
+    make_branch,
+    make_walker_problem,
+    read_switch,
+    trace_fixed_points,
 )
-from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.gait_search import limit_cycles, resolve_model
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.batching import (
     select_rows_on_device,
-    select_tree_rows,
 )
 from vrw_jax.models.measures import (
     FORCE_PEAK_MEASURES,
-    MARGIN_MEASURES,
     MEASURES,
-    STEP_MEASURES,
-    UNILATERAL_STEP_MEASURES,
-    describe_parameter,
-    make_labeled_variables,
-    make_locked_leg_coordinate,
 )
 from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.stepping import (
@@ -94,8 +80,6 @@ class BranchStart(NamedTuple):
     wheels: BranchWheel
     z: np.ndarray
     outcomes: np.ndarray  # outcomes of the first gaits
-    # function of (wheel index, point) that returns a function, which finds the gait at the point
-    make_point_reader: Callable | None = None
     cycles: Any = None  # the first gaits
     # None for a problem without a mesh
     finer_cycle_options: CycleOptions | None = None
@@ -127,16 +111,17 @@ def find_branch_starts(
         return _find_collocation_starts(params, cycle, cycle_options, problem_fields)
     wheels = BranchWheel(model.collect_batch_parameter_values(params))
     problem_class = ContactGaitProblem if gait_finder.is_multistable else ReturnMapProblem
-    n_coordinates = model.count_continuous_section_entries(params)
-    problem = problem_class(**problem_fields, n_coordinates=n_coordinates)
+    units = (1.0,) * model.count_continuous_section_entries(params)
+    problem = problem_class(units, **problem_fields)
+    (name,) = problem.continued_names
 
     def walk_to_gait(params: WheelParams, p: Array) -> tuple[Array, Array]:
-        model_at_p, params = model.with_parameter(params, problem.parameter_name, p)
+        model_at_p, params = model.with_parameter(params, name, p)
         walk = start_walk_toward_gait(model_at_p, params, step_options)
         return walk.steps.section_state[-1], walk.outcome
 
     if cycle is None and gait_finder.is_multistable:
-        values = problem.replace_parameter(wheels, parameter_values)
+        values = problem.replace_parameters(wheels, parameter_values)
         cycle = gait_finder.find_cycles_near(
             values, gait_finder.make_initial_guesses(jnp.asarray(values))
         )
@@ -145,20 +130,6 @@ def find_branch_starts(
     else:
         z, outcomes = cycle.section_state, cycle.outcome
     return BranchStart(problem, wheels, np.asarray(z), np.asarray(outcomes))
-
-
-def find_special_cycle(
-    gait_finder: Any, parameter_name: str, params: WheelParams, guess: CollocationState, p: float
-) -> LimitCycle:
-    """Find the limit cycle at a special point, from the collocation state at the point next to it.
-
-    - `gait_finder`: finder of the branch's gaits;
-    - `parameter_name`: name of the continued parameter;
-    - `params`: wheel at the start of the branch.
-    """
-    params, guess, p = jax.device_put((params, guess, p))
-    _, params = gait_finder.model.with_parameter(params, parameter_name, p)
-    return gait_finder.find_cycle(params, guess)
 
 
 def _find_collocation_starts(
@@ -194,130 +165,33 @@ def _find_collocation_starts(
     system = gait_finder.collocation_system
     transfer_to_mesh = functools.partial(transfer_solution_to_mesh, cycle.system, system)
     solution = jax.vmap(transfer_to_mesh)(cycle.collocation_state.solution)
+    # A gait of fewer steps is repeated.
+    repeat = lambda x: jnp.concatenate([x] * (period_n // x.shape[1]), 1)
+    states, *by_step = solution
+    solution = CollocationSolution(states, *jax.tree.map(repeat, by_step))
     problem = CollocationProblem(
         **problem_fields,
         collocation_system=system,
         shapes=tuple(x.shape[1:] for x in jax.tree.leaves(solution)),
     )
-
-    def make_point_reader(wheel_index: int, point: ContinuationPoint) -> Callable[[], LimitCycle]:
-        wheel, state = select_tree_rows((params, cycle.collocation_state), wheel_index)
-        # A partial call can be pickled.
-        return functools.partial(
-            find_special_cycle,
-            gait_finder,
-            problem.parameter_name,
-            wheel,
-            state._replace(solution=problem.unpack(point.z)),
-            float(point.p),
-        )
-
     return BranchStart(
         problem,
         BranchWheel(
             model.collect_batch_parameter_values(params),
-            np.asarray(cycle.collocation_state.is_phase_active),
+            np.asarray(repeat(cycle.collocation_state.is_phase_active)),
         ),
         problem.pack(solution),
         np.asarray(cycle.outcome),
-        make_point_reader,
         cycle,
         cycle_options.refine_mesh(),
     )
 
 
-DOUBLE_SUPPORT_INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
-BRANCH_ENDING_QUANTITIES = (
-    *DOUBLE_SUPPORT_INDICATOR_NAMES,
-    "duration_dls",
-    "duration_sls1",
-    "duration_sls2",
-)
-"""Names of the quantities that end a branch if they vanish, because the order of events changes."""
-
-SECOND_PEAK_RATE_NAME = "second_peak_rate"
-"""Name of a measure of the gait's force. If it is zero, a force peak appears inside a phase."""
-FORCE_PEAK_COUNT, FORCE_PEAK_COUNT_CHANGE = "n_force_peaks", "number_of_force_peaks_changes"
-"""Name of the number of force peaks, and of the special point at which a peak appears or
-disappears, at an event or inside a phase.
-"""
-
-GAIT_TEST_FUNCTIONS: Mapping[str, TestFunction] = {
-    **BIFURCATIONS,
-    **{name: TestFunction("lost", "A phase vanishes.", True) for name in BRANCH_ENDING_QUANTITIES},
-    FRICTION_SURPLUS: TestFunction("lost", "No contact carries the weight along the slope.", True),
-    **{
-        name: TestFunction(BORDER_COLLISION, MEASURES[name].description) for name in MARGIN_MEASURES
-    },
-    **{
-        name: TestFunction(BORDER_COLLISION, "A landing without double support begins.", True)
-        for name in DOUBLE_SUPPORT_INDICATOR_NAMES
-    },
-    SECOND_PEAK_RATE_NAME: TestFunction(
-        BORDER_COLLISION, "A force peak appears inside a phase.", explains=FORCE_PEAK_COUNT_CHANGE
-    ),
-    EVENT_ORDER: TestFunction(EVENT_ORDER_CHANGE, "Events change their order.", is_stepwise=True),
-    FORCE_PEAK_COUNT: TestFunction(
-        FORCE_PEAK_COUNT_CHANGE, "A force peak appears or disappears.", is_stepwise=True
-    ),
-}
-"""Test functions of gaits by name."""
-
 DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 """Advice in the error message for a caller who differentiates a branch."""
 
-
 # Largest number of mesh refinements of a gait on a branch or a curve.
 MAX_BRANCH_MESH_REFINEMENTS = 3
-
-
-def split_legs(quantities: QuantitiesByName, n_legs: int) -> QuantitiesByName:
-    """Return quantities with one for each leg, in addition to margins that have a value per leg."""
-    for name, margin in MARGIN_MEASURES.items():
-        if margin.leg_dimension and name in quantities:
-            quantities |= {
-                f"{name}[{leg}]": quantities[name][..., leg - 3] for leg in range(3, n_legs + 1)
-            }
-    return quantities
-
-
-@dataclass(frozen=True)
-class GaitContinuation(AbstractContinuation):
-    """Continuation of gaits."""
-
-    cycle_finder: Callable | None  # see `BranchStart.make_point_reader`
-
-    test_functions: ClassVar[Mapping[str, TestFunction]] = GAIT_TEST_FUNCTIONS
-    linear_margin_substitutes: ClassVar[Mapping[str, str]] = {
-        "clearance_sls1": "takeoff_acceleration"
-    }
-    """Names of margins that vanish as a cube. Each margin is mapped to a quantity that vanishes
-    linearly at the same point.
-
-    A foot that takes off less steeply descends less deeply, until it rises immediately. A solver
-    cannot resolve the shallowest descents, but the linear quantity changes its sign.
-    """
-
-    def make_point_reader(self, owner: int, point: ContinuationPoint) -> Callable | None:
-        return self.cycle_finder and self.cycle_finder(owner, point)
-
-    def evaluate_point_quantities(
-        self, wheels: BranchWheel, points: ContinuationPoint
-    ) -> QuantitiesByName:
-        """Return the measures of the gaits by name.
-
-        If a margin has one value per leg, the result contains one quantity for each leg.
-        """
-        problem: Any = self.continuation_problem
-        return split_legs(problem.measure_gaits(wheels, points), problem.n_legs)
-
-    def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
-        if end_name != FRICTION_SURPLUS:
-            return super().describe_branch_end(end_name, parameter_value)
-        return (
-            f"At {parameter_value:.9g} the friction coefficient is the tangent of the slope: "
-            "with less no contact carries the weight along the slope, and no gait repeats."
-        )
 
 
 @announce_wait("gaits, their derivatives and special points", "30 s")
@@ -385,8 +259,8 @@ def continue_branch(
             distance to a guard. Their minima over the gait are measures of the branch.
         measures: measures of your own, see `vrw.measure`, for the dataset of the branch. For a
             walker of yours, also names of its measures.
-        switch_at: for a `HybridSystem`, a branch point or period doubling of the branch of `cycle`.
-            The branch that crosses there is continued, or that of gaits of twice the period.
+        switch_at: a branch point or period doubling of the branch through `params`. The branch that
+            crosses there is continued, or that of gaits of twice the period.
 
     Returns:
         A `Branch`. If there is no gait from which to start, `outcome` is the reason.
@@ -407,14 +281,18 @@ def continue_branch(
                 "cycle_options or force_peaks is given for a wheel, but the model is a walker of "
                 "yours: give step_options=vrw.StepOptions(...), and measures= for peaks."
             )
-        return continue_hybrid_branch(
-            model, params, name, bounds, cycle, period_n, step_options, options, margins, switch_at,
-            measures,
+        problem, wheel = make_walker_problem(
+            model, params, (name,), cycle, period_n, step_options, margins, measures
+        )
+        value = float(wheel.values[problem.parameter_indices[0]])
+        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
+        return trace_fixed_points(
+            problem, cycle.section_state, value, bounds, wheel, name, options, switch_at,
+            params=params,
         )  # fmt: skip
-    if margins or switch_at is not None:
+    if margins:
         raise ValueError(
-            "margins and switch_at are for a walker of yours, but the model is a wheel: leave them "
-            "out, and give cycle=vrw.limit_cycle(..., period_n=2) for gaits of two steps."
+            "margins are for a walker of yours, but a wheel has its own margins: leave them out."
         )
     require_single_wheel(params, "use vrw.continue_branches for a batch")
     if cycle is not None:
@@ -425,7 +303,7 @@ def continue_branch(
         params_batch, name, bounds, cycle=cycle, period_n=period_n, options=options,
         model=convert_model_argument(resolve_model(params, model)),
         cycle_options=cycle_options, step_options=step_options, force_peaks=force_peaks,
-        measures=measures,
+        measures=measures, switch_at=switch_at,
     )  # fmt: skip
     return branch
 
@@ -444,6 +322,7 @@ def continue_branches(
     step_options: StepOptions | None = None,
     force_peaks: bool = False,
     measures: Sequence[str | Measure] = (),
+    switch_at: SpecialPoint | None = None,
 ) -> tuple[Branch, ...]:
     """Continue the branches of a batch of wheels, as `continue_branch` does for one wheel.
 
@@ -462,6 +341,7 @@ def continue_branches(
         step_options: as in `continue_branch`.
         force_peaks: as in `continue_branch`.
         measures: as in `continue_branch`.
+        switch_at: as in `continue_branch`, for a batch of one wheel.
 
     Returns:
         One `Branch` per wheel.
@@ -487,7 +367,7 @@ def continue_branches(
         "model": model,
         "step_options": step_options,
         "n_legs": params.n_legs,
-        "parameter_name": name,
+        "continued_names": (name,),
         "period_n": period_n,
         "measures_force_peaks": force_peaks,
         "own_measures": select_measures(measures, ()),
@@ -496,32 +376,30 @@ def continue_branches(
     limits, options = np.array(check_range("bounds", bounds)), check_arclength_options(options)
     if n_wheels == 0:
         return ()
+    tangent = None
+    if switch_at is not None:
+        n_periods, tangent = read_switch(switch_at, 1.0, limits)
+        problem_fields["period_n"] = n_periods * period_n
+        if n_wheels > 1:
+            raise ValueError("switch_at is for one wheel, but the batch has more: give one wheel.")
+        cycle = select_rows_on_device(switch_at.cycle, None)
     # The batch is padded to a power of two, because each size compiles programs.
     indices = np.minimum(np.arange(1 << (n_wheels - 1).bit_length()), n_wheels - 1)
     pad = lambda x: np.broadcast_to(np.asarray(x), (n_wheels,))[indices]
-    parameter_values = np.clip(pad(model.get_parameter(params, name)), *limits)
+    value = model.get_parameter(params, name) if switch_at is None else switch_at.value
+    parameter_values = np.clip(pad(value), *limits)
     params, parameter_values = jax.device_put((jax.tree.map(pad, params), parameter_values))
     if isinstance(cycle, AbstractCycle) and len(indices) > n_wheels:
         cycle = select_rows_on_device(cycle, indices)
     if name != FRICTION_NAME:
         _, params = model.with_parameter(params, name, parameter_values)
-    start_outcomes, branch_data = _continue_gait_branches(
-        params, parameter_values, cycle, cycle_options, problem_fields, options, limits, n_wheels
-    )
+    start, branch_data = _continue_gait_branches(
+        params, parameter_values, cycle, cycle_options, problem_fields, options, limits, n_wheels,
+        tangent,
+    )  # fmt: skip
     return tuple(
-        _make_labeled_gait_branch(
-            data,
-            select_rows_on_device(params, i),
-            name,
-            model,
-            step_options,
-            outcome,
-            problem_fields["own_measures"],
-            period_n,
-        )
-        for i, (data, outcome) in enumerate(
-            zip(branch_data[:n_wheels], start_outcomes.tolist(), strict=False)
-        )
+        _make_gait_branch(start, i, data, select_rows_on_device(params, i))
+        for i, data in enumerate(branch_data[:n_wheels])
     )
 
 
@@ -531,7 +409,7 @@ def _check_branches(
     cycle_options: CycleOptions | None,
     *,
     model: Any,
-    parameter_name: str,
+    continued_names: tuple[str],
     period_n: int,
     step_options: StepOptions,
     measures_force_peaks: bool,
@@ -544,7 +422,7 @@ def _check_branches(
             "the ladder can't be followed, since its gaits jump where the model changes: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
-    check_parameter_name(parameter_name, model.parameter_names, "parameter")
+    check_parameter_name(*continued_names, model.parameter_names, "parameter")
     if check_int("period_n", period_n) > model.leg_period and cycle is None:
         raise ValueError(
             f"period_n is {period_n} and there is no cycle, but a gait of several steps is one of "
@@ -582,10 +460,11 @@ def _continue_gait_branches(
     options: ArclengthOptions,
     bounds: np.ndarray,
     n_wheels: int,
-) -> tuple[np.ndarray, list[BranchData | None]]:
+    crossed_tangent: np.ndarray | None,
+) -> tuple[BranchStart, list[BranchData | None]]:
     """Continue the branches of the first `n_wheels` wheels from their start gaits.
 
-    Return the outcomes of the starts, and the data of the branches. Any further wheels only pad the
+    Return the starts, and the data of the branches. Any further wheels only pad the
     batch. See `find_branch_starts`.
     """
     can_refine_mesh = cycle_options is None
@@ -598,13 +477,7 @@ def _continue_gait_branches(
         has_start = start.outcomes == Outcome.STEPPED
         has_start &= np.arange(len(has_start)) < n_wheels
         branch_data = continue_and_locate_special_points(
-            GaitContinuation(
-                start.problem,
-                options,
-                start.wheels,
-                bounds,
-                start.make_point_reader,
-            ),
+            Continuation(start.problem, options, bounds, start.wheels, crossed_tangent),
             start.z,
             np.asarray(parameter_values),
             has_start,
@@ -618,83 +491,19 @@ def _continue_gait_branches(
         if is_finest_mesh or not any(needs_finer_mesh):
             break
         cycle_options, cycle = start.finer_cycle_options, start.cycles
-    return start.outcomes, branch_data
+    return start, branch_data
 
 
-MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
-"""Names of measures of the event-driven step that the dataset of a branch does not contain."""
-
-
-def _make_labeled_gait_branch(
-    branch_data: BranchData | None,
-    params: WheelParams,
-    parameter_name: str,
-    model: Any,
-    step_options: StepOptions,
-    start_outcome: int,
-    own_measures: tuple[Measure, ...],
-    period_n: int,
+def _make_gait_branch(
+    start: BranchStart, index: int, data: BranchData | None, params: WheelParams
 ) -> Branch:
-    start_provenance = collect_provenance_attributes(params, model, step_options)
-    start_provenance.pop(f"parameter_{parameter_name}", None)
-    branch_attrs = {"title": f"Branch of limit cycles along {parameter_name}"} | start_provenance
-    if branch_data is None:
-        branch_outcome = Outcome(start_outcome)
-        if branch_outcome == Outcome.STEPPED:
-            branch_outcome = Outcome.NO_CYCLE_FOUND
-        empty_dataset = xr.Dataset(
-            coords={parameter_name: ("point", np.zeros(0))}, attrs=branch_attrs
-        )
-        return Branch(parameter_name, empty_dataset, (), ("", ""), branch_outcome)
-    points, quantity_table, special_points, end_reasons, _ = branch_data
-    measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES | FORCE_PEAK_MEASURES
-    branch_variables = make_labeled_variables(
-        {
-            measure_name: quantity_table[measure_name]
-            for measure_name in measures
-            if measure_name in quantity_table and measure_name not in MEASURES_OUTSIDE_BRANCHES
-        },
-        "point",
-    )
-    for measure in own_measures:
-        branch_variables[measure.name] = xr.Variable(
-            "point", quantity_table[measure.name], measure.variable_attributes
-        )
-    branch_variables["section_state"] = xr.Variable(
-        ("point", "component"),
-        quantity_table["section_state"],
-        {"long_name": "section state just before touchdown"},
-    )
-    branch_variables["closure"] = xr.Variable(
-        "point",
-        quantity_table["closure"],
-        {"units": "1", "long_name": "miss of the section state after one event-driven period"},
-    )
-    component_names = ["theta", "dtheta", "dL1"]
-    if quantity_table["section_state"].shape[-1] != len(component_names):
-        leg_names = [
-            f"{quantity_name}{leg_number}"
-            for quantity_name in ("L", "dL", "code")
-            for leg_number in range(1, params.n_legs + 1)
-        ]
-        component_names = ["theta", "dtheta", "vx", "vz", *leg_names]
-    branch_coordinates = {
-        parameter_name: xr.Variable(
-            "point",
-            points.p,
-            describe_parameter(
-                parameter_name, model.parameter_domains[parameter_name]
-            ).variable_attributes,
-        ),
-        "component": component_names,
-        "leg": make_locked_leg_coordinate(params.n_legs),
-    }
-    branch_dataset = xr.Dataset(
-        branch_variables | make_stability_variables(points.return_map_jacobian),
-        branch_coordinates,
-        branch_attrs,
-    )
-    return Branch(
-        parameter_name, branch_dataset, special_points, end_reasons, Outcome.STEPPED,
-        params.attach_laws(None), period_n,
-    )  # fmt: skip
+    problem = start.problem
+    (name,) = problem.continued_names
+    provenance = collect_provenance_attributes(params, problem.model, problem.step_options)
+    provenance.pop(f"parameter_{name}", None)
+    attributes = {"title": f"Branch of limit cycles along {name}"} | provenance
+    outcome = Outcome(int(start.outcomes[index]))
+    if data is None and outcome == Outcome.STEPPED:
+        outcome = Outcome.NO_CYCLE_FOUND
+    start_params = None if data is None else params.attach_laws(None)
+    return make_branch(problem, data, name, attributes, start_params, outcome)

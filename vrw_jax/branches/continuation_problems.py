@@ -2,13 +2,14 @@
 
 `CollocationProblem` is the fastest problem. It solves the collocation equations of the paper's
 sequence of phases, with one linearization per Newton iteration. `ContactGaitProblem` uses batches
-of gait steps with unilateral contact. `ReturnMapProblem` applies to every model. It iterates the
-gait step of the model and differentiates it in forward mode.
+of gait steps with unilateral contact. `ReturnMapProblem` applies to every walker. It iterates the
+gait step of the walker and differentiates it in forward mode.
 """
 
+import abc
 import functools
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,21 +21,40 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.base import batch_sizes
+from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.branches.abstract_continuation import EVENT_ORDER, QuantitiesByName
-from vrw_jax.branches.arclength import AbstractContinuationProblem, ContinuationPoint, NewtonStep
-from vrw_jax.gaits.collocation_search import CollocationSystem
+from vrw_jax.base.walker import make_return_map
+from vrw_jax.branches.arclength import (
+    AbstractContinuationProblem,
+    ContinuationPoint,
+    NewtonStep,
+    QuantitiesByName,
+)
+from vrw_jax.branches.branch import BIFURCATIONS, TestFunction
+from vrw_jax.branches.branch_continuation import BORDER_COLLISION, EVENT_ORDER, EVENT_ORDER_CHANGE
+from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem
+from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.force_peaks import locate_force_peaks
-from vrw_jax.gaits.limit_cycle_result import evaluate_own_measure
+from vrw_jax.gaits.limit_cycle_result import evaluate_own_measure, land_foot
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.return_map_finder import measure_return_map_force_peaks
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
-from vrw_jax.lanes.batching import map_in_numpy_batches
+from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 from vrw_jax.lanes.lane_function import compile_batch_function
-from vrw_jax.models.measures import MARGIN_MEASURES, MEASURES, STOPPER_MARGIN_MEASURES
+from vrw_jax.models.measures import (
+    FORCE_PEAK_MEASURES,
+    MARGIN_MEASURES,
+    MEASURES,
+    STEP_MEASURES,
+    STOPPER_MARGIN_MEASURES,
+    UNILATERAL_STEP_MEASURES,
+    describe_parameter,
+    make_labeled_variables,
+    make_locked_leg_coordinate,
+)
 from vrw_jax.models.step_results import AbstractStep
 from vrw_jax.wheel.params import FRICTION_NAME
 
@@ -44,12 +64,71 @@ FRICTION_SURPLUS = "friction_above_slope"
 The tangent is the smallest friction coefficient for which a gait exists.
 """
 
+DOUBLE_SUPPORT_INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
+BRANCH_ENDING_QUANTITIES = (
+    *DOUBLE_SUPPORT_INDICATOR_NAMES,
+    "duration_dls",
+    "duration_sls1",
+    "duration_sls2",
+)
+"""Names of the quantities that end a branch if they vanish, because the order of events changes."""
+
+SECOND_PEAK_RATE_NAME = "second_peak_rate"
+"""Name of a measure of the gait's force. If it is zero, a force peak appears inside a phase."""
+FORCE_PEAK_COUNT, FORCE_PEAK_COUNT_CHANGE = "n_force_peaks", "number_of_force_peaks_changes"
+"""Name of the number of force peaks, and of the special point at which a peak appears or
+disappears, at an event or inside a phase.
+"""
+
+GAIT_TEST_FUNCTIONS: Mapping[str, TestFunction] = {
+    **BIFURCATIONS,
+    **{name: TestFunction("lost", "A phase vanishes.", True) for name in BRANCH_ENDING_QUANTITIES},
+    FRICTION_SURPLUS: TestFunction("lost", "No contact carries the weight along the slope.", True),
+    **{
+        name: TestFunction(BORDER_COLLISION, MEASURES[name].description) for name in MARGIN_MEASURES
+    },
+    **{
+        name: TestFunction(BORDER_COLLISION, "A landing without double support begins.", True)
+        for name in DOUBLE_SUPPORT_INDICATOR_NAMES
+    },
+    SECOND_PEAK_RATE_NAME: TestFunction(
+        BORDER_COLLISION, "A force peak appears inside a phase.", explains=FORCE_PEAK_COUNT_CHANGE
+    ),
+    EVENT_ORDER: TestFunction(EVENT_ORDER_CHANGE, "Events change their order.", is_stepwise=True),
+    FORCE_PEAK_COUNT: TestFunction(
+        FORCE_PEAK_COUNT_CHANGE, "A force peak appears or disappears.", is_stepwise=True
+    ),
+}
+"""Test functions of gaits by name."""
+
+LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = {"clearance_sls1": "takeoff_acceleration"}
+"""Names of margins that vanish as a cube. Each margin is mapped to a quantity that vanishes
+linearly at the same point.
+
+A foot that takes off less steeply descends less deeply, until it rises immediately. A solver cannot
+resolve the shallowest descents, but the linear quantity changes its sign.
+"""
+
+
+def split_legs(quantities: QuantitiesByName, n_legs: int) -> QuantitiesByName:
+    """Return quantities with one for each leg, in addition to margins that have a value per leg."""
+    for name, margin in MARGIN_MEASURES.items():
+        if margin.leg_dimension and name in quantities:
+            quantities |= {
+                f"{name}[{leg}]": quantities[name][..., leg - 3] for leg in range(3, n_legs + 1)
+            }
+    return quantities
+
+
 MIN_FRICTION_SURPLUS = 1e-9
 """Smallest admissible surplus of friction, as a fraction of the slope's tangent.
 
 The value is chosen to exceed the round-off of friction. If friction equals the tangent, gaits of
 every speed repeat.
 """
+
+MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
+"""Names of measures of the event-driven step that the dataset of a branch does not contain."""
 
 POINT_BATCH_SIZES = (batch_sizes.LOCATION_BATCH_SIZES[-1],)
 """Number of points that one call of an XLA program computes, one size so that it compiles once."""
@@ -92,71 +171,142 @@ def _linearize_map(
     return jax.vmap(linearize)(args, z, p)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class AbstractStateProblem(AbstractContinuationProblem):
-    """Base class of problems whose unknowns are section states.
-
-    Components after the first `n_coordinates` are discrete codes, which Newton's method copies from
-    the image under the map. It converges only if state and image have equal codes.
-    """
-
-    n_coordinates: int
-
-    def section_state(self, z: np.ndarray) -> np.ndarray:
-        return z[..., : self.n_coordinates]
-
-    def interpolate(self, left: np.ndarray, right: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-        """Interpolate the coordinates; the discrete codes are those of the nearer state."""
-        nearer = np.where(fraction[:, None] < 0.5, left, right)
-        between, n = super().interpolate(left, right, fraction), self.n_coordinates
-        return np.concatenate([between[:, :n], nearer[:, n:]], 1)
-
-    def is_smooth_between(self, left: np.ndarray, right: np.ndarray) -> bool:
-        return bool(np.all(left[self.n_coordinates :] == right[self.n_coordinates :]))
+def make_walker(model: Any, values: Any, n_legs: int) -> tuple[Any, Any]:
+    """Return a walker, of a user or a wheel, and its parameters with the given values."""
+    model, params = model.from_parameter_values(values, n_legs)
+    return getattr(model, "walker", model), params
 
 
 @dataclass(frozen=True, eq=False)
-class MapProblem(AbstractContinuationProblem):
-    """Continuation problem for the fixed points of a map x -> `function(args, x, p)`.
+class AbstractStateProblem(AbstractContinuationProblem):
+    """Base class of problems whose unknowns are section states in units, fixed points of a map.
 
-    JAX differentiates the map in forward mode. The map returns NaN where it is undefined. The
-    unknowns are x in the given units. If p is a vector, there is a tangent for each entry.
+    Components without a unit are discrete codes, which Newton's method copies from the image under
+    the map. It converges only if state and image have equal codes.
     """
 
-    function: Callable[[Any, Array, Array], Array]
-    units: tuple[float, ...]  # one unit for each component
+    units: tuple[float, ...]
+
+    @property
+    def section_units(self) -> np.ndarray:
+        return np.array(self.units)
+
+    @property
+    @abc.abstractmethod
+    def function(self) -> Callable[[Any, Array, Array], Array]:
+        """Return the map x -> `function(args, x, p)`, which is NaN where it is undefined.
+
+        If p is a vector, there is a tangent for each entry.
+        """
 
     def linearize(self, args: Any, z: np.ndarray, p: np.ndarray) -> NewtonStep:
         linearize = functools.partial(_linearize_map, self.function, self.units)
         return map_in_numpy_batches(linearize, POINT_BATCH_SIZES, args, z, p)
 
+    def section_state(self, z: np.ndarray) -> np.ndarray:
+        return z[..., : len(self.units)]
+
+    def interpolate(self, left: np.ndarray, right: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+        """Interpolate the coordinates; the discrete codes are those of the nearer state."""
+        nearer = np.where(fraction[:, None] < 0.5, left, right)
+        between, n = super().interpolate(left, right, fraction), len(self.units)
+        return np.concatenate([between[:, :n], nearer[:, n:]], 1)
+
+    def is_smooth_between(self, left: np.ndarray, right: np.ndarray) -> bool:
+        return bool(np.all(left[len(self.units) :] == right[len(self.units) :]))
+
+
+@dataclass(frozen=True, eq=False)
+class MapProblem(AbstractStateProblem):
+    """Continuation problem for the fixed points of any map, which JAX differentiates."""
+
+    iterated_map: Callable[[Any, Array, Array], Array]
+    period_n: int = 1  # number of iterates
+
+    may_start_singular: ClassVar[bool] = True
+
+    @property
+    def function(self) -> Callable[[Any, Array, Array], Array]:
+        if self.period_n == 1:
+            return self.iterated_map
+
+        def iterate(args: Any, x: Array, p: Array) -> Array:
+            for _ in range(self.period_n):
+                x = self.iterated_map(args, x, p)
+            return x
+
+        return iterate
+
+    def measure(self, args: Any, points: ContinuationPoint) -> QuantitiesByName:
+        return {"x": self.section_units * points.z}
+
+    def label(self, quantities: QuantitiesByName) -> tuple[dict, dict]:
+        return {"x": (("point", "component"), quantities["x"])}, {}
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AbstractGaitProblem(AbstractContinuationProblem):
-    """Continuation problem of gaits in one parameter of the wheel.
+    """Continuation problem of gaits in one parameter of the walker, or in several at once.
 
     Event-driven steps of the model measure the gaits. The unknowns are the section state, unless a
     class defines others.
+
+    - `continued_names`: names of the continued parameters, of which p contains the values.
     """
 
     model: Any
     step_options: StepOptions
-    n_legs: int
-    parameter_name: str
+    continued_names: tuple[str, ...]
     period_n: int
-    measures_force_peaks: bool
+    n_legs: int = 0
+    measures_force_peaks: bool = False
     own_measures: tuple[Measure, ...] = ()  # of the user
 
-    @property
-    def parameter_index(self) -> int:
-        """Return the index of the continued parameter."""
-        return self.model.parameter_names.index(self.parameter_name)
+    test_functions: ClassVar[Mapping[str, TestFunction]] = GAIT_TEST_FUNCTIONS
+    linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
+    location_unit: ClassVar[float | None] = 1.0
 
-    def replace_parameter(self, wheels: BranchWheel, p: Any, name: str = "") -> np.ndarray:
-        """Return the parameters of wheels, where the continued or a named one has the value p."""
+    @property
+    def parameter_indices(self) -> tuple[int, ...]:
+        """Return the indices of the continued parameters."""
+        return tuple(map(self.model.parameter_names.index, self.continued_names))
+
+    def replace_parameters(self, wheels: BranchWheel, p: Any) -> np.ndarray:
+        """Return the parameters of wheels, where the continued ones have the values p."""
         values = np.array(wheels.values)
-        values[..., self.model.parameter_names.index(name or self.parameter_name)] = p
+        values[..., self.parameter_indices] = np.reshape(p, (*values.shape[:-1], -1))
         return values
+
+    def split_parameters(self, values: np.ndarray) -> tuple[Any, Any]:
+        """Return the walker and its parameters for rows of values."""
+        return make_walker(self.model, tuple(map(jnp.asarray, values.T)), self.n_legs)
+
+    def make_finder(self) -> Any:
+        """Return the finder of the gaits of the model."""
+        return make_finder(
+            self.model, self.n_legs, period_n=self.period_n, step_options=self.step_options
+        )
+
+    def make_guess(self, wheel: BranchWheel, z: np.ndarray) -> Any:
+        """Return the guess from which a gait is found near the unknowns z."""
+        return z
+
+    def make_point_reader(self, wheel: BranchWheel, point: ContinuationPoint) -> Callable:
+        # A partial call can be pickled.
+        return functools.partial(
+            _find_cycle,
+            self.make_finder(),
+            self.replace_parameters(wheel, point.p),
+            self.make_guess(wheel, point.z),
+        )
+
+    def linearize_with_quantities(
+        self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray, quantity_function: Any
+    ) -> tuple[NewtonStep, list]:
+        """Return Newton's steps, and the quantities and JVPs of a `GaitQuantityFunction`, if the
+        problem can compute them.
+        """
+        return self.linearize(wheels, z, p), []
 
     def read_gaits(
         self, wheels: BranchWheel, values: np.ndarray, z: np.ndarray
@@ -170,9 +320,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
 
     def take_steps(self, values: np.ndarray, states: np.ndarray) -> Any:
         """Return the event-driven steps of one period, on an axis after that of the gaits."""
-        columns = tuple(map(jnp.asarray, values.T))
-        model, params = self.model.from_parameter_values(columns, self.n_legs)
-        steps = []
+        (model, params), steps = self.split_parameters(values), []
         for k in range(self.period_n):
             step_params = model.select_params(params, k)
             steps.append(model.take_steps(step_params, states, self.step_options))
@@ -185,17 +333,60 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         """Return further quantities of gaits, which only some models have."""
         return {}
 
-    def measure_gaits(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantitiesByName:
-        """Return the measures of the gaits at many points by name."""
-        values = self.replace_parameter(wheels, points.p)
+    def measure(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantitiesByName:
+        """Return the measures of the gaits at many points by name.
+
+        If a margin has one value per leg, the result contains one quantity for each leg too.
+        """
+        values = self.replace_parameters(wheels, points.p)
         states, quantities = self.read_gaits(wheels, values, points.z)
         steps = self.take_steps(values, states)
-        return {
+        quantities = {
             **map_in_numpy_batches(_combine_period_measures, POINT_BATCH_SIZES, steps, states),
             **quantities,
             **self.measure_steps(values, states, steps),
             "section_state": states,
         }
+        return split_legs(quantities, self.n_legs)
+
+    def describe_parameter(self, name: str) -> dict[str, str]:
+        return describe_parameter(name, self.model.parameter_domains[name]).variable_attributes
+
+    def label(self, quantities: QuantitiesByName) -> tuple[dict, dict]:
+        measures = STEP_MEASURES | MARGIN_MEASURES | UNILATERAL_STEP_MEASURES | FORCE_PEAK_MEASURES
+        variables = make_labeled_variables(
+            {
+                name: quantities[name]
+                for name in measures
+                if name in quantities and name not in MEASURES_OUTSIDE_BRANCHES
+            },
+            "point",
+        )
+        for own in self.own_measures:
+            attributes = own.variable_attributes
+            variables[own.name] = xr.Variable("point", quantities[own.name], attributes)
+        states, names = quantities["section_state"], ["theta", "dtheta", "dL1"]
+        variables["section_state"] = xr.Variable(
+            ("point", "component"), states, {"long_name": "section state just before touchdown"}
+        )
+        variables["closure"] = xr.Variable(
+            "point",
+            quantities["closure"],
+            {"units": "1", "long_name": "miss of the section state after one event-driven period"},
+        )
+        if states.shape[-1] != len(names):
+            legs = range(1, self.n_legs + 1)
+            leg_names = [f"{name}{leg}" for name in ("L", "dL", "code") for leg in legs]
+            names = ["theta", "dtheta", "vx", "vz", *leg_names]
+        return variables, {"component": names, "leg": make_locked_leg_coordinate(self.n_legs)}
+
+    def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
+        if end_name != FRICTION_SURPLUS:
+            return super().describe_branch_end(end_name, parameter_value)
+        return (
+            f"At {parameter_value:.9g} the friction coefficient is the tangent of the slope: "
+            "with less no contact carries the weight along the slope, and no gait repeats."
+        )
 
 
 SolutionShapes = tuple[tuple[int, ...], ...]
@@ -239,12 +430,46 @@ class CollocationProblem(AbstractGaitProblem):
         return unpack_solution(self.shapes, z)
 
     def linearize(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> NewtonStep:
-        linearize_trials = make_trial_linearizer(self.collocation_system, (self.parameter_index,))
-        correction, tangents, monodromy = linearize_trials(
-            self.replace_parameter(wheels, p), wheels.is_phase_active, self.unpack(z)
+        return self.linearize_with_quantities(wheels, z, p, None)[0]
+
+    def linearize_with_quantities(
+        self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray, quantity_function: Any
+    ) -> tuple[NewtonStep, list]:
+        linearize_trials = make_trial_linearizer(
+            self.collocation_system, self.parameter_indices, quantity_function
         )
-        tangent = jax.tree.map(lambda x: x[:, 0], tangents)
-        return NewtonStep(self.pack(correction), self.pack(tangent), monodromy)
+        correction, tangents, monodromy, *quantities = linearize_trials(
+            self.replace_parameters(wheels, p), wheels.is_phase_active, self.unpack(z)
+        )
+        tangents = np.stack(
+            [
+                self.pack(jax.tree.map(lambda x, i=i: x[:, i], tangents))
+                for i in range(len(self.continued_names))
+            ],
+            1,
+        )
+        tangents = tangents if p.ndim > 1 else tangents[:, 0]
+        return NewtonStep(self.pack(correction), tangents, monodromy), quantities
+
+    def make_finder(self) -> Any:
+        options = self.collocation_system.cycle_options
+        return make_finder(self.model, self.n_legs, period_n=self.period_n, cycle_options=options)
+
+    def make_guess(self, wheel: BranchWheel, z: np.ndarray) -> Any:
+        start = CollocationState.make_start(self.unpack(z), wheel.is_phase_active)
+        return jax.tree.map(np.asarray, start)
+
+    def displace(
+        self, wheel: BranchWheel, z: np.ndarray, p: float, section_state: np.ndarray
+    ) -> np.ndarray:
+        """Return the motion of event-driven steps from another section state."""
+        values = self.replace_parameters(wheel, p)
+        (x,), _ = self.read_gaits(*select_tree_rows((wheel, values, z), None))
+        params = self.collocation_system.make_wheel(jnp.asarray(values))
+        land = functools.partial(land_foot, params.symbols())
+        change = np.linalg.pinv(jax.jacfwd(land)(x)) @ (section_state - self.section_state(z))
+        guess = self.make_finder().guess_cycle_from_state(params, x + change)
+        return self.pack(select_tree_rows(guess.solution, None))[0]
 
     def section_state(self, z: np.ndarray) -> np.ndarray:
         return z[..., : self.shapes[0][0]]
@@ -300,6 +525,10 @@ class CollocationProblem(AbstractGaitProblem):
                 evaluate, POINT_BATCH_SIZES, values, z, states
             )
         return states, quantities
+
+
+def _find_cycle(finder: Any, values: np.ndarray, guess: Any) -> Any:
+    return finder.find_cycle_from_values(*jax.device_put((values, guess)))
 
 
 @eqx.filter_jit
@@ -423,16 +652,19 @@ def make_trial_linearizer(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReturnMapProblem(AbstractGaitProblem, AbstractStateProblem):
-    """Continuation problem of fixed points of a model's return map over `period_n` gait steps."""
+    """Continuation problem of fixed points of a walker's return map over `period_n` gait steps.
 
-    def linearize(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> NewtonStep:
-        units = (1.0,) * self.n_coordinates
-        advance_period = jax.tree_util.Partial(
+    - `conserved_values`: values of the invariants of the walker, which all gaits have.
+    """
+
+    conserved_values: Any = None
+
+    @property
+    def function(self) -> Callable[[Any, Array, Array], Array]:
+        return jax.tree_util.Partial(
             _advance_period, self.model, self.step_options, self.n_legs, self.period_n,
-            self.parameter_index,
+            self.parameter_indices, self.conserved_values,
         )  # fmt: skip
-        linearize = functools.partial(_linearize_map, advance_period, units)
-        return map_in_numpy_batches(linearize, POINT_BATCH_SIZES, wheels, z, p)
 
 
 def _advance_period(
@@ -440,21 +672,26 @@ def _advance_period(
     options: StepOptions,
     n_legs: int,
     period_n: int,
-    parameter_index: int,
+    parameter_indices: tuple[int, ...],
+    conserved_values: Any,
     wheel: BranchWheel,
-    z: Array,
+    x: Array,
     p: Array,
 ) -> Array:
-    values = jnp.asarray(wheel.values).at[parameter_index].set(p)
-    model, params = model.from_parameter_values(values, n_legs)
+    values = jnp.asarray(wheel.values).at[np.array(parameter_indices)].set(p)
+    walker, params = make_walker(model, values, n_legs)
     for k in range(period_n):
-        result = model.advance(model.select_params(params, k), z, options)
-        z = jnp.where(result.outcome == Outcome.STEPPED, result.section_state, jnp.nan)
-    return z
+        x = make_return_map(walker, walker.select_params(params, k), options)(x)
+    if conserved_values is None:
+        return x
+    # Each multiplier 1 of a conserved quantity becomes 0, and all others are the same.
+    evaluate = lambda x: jnp.ravel(walker.evaluate_invariants(params, x))
+    gradients = lax.stop_gradient(jax.jacfwd(evaluate)(x))
+    return x - jnp.linalg.pinv(gradients) @ (evaluate(x) - conserved_values)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
+class ContactGaitProblem(ReturnMapProblem):
     """Continuation problem of gaits with unilateral contact, solved by batches of gait steps."""
 
     has_kinks: ClassVar[bool] = True
@@ -465,9 +702,9 @@ class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
 
     def linearize(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> NewtonStep:
         """Return the Newton steps of many wheels at their trial points."""
-        n, is_continued = self.n_coordinates, np.arange(wheels.values.shape[1])
-        is_continued = is_continued == self.parameter_index
-        period = self._evaluate_period(self.replace_parameter(wheels, p), z, is_continued)
+        n, is_continued = len(self.units), np.arange(wheels.values.shape[1])
+        is_continued = is_continued == self.parameter_indices[0]
+        period = self._evaluate_period(self.replace_parameters(wheels, p), z, is_continued)
         defects, jacobian = period.defects, period.return_map_jacobian[:, :n, :n]
         defects[~period.is_complete] = np.nan
         right_sides = np.concatenate(
@@ -517,7 +754,7 @@ class ContactGaitProblem(AbstractGaitProblem, AbstractStateProblem):
 
     def is_admissible(self, wheel: BranchWheel, z: np.ndarray, p: float) -> bool:
         """Return whether friction can balance the component of the weight parallel to the slope."""
-        surplus = self._compute_friction_surplus(self.replace_parameter(wheel, p))
+        surplus = self._compute_friction_surplus(self.replace_parameters(wheel, p))
         return bool(np.isfinite(z).all() and surplus > 0.0)
 
 

@@ -8,7 +8,7 @@ margins that the collocation does not determine.
 
 import abc
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,22 +17,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.branches.abstract_continuation import QuantitiesByName
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.arclength import (
     AbstractContinuationProblem,
     ContinuationPoint,
     NewtonStep,
+    QuantitiesByName,
 )
-from vrw_jax.branches.branch import BIFURCATIONS, FOLD, evaluate_bifurcations
-from vrw_jax.branches.continuation import (
-    DOUBLE_SUPPORT_INDICATOR_NAMES,
-    SECOND_PEAK_RATE_NAME,
-    GaitContinuation,
-)
+from vrw_jax.branches.branch import BIFURCATIONS, FOLD, TestFunction, evaluate_bifurcations
 from vrw_jax.branches.continuation_problems import (
+    DOUBLE_SUPPORT_INDICATOR_NAMES,
+    LINEAR_MARGIN_SUBSTITUTES,
+    SECOND_PEAK_RATE_NAME,
     BranchWheel,
-    CollocationProblem,
-    make_trial_linearizer,
 )
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration
@@ -153,6 +150,10 @@ class AbstractCurveProblem(AbstractContinuationProblem):
         return super().is_admissible(args, y, p) and bool(0.0 <= y[0] <= 1.0)
 
 
+RANGE_EDGE = "edge of the box"
+"""Name of the distance of the second parameter from its nearer bound, as a fraction of its range.
+"""
+
 FOLD_MARGIN_OFFSET = 1e-6
 """Value that the margin to the fold has on the curve by which the fold is represented.
 
@@ -171,11 +172,6 @@ def stack_bifurcation_margins(jacobians: np.ndarray) -> np.ndarray:
     margins = evaluate_bifurcations(jacobians)
     return np.stack([*(margins | {FOLD: margins[FOLD] - FOLD_MARGIN_OFFSET}).values()], -1)
 
-
-LINEAR_MARGIN_SUBSTITUTES: Mapping[str, str] = GaitContinuation.linear_margin_substitutes
-"""Names of margins that vanish as a cube. Each margin is mapped to a quantity that vanishes
-linearly at the same point.
-"""
 
 DISCONTINUOUS_QUANTITIES = (*DOUBLE_SUPPORT_INDICATOR_NAMES, "duration_sls1", "duration_sls2")
 """Names of the quantities that make the gait step discontinuous if they vanish. The measures of the
@@ -258,47 +254,37 @@ class CurveWheel(NamedTuple):
     quantity_index: np.ndarray
 
 
-# Largest round-off of a duration that is zero on a whole curve, s.
-MAX_DURATION_ROUNDOFF_S = 1e-9
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GaitCurveProblem(AbstractCurveProblem):
-    """Problem of the curves of special points of gaits that collocation finds.
+    """Problem of the curves of special points of gaits.
 
-    - `gait_problem`: problem of the gaits in the first parameter;
-    - `second_name`: name of the second parameter;
-    - `quantity_names`: names of the quantities in one group, which are evaluated together.
+    - `gaits`: problem of the gaits in both parameters;
+    - `quantity_names`: names of the quantities in one group, which are evaluated together;
+    - `special_point_names`: name of the special point on each curve;
+    - `first_range`: range of the first parameter, in which it is measured, or None for its value.
     """
 
-    gait_problem: CollocationProblem
-    second_name: str
+    gaits: Any
     quantity_names: tuple[str, ...]
+    special_point_names: tuple[str, ...]
+    first_range: float | None = None
 
-    def replace_second(self, wheels: BranchWheel, second: np.ndarray) -> BranchWheel:
-        """Return the wheels with other values of the second parameter."""
-        values = self.gait_problem.replace_parameter(wheels, second, self.second_name)
-        return wheels._replace(values=values)
+    @property
+    def test_functions(self) -> Mapping[str, TestFunction]:  # type: ignore[override]
+        edge = TestFunction("lost", "The second parameter's range ends.", True)
+        return {**self.gaits.test_functions, RANGE_EDGE: edge}
+
+    @property
+    def location_unit(self) -> float | None:  # type: ignore[override]
+        return self.gaits.location_unit
 
     def linearize_in_two_parameters(
         self, wheels: CurveWheel, z: np.ndarray, p: np.ndarray
     ) -> TwoParameterStep:
-        gaits, rows = self.gait_problem, np.arange(len(z))
-        branch_wheels = self.replace_second(wheels.branch_wheel, p[:, 1])
-        linearize_trials = make_trial_linearizer(
-            gaits.collocation_system,
-            (gaits.parameter_index, gaits.model.parameter_names.index(self.second_name)),
-            QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names),
+        step, quantities = self.gaits.linearize_with_quantities(
+            wheels.branch_wheel, z, p, QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names)
         )
-        correction, tangents, monodromy, *quantities = linearize_trials(
-            gaits.replace_parameter(branch_wheels, p[:, 0]),
-            branch_wheels.is_phase_active,
-            gaits.unpack(z),
-        )
-        correction = gaits.pack(correction)
-        tangents = np.stack(
-            [gaits.pack(jax.tree.map(lambda x, i=i: x[:, i], tangents)) for i in range(2)], 1
-        )
+        correction, tangents, jacobian = step
         if quantities:
             values, rates = quantities  # The first rate is along the correction.
             if self.quantity_names == tuple(BIFURCATIONS):
@@ -307,52 +293,129 @@ class GaitCurveProblem(AbstractCurveProblem):
                 values = stack_bifurcation_margins(values)
             values, gradient = values + rates[:, 0], rates[:, 1:]
         else:
+            units, second_range = p, self.second_bounds[1] - self.second_bounds[0]
+            if self.first_range is not None:
+                units = np.broadcast_to([self.first_range, second_range], p.shape)
             values, gradient = self.differentiate_quantities(
-                branch_wheels, z + correction, p, correction, tangents, p
+                wheels.branch_wheel, z + correction, p, correction, tangents, units
             )
-        index = wheels.quantity_index
+        rows, index = np.arange(len(z)), wheels.quantity_index
         return TwoParameterStep(
-            correction, tangents, monodromy, values[rows, index], gradient[rows, :, index]
+            correction, tangents, jacobian, values[rows, index], gradient[rows, :, index]
         )
 
     def select_section_state(self, z: np.ndarray) -> np.ndarray:
-        return self.gait_problem.section_state(z)
+        return self.gaits.section_state(z)
 
     def measure_quantities(self, wheels: BranchWheel, z: np.ndarray, p: np.ndarray) -> np.ndarray:
-        """Return the quantities of gaits that the collocation equations do not contain.
+        """Return the quantities of gaits that the equations of the gaits do not contain.
 
-        They are either those of the gait's force, or those of an event-driven step that starts from
-        the gait. The last axis has the order of `quantity_names`.
+        They are the bifurcations of a return map, the measures of the gait's force, or those of an
+        event-driven step that starts from the gait. The last axis has the order of
+        `quantity_names`.
         """
-        wheels, gaits = self.replace_second(wheels, p[:, 1]), self.gait_problem
+        gaits = self.gaits
+        if self.quantity_names == tuple(BIFURCATIONS):
+            return stack_bifurcation_margins(gaits.linearize(wheels, z, p).return_map_jacobian)
         if self.quantity_names == FORCE_QUANTITY_NAMES:
             gaits = dataclasses.replace(gaits, measures_force_peaks=True)
-            measures = gaits.read_gaits(wheels, gaits.replace_parameter(wheels, p[:, 0]), z)[1]
+            measures = gaits.read_gaits(wheels, gaits.replace_parameters(wheels, p), z)[1]
         else:
-            points = ContinuationPoint(z, p[:, 0], z, p[:, 0], z, p[:, 0])
-            measures = gaits.measure_gaits(wheels, points)
-        names_and_legs = [name.partition("[")[::2] for name in self.quantity_names]
-        columns = [
-            measures[name][:, int(leg[:-1]) - 3] if leg else measures[name]
-            for name, leg in names_and_legs
-        ]
-        return np.stack(columns, -1)
+            measures = gaits.measure(wheels, ContinuationPoint(z, p, z, p, z, p))
+        return np.stack([measures[name] for name in self.quantity_names], -1)
 
-    def measure_gaits(self, wheels: CurveWheel, points: ContinuationPoint) -> QuantitiesByName:
-        """Return the quantities of the gaits at points of curves, see `GaitContinuation`."""
-        gait_wheels = self.replace_second(
-            wheels.branch_wheel, self.compute_second_parameter(points.z)
-        )
-        return self.gait_problem.measure_gaits(gait_wheels, points._replace(z=points.z[:, 1:]))
+    def measure(self, wheels: CurveWheel, points: ContinuationPoint) -> QuantitiesByName:
+        """Return the quantities of the gaits, the second parameter, and its distance from its
+        range's edge as a fraction of the range.
+        """
+        fraction, z = points.z[:, 0], points.z[:, 1:]
+        p = np.stack([points.p, self.compute_second_parameter(points.z)], 1)
+        quantities = self.gaits.measure(wheels.branch_wheel, points._replace(z=z, p=p))
+        return quantities | {"second": p[:, 1], RANGE_EDGE: np.minimum(fraction, 1.0 - fraction)}
+
+    def mask_undefined_quantities(
+        self, quantities: QuantitiesByName, owners: np.ndarray
+    ) -> QuantitiesByName:
+        """Replace the quantity that is zero on the whole curve by NaN."""
+        (name,) = self.special_point_names
+        return quantities | {name: np.full(len(owners), np.nan)}
+
+    def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
+        are_positive = [
+            ~(values <= 0.0)
+            for name, values in quantities.items()
+            if (test := self.test_functions.get(name)) and test.ends_branch
+        ]
+        return np.all(are_positive, axis=0) & super().are_points_admissible(quantities)
+
+    def make_point_reader(self, wheel: CurveWheel, point: ContinuationPoint) -> Callable:
+        return lambda: point
 
     def section_state(self, y: np.ndarray) -> np.ndarray:
-        return y[..., : 1 + self.gait_problem.shapes[0][0]]
+        return np.concatenate([y[..., :1], self.gaits.section_state(y[..., 1:])], -1)
 
     def correction_norm(self, y: np.ndarray, correction: np.ndarray) -> float:
-        return max(abs(correction[0]), self.gait_problem.correction_norm(y[1:], correction[1:]))
+        return max(abs(correction[0]), self.gaits.correction_norm(y[1:], correction[1:]))
+
+
+# Largest round-off of a duration that is zero on a whole curve, s.
+MAX_DURATION_ROUNDOFF_S = 1e-9
+
+
+class CollocationCurveProblem(GaitCurveProblem):
+    """Problem of the curves of special points of gaits that collocation finds."""
+
+    linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
+
+    @property
+    def test_functions(self) -> Mapping[str, TestFunction]:  # type: ignore[override]
+        force_fall = TestFunction("lost", "The force begins to rise.", True)
+        return {**super().test_functions, INITIAL_FORCE_FALL_NAME: force_fall}
+
+    def measure(self, wheels: CurveWheel, points: ContinuationPoint) -> QuantitiesByName:
+        quantities = super().measure(wheels, points)
+        # Without double support, the rear foot's force must not be positive.
+        rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
+        return quantities | {"lambda_4_plus": rear_force_sign * quantities["lambda_4_plus"]}
+
+    def mask_undefined_quantities(
+        self, quantities: QuantitiesByName, owners: np.ndarray
+    ) -> QuantitiesByName:
+        """Replace each quantity that is zero or undefined on the whole curve by NaN."""
+        special_point_names = np.array(self.special_point_names)[owners]
+        is_dls_vanishing = special_point_names == DLS_VANISHING_NAME
+        is_step_discontinuous = np.isin(
+            special_point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
+        )
+
+        def is_undefined(quantity_name: str) -> np.ndarray:
+            if quantity_name == INITIAL_FORCE_FALL_NAME:
+                return ~is_dls_vanishing
+            is_step_margin = quantity_name.partition("[")[0] in MARGIN_MEASURES
+            substituted_names = [
+                margin_name
+                for margin_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
+                if substitute_name == quantity_name
+            ]
+            is_zero_on_curve = np.isin(special_point_names, [quantity_name, *substituted_names])
+            if quantity_name == "lambda_4_plus":
+                return is_zero_on_curve | is_dls_vanishing
+            if is_step_margin and quantity_name not in CONTINUED_QUANTITIES:
+                return is_zero_on_curve | is_step_discontinuous
+            return is_zero_on_curve
+
+        # A transposed array has its points on the last axis.
+        masked_quantities = {
+            quantity_name: np.where(is_undefined(quantity_name), np.nan, quantity_values.T).T
+            for quantity_name, quantity_values in quantities.items()
+        }
+        return masked_quantities | {
+            "outcome": np.where(is_step_discontinuous, Outcome.STEPPED, quantities["outcome"]),
+            "closure": np.where(is_step_discontinuous, 0.0, quantities["closure"]),
+        }
 
     def is_admissible(self, wheel: CurveWheel, y: np.ndarray, p: float) -> bool:
-        durations = self.gait_problem.unpack(y[1:]).durations
+        durations = self.gaits.unpack(y[1:]).durations
         is_inactive = wheel.branch_wheel.is_phase_active < 0.5
         return super().is_admissible(wheel, y, p) and bool(
             np.all((durations > -MAX_DURATION_ROUNDOFF_S) | is_inactive)
@@ -364,7 +427,7 @@ N_CODIM2_ITERATIONS = 8
 
 
 def locate_jump_onset(
-    problem: GaitCurveProblem, wheels: BranchWheel, z: np.ndarray, p: np.ndarray
+    problem: CollocationCurveProblem, wheels: BranchWheel, z: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Locate the two parameters at which `DLS_VANISHING_NAME` meets `lambda_4_plus`.
 
@@ -374,9 +437,9 @@ def locate_jump_onset(
     regular. The rear foot's force and its rate must be zero.
     """
     # One row for each of the two equations.
-    solution = problem.gait_problem.unpack(np.repeat(z[None], 2, 0))
+    solution = problem.gaits.unpack(np.repeat(z[None], 2, 0))
     solution.durations[:, 0, 0] = 0.0
-    z = problem.gait_problem.pack(solution)
+    z = problem.gaits.pack(solution)
     values, is_phase_active = (np.repeat(np.asarray(x)[None], 2, 0) for x in wheels)
     is_phase_active[:, 0, 0] = 0.0
     names = ("lambda_4_plus", INITIAL_FORCE_FALL_NAME)

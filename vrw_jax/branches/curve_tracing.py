@@ -6,9 +6,8 @@ meeting point.
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,24 +17,17 @@ import numpy as np
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.branches.abstract_continuation import QuantitiesByName
-from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint
+from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import (
     BIFURCATIONS,
     BRANCH_POINT,
     FOLD,
     Codim2Point,
     SpecialPointCurve,
-    TestFunction,
 )
+from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
-from vrw_jax.branches.continuation import (
-    GAIT_TEST_FUNCTIONS,
-    MAX_BRANCH_MESH_REFINEMENTS,
-    continue_branches,
-    split_legs,
-)
+from vrw_jax.branches.continuation import MAX_BRANCH_MESH_REFINEMENTS, continue_branches
 from vrw_jax.branches.continuation_problems import BranchWheel, CollocationProblem
 from vrw_jax.branches.curve_problems import (
     CONTINUED_QUANTITIES,
@@ -43,15 +35,14 @@ from vrw_jax.branches.curve_problems import (
     DLS_VANISHING_NAME,
     FORCE_QUANTITY_NAMES,
     INITIAL_FORCE_FALL_NAME,
-    LINEAR_MARGIN_SUBSTITUTES,
+    RANGE_EDGE,
+    CollocationCurveProblem,
     CurveWheel,
-    GaitCurveProblem,
     compute_continued_quantities,
     find_test_quantity_group,
     locate_jump_onset,
     select_test_quantity,
 )
-from vrw_jax.branches.walker_curves import RANGE_EDGE, AbstractCurveContinuation
 from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.phase_collocation import CollocationSolution
@@ -59,78 +50,6 @@ from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
 from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.params import WheelParams
-
-
-@dataclass(frozen=True)
-class CurveContinuation(AbstractCurveContinuation):
-    """Continuation of special points of gaits that collocation finds.
-
-    The quantities at a point of a curve are those of its gait, except the quantity that vanishes on
-    the whole curve.
-    """
-
-    special_point_names: tuple[str, ...]  # one name per wheel
-
-    test_functions: ClassVar[Mapping[str, TestFunction]] = {
-        **GAIT_TEST_FUNCTIONS,
-        **AbstractCurveContinuation.edge_functions,
-        INITIAL_FORCE_FALL_NAME: TestFunction("lost", "The force begins to rise.", True),
-    }
-    linear_margin_substitutes: ClassVar[Mapping[str, str]] = LINEAR_MARGIN_SUBSTITUTES
-
-    def evaluate_point_quantities(
-        self, wheels: CurveWheel, points: ContinuationPoint
-    ) -> QuantitiesByName:
-        problem = self.continuation_problem
-        quantities = split_legs(problem.measure_gaits(wheels, points), problem.gait_problem.n_legs)
-        # Without double support, the rear foot's force must not be positive.
-        rear_force_sign = np.where(wheels.branch_wheel.is_phase_active[:, 0, 0] > 0.5, 1.0, -1.0)
-        quantities["lambda_4_plus"] = rear_force_sign * quantities["lambda_4_plus"]
-        return self.add_second_parameter(quantities, points)
-
-    def mask_undefined_quantities(
-        self, quantities: QuantitiesByName, owners: np.ndarray
-    ) -> QuantitiesByName:
-        """Replace each quantity that is zero or undefined on the whole curve by NaN."""
-        special_point_names = np.array(self.special_point_names)[owners]
-        is_dls_vanishing = special_point_names == DLS_VANISHING_NAME
-        is_step_discontinuous = np.isin(
-            special_point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
-        )
-
-        def is_undefined(quantity_name: str) -> np.ndarray:
-            if quantity_name == INITIAL_FORCE_FALL_NAME:
-                return ~is_dls_vanishing
-            is_step_margin = quantity_name.partition("[")[0] in MARGIN_MEASURES
-            substituted_names = [
-                margin_name
-                for margin_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
-                if substitute_name == quantity_name
-            ]
-            is_zero_on_curve = np.isin(special_point_names, [quantity_name, *substituted_names])
-            if quantity_name == "lambda_4_plus":
-                return is_zero_on_curve | is_dls_vanishing
-            if is_step_margin and quantity_name not in CONTINUED_QUANTITIES:
-                return is_zero_on_curve | is_step_discontinuous
-            return is_zero_on_curve
-
-        # A transposed array has its points on the last axis.
-        masked_quantities = {
-            quantity_name: np.where(is_undefined(quantity_name), np.nan, quantity_values.T).T
-            for quantity_name, quantity_values in quantities.items()
-        }
-        return masked_quantities | {
-            "outcome": np.where(is_step_discontinuous, Outcome.STEPPED, quantities["outcome"]),
-            "closure": np.where(is_step_discontinuous, 0.0, quantities["closure"]),
-        }
-
-    def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
-        are_positive = [
-            ~(values <= 0.0)
-            for name, values in quantities.items()
-            if (test := self.find_test_function(name)) and test.ends_branch
-        ]
-        return np.all(are_positive, axis=0) & super().are_points_admissible(quantities)
 
 
 class CurveSeed(NamedTuple):
@@ -317,9 +236,8 @@ class CurveTracer(NamedTuple):
         """Continue the curve through each seed, and return its data; further entries are None."""
         n_padding = -len(curve_seeds) % batch_sizes.CURVE_BATCH_SIZE
         padded_seeds = [*curve_seeds, *curve_seeds[-1:] * n_padding]
-        problem = self.make_problem(
-            curve_seeds[0].collocation_system, quantity_group, curve_seeds[0].z
-        )
+        names = tuple(seed.special_point_name for seed in padded_seeds)
+        problem = self.make_problem(curve_seeds[0], quantity_group, names)
 
         def make_start(seed: CurveSeed) -> tuple[CurveWheel, CollocationSolution, Any, Any]:
             has_double_support = bool(seed.branch_wheel.is_phase_active[0, 0] > 0.5)
@@ -332,50 +250,41 @@ class CurveTracer(NamedTuple):
             lambda *leaves: np.stack(leaves), *map(make_start, padded_seeds)
         )
         return continue_and_locate_special_points(
-            CurveContinuation(
-                problem,
-                self.arclength_options,
-                wheels,
-                self.parameter_ranges[0],
-                tuple(seed.special_point_name for seed in padded_seeds),
-            ),
-            np.column_stack([fractions, problem.gait_problem.pack(z)]),
+            Continuation(problem, self.arclength_options, self.parameter_ranges[0], wheels),
+            np.column_stack([fractions, problem.gaits.pack(z)]),
             first_values,
             np.arange(len(padded_seeds)) < len(curve_seeds),
             is_finest_mesh,
         )
 
     def make_problem(
-        self,
-        collocation_system: CollocationSystem,
-        quantity_group: tuple[str, ...],
-        z: CollocationSolution,
-    ) -> GaitCurveProblem:
-        """Return the problem of the curves of a group of quantities, for solutions like z."""
-        gait_problem = CollocationProblem(
+        self, seed: CurveSeed, quantity_group: tuple[str, ...], names: tuple[str, ...]
+    ) -> CollocationCurveProblem:
+        """Return the problem of curves of named special points, for solutions like that of a seed.
+
+        - `quantity_group`: quantities that are evaluated together.
+        """
+        gaits = CollocationProblem(
             model=self.model,
             step_options=self.step_options,
-            n_legs=collocation_system.n_legs,
-            parameter_name=self.parameter_names[0],
+            n_legs=seed.collocation_system.n_legs,
+            continued_names=self.parameter_names,
             period_n=1,
-            measures_force_peaks=False,
-            collocation_system=collocation_system,
-            shapes=tuple(x.shape for x in jax.tree.leaves(z)),
+            collocation_system=seed.collocation_system,
+            shapes=tuple(x.shape for x in jax.tree.leaves(seed.z)),
             additional_quantity_function=compute_continued_quantities,
         )
         lower_bound, upper_bound = map(float, self.parameter_ranges[1])
-        return GaitCurveProblem(
-            second_bounds=(lower_bound, upper_bound),
-            gait_problem=gait_problem,
-            second_name=self.parameter_names[1],
-            quantity_names=quantity_group,
-        )
+        return CollocationCurveProblem(
+            second_bounds=(lower_bound, upper_bound), gaits=gaits, quantity_names=quantity_group,
+            special_point_names=names,
+        )  # fmt: skip
 
     def _make_traced_curve(self, seed: CurveSeed, branch_data: BranchData) -> TracedCurve:
         """Build a labeled curve, and seeds at the special points that the curve meets."""
         parameter_points = np.stack([branch_data.points.p, branch_data.quantities["second"]], -1)
-        problem = self.make_problem(seed.collocation_system, CONTINUED_QUANTITIES, seed.z)
-        gaits, rows = problem.gait_problem, branch_data.points.z[:, 1:]
+        problem = self.make_problem(seed, CONTINUED_QUANTITIES, (seed.special_point_name,))
+        gaits, rows = problem.gaits, branch_data.points.z[:, 1:]
         vertices = np.column_stack(
             [gaits.section_state(rows), self.compute_parameter_fractions(parameter_points)]
         )

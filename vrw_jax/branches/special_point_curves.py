@@ -19,19 +19,16 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
-from vrw_jax.branches.abstract_continuation import COARSE_MESH_END_NAME
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import BIFURCATIONS, SpecialPointCurve
-from vrw_jax.branches.continuation import (
+from vrw_jax.branches.branch_continuation import COARSE_MESH_END_NAME
+from vrw_jax.branches.continuation_problems import (
     BRANCH_ENDING_QUANTITIES,
+    LINEAR_MARGIN_SUBSTITUTES,
     SECOND_PEAK_RATE_NAME,
     split_legs,
 )
-from vrw_jax.branches.curve_problems import (
-    DLS_VANISHING_NAME,
-    FORCE_QUANTITY_NAMES,
-    LINEAR_MARGIN_SUBSTITUTES,
-)
+from vrw_jax.branches.curve_problems import DLS_VANISHING_NAME, FORCE_QUANTITY_NAMES
 from vrw_jax.branches.curve_tracing import (
     CurveSeed,
     CurveTracer,

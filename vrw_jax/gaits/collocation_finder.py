@@ -31,6 +31,7 @@ from vrw_jax.gaits.finder import (
 from vrw_jax.gaits.limit_cycle_result import (
     LimitCycle,
     guess_cycle_from_walk,
+    land_foot,
     sample_walk_in_time,
     solve_limit_cycle,
 )
@@ -53,7 +54,6 @@ from vrw_jax.models.measures import (
 from vrw_jax.models.step_results import AbstractStep, SectionState, StepResult
 from vrw_jax.models.stepping import convert_step_arguments, start_walk_toward_gait
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
-from vrw_jax.wheel import transitions
 from vrw_jax.wheel.params import WheelParams
 
 SECOND_MESH_INTERVALS = (64, 24, 24)
@@ -192,14 +192,9 @@ class CollocationFinder(AbstractGaitFinder):
     ) -> CollocationState:
         """Return the same cycle, starting with its gait step at the index `first_step_index`."""
         previous_end_state = collocation_state.gait_step_end_states[first_step_index - 1]
-        landing_result = transitions.resolve_landing(
-            params.symbols(), previous_end_state[0], *previous_end_state[2:]
-        )
+        section_state = land_foot(params.symbols(), previous_end_state[jnp.array([0, 2, 3])])
         shifted_state = jax.tree.map(
             lambda x: jnp.roll(x, -first_step_index, 0) if x.ndim else x, collocation_state
-        )
-        section_state = jnp.stack(
-            [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
         )
         return shifted_state._replace(
             solution=shifted_state.solution._replace(section_state=section_state)

@@ -402,6 +402,12 @@ class WalkSamples(NamedTuple):
     sampled_states: Float[Array, "n 3 n_samples 6"]  # theta, L1, L2 and their rates in each phase
 
 
+def land_foot(wheel_symbols: Any, section_state: SectionState) -> Array:
+    """Return (theta, dtheta) after the landing that follows a section state."""
+    landing_result = transitions.resolve_landing(wheel_symbols, *section_state)
+    return jnp.stack([landing_result.theta_after_landing, landing_result.motion_after.dtheta])
+
+
 @eqx.filter_jit
 def sample_walk_in_time(
     model: ViscoelasticWheel,
@@ -418,10 +424,7 @@ def sample_walk_in_time(
     """
     step_options = StepOptions()
     wheel_symbols = params.symbols()
-    landing_result = transitions.resolve_landing(wheel_symbols, *section_state)
-    post_impact_state = jnp.stack(
-        [landing_result.theta_after_landing, landing_result.motion_after.dtheta]
-    )
+    post_impact_state = land_foot(wheel_symbols, section_state)
 
     def sample_next_step(section_state: Array, k: Array) -> tuple[Array, tuple]:
         step_params = model.select_params(params, k)

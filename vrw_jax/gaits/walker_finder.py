@@ -480,6 +480,12 @@ class ParameterizedWalker(eqx.Module):
         return params
 
 
+def parameterize_walker(walker: AbstractWalker, params: Any) -> ParameterizedWalker:
+    """Return a walker with the names of its parameters."""
+    named_domains = tuple((x.name, x.domain) for x in list_tree_parameters(params))
+    return ParameterizedWalker(walker, jax.tree.structure(params), named_domains)
+
+
 class WalkerFinder(AbstractGaitFinder):
     """Finder of the gaits of a walker of the user, by Newton's method on its return map."""
 
@@ -607,7 +613,6 @@ def make_walker_finder(
     - `guess`: section coordinates from which each search begins, instead of the walker's starts.
     """
     params, guess = check_one_walker(params), convert_gait_guess(guess)
-    named_domains = [(x.name, x.domain) for x in list_tree_parameters(params)]
     start = propose_starts(walker, params) if guess is None else guess
     coordinates = name_coordinates(walker, jnp.shape(start)[-1])
     check_measure_names(walker, coordinates)
@@ -621,7 +626,7 @@ def make_walker_finder(
     }
     check_arguments(walker, params, jnp.atleast_2d(start)[0], options, 1)
     return WalkerFinder(
-        model=ParameterizedWalker(walker, jax.tree.structure(params), tuple(named_domains)),
+        model=parameterize_walker(walker, params),
         n_legs=0,  # as of no wheel
         step_options=options,
         coordinates=tuple(coordinates),

@@ -1,24 +1,23 @@
 """Continuation of several branches at once, with the quantities that locate special points."""
 
-import abc
-from collections.abc import Callable, Mapping, Sequence
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.arclength import (
-    AbstractContinuationProblem,
     ArclengthDriver,
-    ArclengthOptions,
     ContinuationPoint,
     ContinuationStatus,
+    NewtonStep,
+    QuantitiesByName,
     Track,
     run_together,
 )
 from vrw_jax.branches.branch import (
-    BIFURCATIONS,
     BRANCH_POINT,
     FOLD,
     FixedPoint,
@@ -26,7 +25,6 @@ from vrw_jax.branches.branch import (
     compute_multipliers,
     evaluate_bifurcations,
 )
-from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.lanes.batching import select_tree_rows
 
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()
@@ -50,9 +48,6 @@ BORDER_COLLISION = "border_collision"
 
 # Estimated mesh error above which the mesh is refined.
 MAX_SPECIAL_POINT_MESH_ERROR = 1e-8
-
-QuantitiesByName = dict[str, np.ndarray]
-"""Arrays of quantities with one element per point, by the name of the quantity."""
 
 
 class PointTable(NamedTuple):
@@ -96,75 +91,58 @@ PARAMETER_CHANGE_FRACTIONS = (
 )  # fmt: skip
 
 
+START_DISTANCE_FACTORS = (2.0, 10.0)
+"""Largest distances of a start from a singular point, as multiples of that of the plane on which it
+is searched for. The first excludes the known branch, which curves back to the plane. The second is
+chosen because branches may cross at small angles.
+"""
+
+START_FRACTIONS = (1.0, 0.1, 0.01, 0.002)
+"""Distances of these planes, as fractions of the first continuation step. The last ones are chosen
+because a branch of gaits may end soon after it begins, when the events change their order.
+"""
+
+MIN_SINGULAR_VALUE = 1e-9
+"""Relative singular value of the equations below which a tangent has few accurate digits."""
+
+
+def are_equations_regular(return_map_jacobian: np.ndarray) -> bool:
+    """Return whether the tangent of a branch is determined at a fixed point."""
+    if not np.isfinite(return_map_jacobian).all():
+        return False
+    equations = np.eye(len(return_map_jacobian)) - return_map_jacobian
+    singular_values = np.linalg.svd(equations, compute_uv=False)
+    return bool(singular_values[-1] > MIN_SINGULAR_VALUE * max(1.0, singular_values[0]))
+
+
 @dataclass(frozen=True)
-class AbstractContinuation(abc.ABC):
-    """Continuation of gaits of several wheels, with the quantities that locate special points."""
+class Continuation(ArclengthDriver):
+    """Continuation of the branches of several wheels, with what locates their special points.
 
-    continuation_problem: AbstractContinuationProblem
-    arclength_options: ArclengthOptions
-    wheels: Any  # tree of arrays with a leading axis over wheels
-    parameter_bounds: np.ndarray
-
-    test_functions: ClassVar[Mapping[str, TestFunction]] = BIFURCATIONS
-    """Test functions by name; the name of one of a leg has the number of the leg in brackets."""
-
-    linear_margin_substitutes: ClassVar[Mapping[str, str]] = {}
-    """Names of margins whose roots are ill-conditioned. Each margin is mapped to the name of a
-    quantity that vanishes linearly at the same point.
+    - `wheels`: a tree of arrays with a leading axis over wheels;
+    - `crossed_tangent`: tangent of a known branch at the start, which the continued branch crosses.
     """
 
-    @property
-    def driver(self) -> ArclengthDriver:
-        """Return the driver of the continuation."""
-        return ArclengthDriver(
-            self.continuation_problem, self.arclength_options, np.asarray(self.parameter_bounds)
-        )
+    wheels: Any
+    crossed_tangent: np.ndarray | None = None
 
     @property
-    def parameter_unit(self) -> float:
+    def location_unit(self) -> float:
         """Return the unit of the parameter in which special points are located."""
-        return 1.0
+        unit = self.problem.location_unit
+        return float(self.parameter_range) if unit is None else unit
 
     def make_fixed_point(self, point: ContinuationPoint) -> FixedPoint:
         """Return the fixed point of the return map at one point of a branch."""
-        section_state, tangent = map(
-            self.continuation_problem.section_state, (point.z, point.arclength_tangent)
-        )
-        tangent = np.append(tangent, point.fraction_rate)
-        return FixedPoint(section_state, float(point.p), point.return_map_jacobian, tangent)
-
-    def make_point_reader(self, owner: int, point: ContinuationPoint) -> Callable | None:
-        """Return a function that finds the gait at a point, or None if no gait can be found."""
-        return None
-
-    @abc.abstractmethod
-    def evaluate_point_quantities(self, wheels: Any, points: ContinuationPoint) -> QuantitiesByName:
-        """Return quantities at each point by name, except those computed from the Jacobian.
-
-        - `wheels`: one wheel per point.
-        """
-
-    def are_points_admissible(self, quantities: QuantitiesByName) -> np.ndarray:
-        """Return whether each point is admissible, computed from the quantities at the points.
-
-        A gait is admissible if its event-driven step returns to its section state. A fixed point of
-        another map has no such step, and every finite fixed point is admissible.
-        """
-        if "outcome" not in quantities:
-            return np.asarray(True)
-        return (quantities["outcome"] == Outcome.STEPPED) & (
-            quantities["closure"] <= STATE_AGREEMENT_TOLERANCE
-        )
+        section_state, tangent = map(self.problem.section_state, (point.z, point.arclength_tangent))
+        units = np.broadcast_to(self.problem.section_units, section_state.shape)
+        tangent = np.append(units * tangent, self.parameter_range * point.fraction_rate)
+        jacobian = units[:, None] * point.return_map_jacobian / units
+        return FixedPoint(units * section_state, float(point.p), jacobian, tangent)
 
     def find_test_function(self, name: str) -> TestFunction | None:
         """Return the test function of a quantity, whose name may end with the label of a leg."""
-        return self.test_functions.get(name.partition("[")[0])
-
-    def mask_undefined_quantities(
-        self, quantities: QuantitiesByName, owners: np.ndarray
-    ) -> QuantitiesByName:
-        """Replace each quantity that is undefined for the wheel of a point by NaN."""
-        return quantities
+        return self.problem.test_functions.get(name.partition("[")[0])
 
     def name_branch_end(self, quantities: QuantitiesByName, point_index: int) -> str:
         """Return the name of the special point at the end of a branch.
@@ -187,10 +165,6 @@ class AbstractContinuation(abc.ABC):
             is_same &= np.abs(new_values - values) <= MAX_MEASURE_CHANGE_AT_JUMP * np.abs(values)
         return is_same
 
-    def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
-        """Return a sentence that describes the end of a branch."""
-        return f"{end_name.replace('_', ' ')} at {parameter_value:.9g} ends it."
-
     def is_mesh_limited(self, quantities: QuantitiesByName, end_names: Sequence[str]) -> bool:
         """Return whether the mesh limits the extent or the accuracy of a branch.
 
@@ -202,26 +176,28 @@ class AbstractContinuation(abc.ABC):
 
     def make_table(self, points: ContinuationPoint, owners: np.ndarray) -> PointTable:
         """Return the table of points, of the wheels with the indices `owners`."""
-        quantities = self.evaluate_point_quantities(select_tree_rows(self.wheels, owners), points)
+        quantities = self.problem.measure(select_tree_rows(self.wheels, owners), points)
         quantities |= evaluate_bifurcations(points.return_map_jacobian)
-        quantities = self.mask_undefined_quantities(quantities, owners)
+        quantities = self.problem.mask_undefined_quantities(quantities, owners)
         tests = {
             name: values
             for name, values in quantities.items()
             if values.ndim == 1
             and self.find_test_function(name)
-            and name not in self.linear_margin_substitutes.values()
+            and name not in self.problem.linear_margin_substitutes.values()
         }
         # The combined quantity is positive if and only if both are positive. It crosses zero
         # continuously, because the substitute vanishes linearly where the margin vanishes.
-        for name in tests.keys() & self.linear_margin_substitutes.keys():
-            if (substitute := quantities.get(self.linear_margin_substitutes[name])) is not None:
+        for name in tests.keys() & self.problem.linear_margin_substitutes.keys():
+            if (
+                substitute := quantities.get(self.problem.linear_margin_substitutes[name])
+            ) is not None:
                 least = np.minimum(substitute, tests[name])
                 tests[name] = np.where(substitute < 0.0, substitute, least)
         with np.errstate(divide="ignore", invalid="ignore"):
             tests[BRANCH_POINT] = tests[FOLD] / points.fraction_rate
         tests[MODULI] = np.abs(compute_multipliers(points.return_map_jacobian))
-        is_admissible = points.is_admissible & self.are_points_admissible(quantities)
+        is_admissible = points.is_admissible & self.problem.are_points_admissible(quantities)
         tests[ADMISSIBILITY] = np.where(is_admissible, 1.0, -1.0)
         return PointTable(points, owners, quantities, tests)
 
@@ -231,10 +207,9 @@ class AbstractContinuation(abc.ABC):
         """Continue branches of the wheels with the indices `owners` from given starts."""
         starts = zip(owners, z, p, direction_signs, strict=True)
         tasks = [
-            self.driver.trace(select_tree_rows(self.wheels, owner), *start)
-            for owner, *start in starts
+            self.trace(select_tree_rows(self.wheels, owner), *start) for owner, *start in starts
         ]
-        return run_together(self.continuation_problem, self.wheels, owners, tasks)
+        return run_together(self.problem, self.wheels, owners, tasks)
 
     def continue_in_both_directions(
         self, z: np.ndarray, p: np.ndarray, is_requested: np.ndarray
@@ -243,12 +218,33 @@ class AbstractContinuation(abc.ABC):
 
         The first track decreases the parameter.
         """
+        if self.crossed_tangent is not None:
+            start = self._find_crossing_branch(z[0], p[0], self.crossed_tangent)
+            if start is None:
+                return {}
+            signs = np.sign([start.fraction_rate])
+            (track,) = self._continue_from(np.array([0]), start.z[None], np.array([start.p]), signs)
+            return {0: [Track([], ContinuationStatus.BRANCH_SWITCHED), track]}
         owners = np.repeat(np.flatnonzero(is_requested), 2)
         signs = np.tile([-1.0, 1.0], len(owners) // 2)
-        tracks = self.continue_branches(owners, z[owners], p[owners], signs)
-        if self.continuation_problem.has_kinks:
-            self._continue_beyond_jumps(owners, tracks)
+        tracks = self._continue_from(owners, z[owners], p[owners], signs)
+        if self.problem.may_start_singular:
+            points = tracks[0].points
+            if not points or not are_equations_regular(points[0].return_map_jacobian):
+                start = self._find_regular_start(z, p)
+                if start is None:
+                    return {}
+                rows, p = np.repeat(start.z[None], 2, 0), np.repeat([start.p], 2)
+                tracks = self._continue_from(owners, rows, p, signs)
         return {int(owners[i]): tracks[i : i + 2] for i in range(0, len(owners), 2)}
+
+    def _continue_from(
+        self, owners: np.ndarray, z: np.ndarray, p: np.ndarray, signs: np.ndarray
+    ) -> list[Track]:
+        tracks = self.continue_branches(owners, z, p, signs)
+        if self.problem.has_kinks:
+            self._continue_beyond_jumps(owners, tracks)
+        return tracks
 
     def _continue_beyond_jumps(self, owners: np.ndarray, tracks: list[Track]) -> None:
         """Continue stalled tracks beyond jumps of the section state, all of them together.
@@ -291,6 +287,86 @@ class AbstractContinuation(abc.ABC):
                     tracks[i] = track._replace(points=[*tracks[i].points, *track.points])
                     may_continue.add(i)
 
+    def _find_crossing_branch(
+        self, z: np.ndarray, p: float, tangent: np.ndarray
+    ) -> ContinuationPoint | None:
+        """Find a fixed point on the branch that crosses that with the given tangent at (z, p).
+
+        At the crossing, the linear equations have two solutions. The search is on planes across the
+        one that is perpendicular to the tangent of the known branch.
+        """
+        tangent = tangent / np.linalg.norm(tangent)
+        step = NewtonStep(
+            *map(np.asarray, self.problem.linearize(self.wheels, z[None], np.array([p])))
+        )
+        equations = np.eye(step.return_map_jacobian.shape[-1]) - step.return_map_jacobian[0]
+        known_tangent = self.problem.section_state(np.asarray(step.branch_tangent[0]))
+        by_fraction = equations @ (self.parameter_range * known_tangent)
+        extended = np.nan_to_num(np.column_stack([equations, -by_fraction]))
+        null_space = np.linalg.svd(extended)[2][-2:]
+        direction = null_space.T @ np.array([[0.0, 1.0], [-1.0, 0.0]]) @ (null_space @ tangent)
+        direction = direction / np.linalg.norm(direction)
+        center = self.coordinates(z, self.compute_fraction(p))
+        for factor, fraction in itertools.product(START_DISTANCE_FACTORS, START_FRACTIONS):
+            distance = fraction * self.options.initial_ds
+            targets = [
+                (center + distance * (normal + offset * tangent), distance * normal)
+                for normal in (direction, -direction)
+                for offset in (0.0, 1.0, -1.0)
+            ]
+            start = self._find_near(z, p, targets, factor * distance)
+            if start is not None:
+                return start
+        return None
+
+    def _find_near(
+        self,
+        z: np.ndarray,
+        p: float,
+        targets: Sequence[tuple[np.ndarray, np.ndarray]],
+        max_distance: float,
+    ) -> ContinuationPoint | None:
+        """Return the first regular fixed point near z on planes with given points and normals."""
+        wheel = select_tree_rows(self.wheels, 0)
+        tasks = [
+            self.solve_on_plane(
+                wheel, self.problem.displace(wheel, z, p, point[:-1]), point[-1], (point, normal)
+            )
+            for point, normal in targets
+        ]
+        lower_bound, upper_bound = self.parameter_bounds
+        center = self.coordinates(z, self.compute_fraction(p))
+        for point, is_found in run_together(self.problem, self.wheels, [0] * len(tasks), tasks):
+            if (
+                is_found
+                and point.is_admissible
+                and np.abs(self.coordinates(point.z, self.compute_fraction(point.p)) - center).max()
+                <= max_distance
+                and lower_bound <= point.p <= upper_bound
+                and are_equations_regular(point.return_map_jacobian)
+            ):
+                return point
+        return None
+
+    def _find_regular_start(self, z: np.ndarray, p: np.ndarray) -> ContinuationPoint | None:
+        """Find a fixed point next to a start at which the equations are singular.
+
+        Each search is in a plane whose distance from the start is about that of the first
+        continuation step. A branch that turns at the start does not cross all planes. Return None
+        if no plane contains a fixed point near the start.
+        """
+        problem, distance = self.problem, self.options.initial_ds
+        jacobian = np.asarray(problem.linearize(self.wheels, z, p).return_map_jacobian)[0]
+        singular_direction = np.linalg.svd(np.eye(z.shape[-1]) - np.nan_to_num(jacobian))[2][-1]
+        start = self.coordinates(z[0], self.compute_fraction(p[0]))
+        # Along one branch through a crossing, the state may be constant.
+        normals = [
+            distance * self.coordinates(state_part * singular_direction, parameter_part)
+            for state_part, parameter_part in itertools.product((0.0, 0.5, -0.5), (1.0, -1.0))
+        ]
+        targets = [(start + normal, normal) for normal in normals]
+        return self._find_near(z[0], p[0], targets, START_DISTANCE_FACTORS[-1] * distance)
+
     def solve_on_chords(
         self,
         owners: np.ndarray,
@@ -302,17 +378,17 @@ class AbstractContinuation(abc.ABC):
 
         Each new point lies in a plane that divides the chord between its neighbors.
         """
-        problem, driver = self.continuation_problem, self.driver
+        problem = self.problem
         z = problem.interpolate(left.z, right.z, fractions)
-        p = driver.compute_fraction(left.p + fractions * (right.p - left.p))
-        slopes = (right.p - left.p) / driver.parameter_range
+        p = self.compute_fraction(left.p + fractions * (right.p - left.p))
+        slopes = (right.p - left.p) / self.parameter_range
         tasks = [
-            driver.solve_on_plane(
+            self.solve_on_plane(
                 select_tree_rows(self.wheels, owners[i]),
                 z[i],
                 p[i],
-                (driver.coordinates(z[i], p[i]),
-                 driver.coordinates(right.z[i] - left.z[i], slopes[i])),
+                (self.coordinates(z[i], p[i]),
+                 self.coordinates(right.z[i] - left.z[i], slopes[i])),
             )
             for i in range(len(owners))
         ]  # fmt: skip
