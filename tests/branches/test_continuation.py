@@ -552,7 +552,7 @@ def test_the_mesh_of_a_branch_resolves_its_gaits_or_ends_the_branch():
     assert "range" in fine.ends[0]
 
 
-@pytest.mark.slow
+@pytest.mark.slow  # the search for gaits of two steps compiles for more than half a minute
 def test_a_wheel_is_continued_beyond_a_period_doubling_by_gaits_of_two_steps():
     """Its steps then differ by the square root of the distance, until one has no double support."""
     wheel = vrw.WheelParams(damping=141.66)
@@ -574,6 +574,7 @@ def test_a_wheel_is_continued_beyond_a_period_doubling_by_gaits_of_two_steps():
         vrw.continue_branch(wheel, "stiffness", (560.0, 580.0), switch_at=branch.special_points[0])
 
 
+@pytest.mark.slow
 def test_a_rigid_wheel_is_continued_with_its_own_step():
     branch = vrw.continue_branch(
         vrw.WheelParams(), "slope", (0.2, 0.35), model=vrw.RigidWheel(stop_at_lift_off=False)

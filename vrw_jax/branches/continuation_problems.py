@@ -456,8 +456,8 @@ class CollocationProblem(AbstractGaitProblem):
         return make_finder(self.model, self.n_legs, period_n=self.period_n, cycle_options=options)
 
     def make_guess(self, wheel: BranchWheel, z: np.ndarray) -> Any:
-        start = CollocationState.make_start(self.unpack(z), wheel.is_phase_active)
-        return jax.tree.map(np.asarray, start)
+        start = jax.device_put((self.unpack(z), wheel.is_phase_active))
+        return jax.tree.map(np.asarray, CollocationState.make_start(*start))
 
     def displace(
         self, wheel: BranchWheel, z: np.ndarray, p: float, section_state: np.ndarray
@@ -468,7 +468,7 @@ class CollocationProblem(AbstractGaitProblem):
         params = self.collocation_system.make_wheel(jnp.asarray(values))
         land = functools.partial(land_foot, params.symbols())
         change = np.linalg.pinv(jax.jacfwd(land)(x)) @ (section_state - self.section_state(z))
-        guess = self.make_finder().guess_cycle_from_state(params, x + change)
+        guess = self.make_finder().guess_cycle_from_state(params, jnp.asarray(x + change))
         return self.pack(select_tree_rows(guess.solution, None))[0]
 
     def section_state(self, z: np.ndarray) -> np.ndarray:
