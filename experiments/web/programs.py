@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from vrw_jax import lanes
 from vrw_jax.base import StepOptions, compute_sine_cosine
-from vrw_jax.flow import load_explicit_tableau, sample_batch_phase
+from vrw_jax.flow import divide_equally, load_explicit_tableau, sample_batch_phase
 from vrw_jax.models import (
     MARGIN_MEASURES,
     N_STEP_INPUTS,
@@ -138,8 +138,9 @@ def programs(n_legs: int) -> dict[str, Program]:
             strict=True,
         ):
             flow = make_batch_phase(phase, records_margins=False)
+            lengths = divide_equally(end.duration, SAMPLES)
             sampled_states = sample_batch_phase(
-                flow, load_explicit_tableau(SOLVER), *start, end.duration, SAMPLES, options
+                flow, load_explicit_tableau(SOLVER), *start, lengths, options
             )
             motion.append(
                 jnp.concatenate(evaluate_phase_states(phase, jnp.moveaxis(sampled_states, 1, 0)))

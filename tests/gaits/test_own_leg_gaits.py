@@ -80,6 +80,113 @@ def test_derivatives_of_a_gait_with_a_kink_are_differences_of_gaits():
     np.testing.assert_allclose(jax.grad(measure_kinked_period)(100.0), difference, rtol=1e-5)
 
 
+def read_fore_force(instant, params):
+    return instant.fore_force.normal
+
+
+def declare_force(reduction, function=read_fore_force):
+    phases = ("DLS", "SLS-I", "SLS-II")
+    return vrw.measure(f"force_{reduction}", phase=phases, reduction=reduction)(function)
+
+
+def test_smooth_parts_have_the_peaks_and_measures_of_collocation():
+    """A smooth law has one part in each phase."""
+    wheel, options = vrw.parameter_sets["two_peaks"].params, vrw.StepOptions()
+    cycle, model = vrw.limit_cycle(wheel), vrw.ViscoelasticWheel()
+    peaks = model.measure_force_peaks(wheel, cycle.section_state, options)
+    assert (peaks.keys(), peaks["n_force_peaks"]) == (cycle.force_peaks.keys(), 2.0)
+    measures = [declare_force("min"), declare_force("mean"), declare_force("integral")]
+    step = vrw.step(wheel, cycle.section_state)
+    values = model.measure_step(wheel, cycle.section_state, step, options, measures)
+    for name, value in cycle.force_peaks.items():
+        np.testing.assert_allclose(peaks[name], value, rtol=3e-9, err_msg=name)
+    for measure in measures:
+        np.testing.assert_allclose(values[measure.name], cycle.measure(measure), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_forces_with_a_kink_carry_the_weight_and_have_the_peaks_of_samples():
+    """Momentum normal to the slope repeats. Samples of a walk have errors of 1e-8."""
+    cycle, model = find_gait(BumpStop(100.0)), make_wheel(BumpStop(100.0))
+    parts = model._sample_parts(model.attach_laws(PARAMS), cycle.section_state, vrw.StepOptions())
+    assert [int(phase.n_kinks) for phase in parts] == [1, 1, 0]
+
+    def read_total_force(instant, params):
+        rear = 0.0 if instant.rear_force is None else instant.rear_force.normal
+        return instant.fore_force.normal + rear
+
+    impacts = cycle.measure("landing_impulse") + cycle.indicators.lambda_I4
+    impulse = cycle.measure(declare_force("integral", read_total_force)) + impacts
+    impulse = impulse + cycle.margins.hit_planted_impulse
+    weight = (PARAMS.hub_mass + PARAMS.n_legs * PARAMS.leg_mass) * PARAMS.gravity
+    expected = weight * jnp.cos(PARAMS.slope) * cycle.period
+    np.testing.assert_allclose(impulse, expected, rtol=1e-11)
+    walk = vrw.simulate(PARAMS, cycle.section_state, 1, model=model, n_samples=1001)
+    for name, values in vrw.force_peaks(walk).items():
+        if name in cycle.force_peaks:
+            np.testing.assert_allclose(cycle.force_peaks[name], values[0], rtol=1e-7, err_msg=name)
+    np.testing.assert_allclose(
+        cycle.measure(declare_force("min")), walk.lambda_2.values.min(), rtol=1e-7
+    )
+    steps_per_period = vrw.measure("steps")(lambda step, params: cycle.period / step.period)
+    np.testing.assert_allclose(cycle.measure(steps_per_period), 1.0, rtol=1e-14)
+    with pytest.raises(ValueError, match="phase"):
+        cycle.measure(vrw.measure("f", phase="flight", reduction="mean")(read_fore_force))
+
+
+@pytest.mark.slow
+def test_measures_of_gaits_with_a_kink_have_the_derivatives_of_differences():
+    """The error of the differences is 4e-6 relative."""
+    measures = ["peak_force", declare_force("mean"), declare_force("min")]
+    table = vrw.sensitivities(PARAMS, measures=measures, model=make_wheel(BumpStop(100.0)))
+    before, after = (find_gait(BumpStop(k2)) for k2 in (99.5, 100.5))
+    differences = [float(after.measure(x) - before.measure(x)) for x in measures]
+    derivatives = table.derivative.sel(parameter="leg.k2")
+    np.testing.assert_allclose(derivatives, differences, rtol=2e-5)
+    measure_peak = lambda k2: find_gait(BumpStop(k2)).measure("peak_force")
+    np.testing.assert_allclose(jax.grad(measure_peak)(100.0), derivatives[0], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_kink_that_is_never_reached_changes_no_peak():
+    """The mesh of collocation has an error of 1e-9."""
+    smooth, unreached = find_gait(PaperLeg()), find_gait(BumpStop(100.0, 0.5))
+    for name, value in smooth.force_peaks.items():
+        np.testing.assert_allclose(unreached.force_peaks[name], value, rtol=1e-8, err_msg=name)
+    for reduction in ("min", "mean", "integral"):
+        measure = declare_force(reduction)
+        np.testing.assert_allclose(unreached.measure(measure), smooth.measure(measure), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_studies_of_gaits_with_a_kink_take_peaks_and_measures():
+    """Scans and branches have the values of single gaits, also of two legs in turn."""
+    mean, model = declare_force("mean"), make_wheel(BumpStop(100.0))
+    names = ["peak_force", mean, "d force_mean / d leg.k2"]
+    scan = vrw.scan(vrw.grid({"leg.k2": [100.0, 101.0]}), names, base=PARAMS, model=model)
+    cycles = [find_gait(BumpStop(k2)) for k2 in (100.0, 101.0)]
+    for name, measure in {"peak_force": "peak_force", "force_mean": mean}.items():
+        expected = [cycle.measure(measure) for cycle in cycles]
+        np.testing.assert_allclose(scan[name], expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        scan["d force_mean / d leg.k2"].mean(), np.diff(scan.force_mean)[0], rtol=1e-5
+    )
+    branch = vrw.continue_branch(
+        PARAMS, "leg.k2", (100.0, 101.0), model=model, force_peaks=True, measures=[mean]
+    ).dataset
+    np.testing.assert_allclose(branch.force_mean[[0, -1]], scan.force_mean, rtol=1e-8)
+    np.testing.assert_allclose(branch.peak_force[[0, -1]], scan.peak_force, rtol=1e-8)
+    legs = vrw.AlternatingLegs(BumpStop(100.0), BumpStop(100.0))
+    both = find_gait(legs, period_n=2)
+    np.testing.assert_allclose(both.measure(mean), cycles[0].measure(mean), rtol=1e-9)
+    np.testing.assert_allclose(both.measure("peak_force"), scan.peak_force[0], rtol=1e-9)
+
+
+def test_a_wheel_of_a_batch_outside_its_domain_is_named():
+    wheels = vrw.WheelParams(damping=np.array([200.0, -5.0]))
+    assert vrw.limit_cycles(wheels).why[1].startswith("damping is -5, but ")
+
+
 @pytest.mark.slow
 def test_gaits_with_a_kink_and_contact_are_those_of_the_papers_wheel():
     """With a friction of 50, the rear foot slides before it leaves the ground."""

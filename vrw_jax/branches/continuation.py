@@ -438,11 +438,10 @@ def _check_branches(
             f"force_peaks is True, but the branch of a {type(model).__name__} has no measures of "
             "the force: take vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
-    if own_measures and not gait_finder.supports_cold_start:
+    if own_measures and not gait_finder.has_own_measures:
         raise ValueError(
             f"{own_measures[0].name} is a measure of your own, but it is known for gaits of the "
-            "paper's model and of your own walkers only: take vrw.ViscoelasticWheel() without "
-            "declared kinks of the legs."
+            "paper's model and of your own walkers only: take vrw.ViscoelasticWheel()."
         )
     gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
     batch_shape = np.broadcast_shapes(*(leaf.shape for leaf in jax.tree.leaves(params)))

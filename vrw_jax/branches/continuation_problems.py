@@ -39,7 +39,10 @@ from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.force_peaks import locate_force_peaks
 from vrw_jax.gaits.limit_cycle_result import evaluate_own_measure, land_foot
 from vrw_jax.gaits.phase_collocation import CollocationSolution
-from vrw_jax.gaits.return_map_finder import measure_return_map_force_peaks
+from vrw_jax.gaits.return_map_finder import (
+    measure_return_map_cycle,
+    measure_return_map_force_peaks,
+)
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
@@ -659,6 +662,11 @@ class ReturnMapProblem(AbstractGaitProblem, AbstractStateProblem):
 
     conserved_values: Any = None
 
+    def measure_steps(
+        self, values: np.ndarray, states: np.ndarray, steps: AbstractStep
+    ) -> QuantitiesByName:
+        return _measure_cycles(self, values, states, steps)
+
     @property
     def function(self) -> Callable[[Any, Array, Array], Array]:
         return jax.tree_util.Partial(
@@ -729,17 +737,7 @@ class ContactGaitProblem(ReturnMapProblem):
             EVENT_ORDER: compute_contact_order_numbers(steps, self.n_legs),
             FRICTION_SURPLUS: self._compute_friction_surplus(values),
         }
-        if self.measures_force_peaks:
-            quantities |= map_in_numpy_batches(
-                functools.partial(
-                    _measure_contact_force_peaks, self.model, self.n_legs, self.step_options
-                ),
-                POINT_BATCH_SIZES,
-                values,
-                states,
-                steps.section_state,
-            )
-        return quantities
+        return quantities | _measure_cycles(self, values, states, steps)
 
     def _compute_friction_surplus(self, values: np.ndarray) -> np.ndarray:
         """Return the friction coefficient minus the slope's tangent.
@@ -758,19 +756,27 @@ class ContactGaitProblem(ReturnMapProblem):
         return bool(np.isfinite(z).all() and surplus > 0.0)
 
 
-@eqx.filter_jit
-@eqx.filter_vmap(in_axes=(None, None, None, 0, 0, 0))
-def _measure_contact_force_peaks(
-    model: Any,
-    n_legs: int,
-    options: StepOptions,
-    values: Array,
-    state: Array,
-    step_ends: Array,
-) -> dict[str, Array]:
-    """Return the `measures.FORCE_PEAK_MEASURES` of a gait by name."""
-    model, params = model.from_parameter_values(values, n_legs)
-    return measure_return_map_force_peaks(model, params, state, step_ends, options)
+def _measure_cycles(
+    problem: AbstractGaitProblem, values: np.ndarray, states: np.ndarray, steps: AbstractStep
+) -> QuantitiesByName:
+    """Return force peaks and measures of the user, if requested, from the steps of gaits."""
+    if not (problem.measures_force_peaks or problem.own_measures):
+        return {}
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def measure(values: Array, state: Array, steps: AbstractStep) -> dict[str, Array]:
+        model, params = problem.model.from_parameter_values(values, problem.n_legs)
+        options, quantities = problem.step_options, {}
+        if problem.measures_force_peaks:
+            step_ends = steps.section_state
+            quantities = measure_return_map_force_peaks(model, params, state, step_ends, options)
+        return quantities | {
+            measure.name: measure_return_map_cycle(measure, options, model, params, state, steps)
+            for measure in problem.own_measures
+        }
+
+    return map_in_numpy_batches(measure, POINT_BATCH_SIZES, values, states, steps)
 
 
 def compute_contact_order_numbers(gait_steps_of_period: Any, n_legs: int) -> np.ndarray:

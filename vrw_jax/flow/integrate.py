@@ -71,6 +71,7 @@ class PhaseEnd(NamedTuple):
     solver_steps: Array  # number of tried solver steps, accepted or not
     next_solver_dt: Array  # next step length that the controller proposes, s
     margin_minima: Any  # minima of the margins, (margins, batch) or (margins,)
+    kink_log: Any = None  # a `kinks.KinkLog` without tangents, if requested
 
     @property
     def has_integration_failed(self) -> Array:
@@ -140,18 +141,27 @@ def integrate_batch_phase(
                 make_phase, primals[0], primals[1], phase_constants_tangents, start_tangents
             )
             phase_end, search_end = integrate(phase_tangents, *primals)
-            return phase_end, compute_phase_end_jvp(tableau, phase_tangents, phase_end, search_end)
+            end_tangents = compute_phase_end_jvp(tableau, phase_tangents, phase_end, search_end)
+            return phase_end, (*end_tangents, search_end.kink_tangents)
 
-        phase_end, (motion_tangent, event_time_tangent, minima_tangents) = apply_batched_jvp_rule(
-            integrate_with_tangents, primals, state_tangents[:4]
+        phase_end, (motion_tangent, event_time_tangent, minima_tangents, kink_tangents) = (
+            apply_batched_jvp_rule(integrate_with_tangents, primals, state_tangents[:4])
         )
         zero_phase_end = lanes.make_zero_tangent(phase_end)
         n = len(phase_end.state.q)
         state_tangent = zero_phase_end.state._replace(
             q=tuple(motion_tangent[:n]), v=tuple(motion_tangent[n:])
         )
+        log_tangent = zero_phase_end.kink_log
+        if log_tangent is not None:
+            log_tangent = log_tangent._replace(
+                times=kink_tangents[:, 0], states=kink_tangents[:, 1:]
+            )
         return phase_end, zero_phase_end._replace(
-            state=state_tangent, duration=event_time_tangent, margin_minima=minima_tangents
+            state=state_tangent,
+            duration=event_time_tangent,
+            margin_minima=minima_tangents,
+            kink_log=log_tangent,
         )
 
     return integrate_with_rule(
@@ -169,6 +179,7 @@ class SearchEnd(NamedTuple):
     enter_sides: EnterSides | None  # None for phases without kinks
     sides: Vector  # sides of the kinks at the end
     margin_minima_result: MarginMinimaResult | None = None
+    kink_tangents: Array | None = None  # see `kinks.KinkLog`
 
 
 def compute_phase_end_jvp(
@@ -269,7 +280,7 @@ def integrate_to_event(
     locate = lambda phase, solver, state: locate_event(
         phase, solver, tableau, lax.stop_gradient(state), options
     )
-    sides, end_guard_index, has_last_step = phase.sides, None, False
+    sides, end_guard_index, has_last_step, log = phase.sides, None, False, None
     if enter_sides is None:
         take_steps = make_loop(phase, solver, phase_tangents)
         if phase.margins_include_start or phase_tangents is not None:
@@ -286,11 +297,12 @@ def integrate_to_event(
             take_steps, functools.partial(locate, phase, solver), integrator_state
         )
     else:
-        sides, integrator_state, event_search, end_guard_index, _ = integrate_over_kinks(
+        sides, integrator_state, event_search, end_guard_index, _, log = integrate_over_kinks(
             lambda phase, solver, tangents, state: _find_events(
                 make_loop(phase, solver, tangents), functools.partial(locate, phase, solver), state
             ),
             enter_sides, sides, n_guards, tableau, integrator_state, options, attach_derivatives,
+            phase_with_kinks.n_logged_kinks,
         )  # fmt: skip
         phase, solver, _ = enter_sides(sides)
     phase_end, located_guard_index = _make_phase_end(
@@ -304,6 +316,9 @@ def integrate_to_event(
     search_end = SearchEnd(
         last_solver, start_state, integrator_state, located_guard_index, enter_sides, sides
     )
+    if log is not None:
+        phase_end = phase_end._replace(kink_log=log._replace(tangents=None))
+        search_end = search_end._replace(kink_tangents=log.tangents)
     if integrator_state.margin_minima_state is None:
         return phase_end, search_end
     start_margins = jnp.stack(phase_with_kinks.evaluate_margins(start_state))
@@ -847,14 +862,14 @@ def sample_batch_phase(
     tableau: ButcherTableau,
     q: Vector,
     v: Vector,
-    duration: Array,
-    n_samples: int,
+    interval_lengths: Array,
     options: StepOptions,
 ) -> Array:
-    """Return positions and rates at `n_samples` equally spaced times of a phase.
+    """Return positions and rates at the start of a phase and after each interval of time.
 
-    The first sample is at the start of the phase, and the last is after `duration`, s. The result
-    has the shape (samples, 2 coordinates, batch), with the positions before the rates.
+    The result has the shape (samples, 2 coordinates, batch), with the positions before the rates.
+
+    - `interval_lengths`: see `sample_between_intervals`.
     """
 
     take_solver_step = _make_solver_step_function(phase, tableau, options)
@@ -864,32 +879,36 @@ def sample_batch_phase(
         return stage_states[-1], mean_squared_error
 
     pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
-    return sample_at_equal_times(
+    return sample_between_intervals(
         solver_step_function,
         pack_sample,
         phase.make_state(q, v),
         tableau,
-        duration,
-        n_samples,
+        interval_lengths,
         options,
     )
 
 
-def sample_at_equal_times(
+def divide_equally(duration: Array, n_samples: int) -> Array:
+    """Return the lengths of the intervals between `n_samples` equally spaced times, s."""
+    return jnp.broadcast_to(duration / (n_samples - 1), (n_samples - 1, *duration.shape))
+
+
+def sample_between_intervals(
     solver_step_function: Callable[[Any, Array], tuple[Any, Array]],
     pack_sample: Callable[[Any], Array],
     start_state: Any,
     tableau: ButcherTableau,
-    duration: Array,
-    n_samples: int,
+    interval_lengths: Array,
     options: StepOptions,
 ) -> Array:
-    """Return samples at `n_samples` equally spaced times from 0 to `duration`, s.
+    """Return samples at the start of a motion and after each interval of time.
 
     - `solver_step_function`: function of state and step length, s, that returns the state at the
       end of a solver step and the squared ratio of its error to the tolerance;
     - `pack_sample`: function that returns the sample for a state. The first axis of the result
-      contains the samples.
+      contains the samples;
+    - `interval_lengths`: lengths of the intervals between samples, on the first axis, s.
     """
     initial_count = jnp.zeros((), jnp.int32)
 
@@ -924,18 +943,18 @@ def sample_at_equal_times(
             n_tried_steps + 1,
         )
 
-    def integrate_to_next_sample(loop_carry: tuple, _: None) -> tuple[tuple, Array]:
+    def integrate_to_next_sample(loop_carry: tuple, length: Array) -> tuple[tuple, Array]:
         needs_step = lambda loop_carry: (
             jnp.any(loop_carry[2] > 0.0) & (loop_carry[3] < options.max_solver_steps)
         )
-        initial_loop_carry = (*loop_carry, duration / (n_samples - 1), initial_count)
+        initial_loop_carry = (*loop_carry, length, initial_count)
         sample_state, h, _, _ = lax.while_loop(
             needs_step, take_solver_step_to_sample, initial_loop_carry
         )
         return (sample_state, h), pack_sample(sample_state)
 
-    initial_loop_carry = start_state, options.dt0 + jnp.zeros_like(duration)
-    samples_after_start = lax.scan(
-        integrate_to_next_sample, initial_loop_carry, None, length=n_samples - 1
-    )[1]
+    initial_loop_carry = start_state, options.dt0 + jnp.zeros_like(interval_lengths[0])
+    samples_after_start = lax.scan(integrate_to_next_sample, initial_loop_carry, interval_lengths)[
+        1
+    ]
     return jnp.concatenate([pack_sample(start_state)[None], samples_after_start])

@@ -41,6 +41,42 @@ def find_sides(phase: BatchPhase, state: StageState) -> Vector:
     )
 
 
+class KinkLog(NamedTuple):
+    """Kinks that a phase has passed, on the first axis of each array."""
+
+    n_kinks: Array  # number of passed kinks, of which only the first ones are listed
+    times: Array  # since the start of the phase, s
+    states: Array  # positions and rates at each kink
+    sides: Array  # sides of all kinks on which the motion goes on from each kink
+    tangents: Array | None  # of time, positions and rates, with the directions on the first axis
+
+    @classmethod
+    def begin(cls, n_logged: int, sides: Vector, state: IntegratorState) -> "KinkLog":
+        repeat = lambda x: jnp.zeros((n_logged, *x.shape), x.dtype)
+        time, motion = state.elapsed_time, jnp.stack([*state.state.q, *state.state.v])
+        tangents: Any = state.state_tangents
+        if tangents is not None:
+            n_directions, n_rows = len(tangents), 1 + len(motion)
+            tangents = jnp.zeros((n_directions, n_logged, n_rows, *time.shape), tangents.dtype)
+        n_kinks = jnp.zeros_like(state.n_tried_steps)
+        return cls(n_kinks, repeat(time), repeat(motion), repeat(jnp.stack(sides)), tangents)
+
+    def append(
+        self, is_passed: Array, time: Array, motion: Array, sides: Vector, tangents: Any
+    ) -> "KinkLog":
+        """Return the log after a kink, which only some batch elements have passed."""
+        indices = jnp.arange(len(self.times)).reshape(-1, *(1,) * jnp.ndim(time))
+        is_entry = is_passed & (indices == self.n_kinks)
+        write = lambda entry, log: jnp.where(is_entry[:, None], entry, log)
+        return KinkLog(
+            self.n_kinks + is_passed,
+            jnp.where(is_entry, time, self.times),
+            write(motion, self.states),
+            write(jnp.stack(sides), self.sides),
+            None if self.tangents is None else write(tangents[:, None], self.tangents),
+        )
+
+
 class KinkPassage(NamedTuple):
     """State of the integration over kinks."""
 
@@ -54,6 +90,7 @@ class KinkPassage(NamedTuple):
     would slide along it, because the force drives the motion back from both sides.
     """
     is_passed: Array  # whether the last segment ended at a kink, and the phase goes on
+    log: KinkLog | None
 
 
 def integrate_over_kinks(
@@ -65,6 +102,7 @@ def integrate_over_kinks(
     integrator_state: IntegratorState,
     options: StepOptions,
     attach_derivatives: Callable | None = None,
+    n_logged_kinks: int = 0,
 ) -> KinkPassage:
     """Integrate each batch element to the first guard that ends the phase.
 
@@ -72,7 +110,8 @@ def integrate_over_kinks(
       crossing of a guard, and locates it;
     - `sides`: sides of the kinks at the start;
     - `n_guards`: number of guards that end the phase, which precede those of the kinks;
-    - `attach_derivatives`: function that returns the time and the rates at a kink with derivatives.
+    - `attach_derivatives`: function that returns the time and the rates at a kink with derivatives;
+    - `n_logged_kinks`: see `BatchPhase`.
     """
 
     def integrate_to_next_kink(passage: KinkPassage) -> KinkPassage:
@@ -109,20 +148,26 @@ def integrate_over_kinks(
             integration_status=jnp.full_like(state.integration_status, IntegrationStatus.RUNNING),
             n_tried_steps=state.n_tried_steps + search.n_tried_steps,
         )
+        next_state, kink_tangents = _select_passed_state(
+            tableau,
+            solver_step_function,
+            phase_tangents,
+            (phase, next_phase),
+            (state, next_state),
+            search,
+            is_passed,
+        )
+        log = passage.log
+        if log is not None:
+            motion = jnp.stack([*q, *v])
+            log = log.append(is_passed, elapsed_time, motion, next_sides, kink_tangents)
         return KinkPassage(
             select_trees_by_condition(is_passed, next_sides, passage.sides),
-            _select_passed_state(
-                tableau,
-                solver_step_function,
-                phase_tangents,
-                (phase, next_phase),
-                (state, next_state),
-                search,
-                is_passed,
-            ),
+            next_state,
             search,
             end_guard_index,
             is_passed,
+            log,
         )
 
     no_search = EventSearch.begin(
@@ -136,6 +181,7 @@ def integrate_over_kinks(
         no_search,
         jnp.full_like(no_search.guard_index, -1),
         jnp.ones_like(no_search.is_event_unresolved),
+        KinkLog.begin(n_logged_kinks, sides, integrator_state) if n_logged_kinks else None,
     )
     return lax.while_loop(lambda passage: jnp.any(passage.is_passed), integrate_to_next_kink, start)
 
@@ -184,8 +230,10 @@ def _select_passed_state(
     states: tuple[IntegratorState, IntegratorState],
     search: EventSearch,
     is_passed: Array,
-) -> IntegratorState:
+) -> tuple[IntegratorState, Array | None]:
     """Return the state of the integration, with tangents and minima, in which kinks are passed.
+
+    The second result contains the tangents of time, positions and rates at the kinks.
 
     - `phases`: phase before and after a kink;
     - `states`: state before the solver step to the kink, and after the kink.
@@ -194,7 +242,7 @@ def _select_passed_state(
     unbatched: dict[str, Any] = {
         name: getattr(state, name) for name in ("n_iterations_until_half_ended", "n_iterations")
     }
-    kink_tangents = None
+    kink_tangents = logged_tangents = None
     if phase_tangents is not None:
         pass_kink = functools.partial(
             _pass_tangents,
@@ -206,11 +254,14 @@ def _select_passed_state(
             next_state.state,
             is_passed,
         )
-        unchanged_tangents = state.state_tangents, state.state_tangents
-        tangents, kink_tangents = run_if_any_element_active(
+        tangents: Any = state.state_tangents
+        unchanged_tangents = tangents, tangents, tangents[:, 0]
+        tangents, kink_tangents, time_tangent = run_if_any_element_active(
             jnp.any(is_passed), pass_kink, unchanged_tangents
         )
         unbatched["state_tangents"] = tangents
+        n_rows = len(state.state.q) + len(state.state.v)
+        logged_tangents = jnp.concatenate([time_tangent[:, None], kink_tangents[:, :n_rows]], 1)
     if state.margin_minima_state is not None:
         minima = update_margin_minima_state(
             phase, state.margin_minima_state, state.state, search.end_state,
@@ -223,7 +274,7 @@ def _select_passed_state(
     selected_state = select_trees_by_condition(
         is_passed, next_state._replace(**drop), state._replace(**drop)
     )
-    return selected_state._replace(**unbatched)
+    return selected_state._replace(**unbatched), logged_tangents
 
 
 def _pass_tangents(
@@ -234,9 +285,9 @@ def _pass_tangents(
     search: EventSearch,
     kink_state: StageState,
     is_passed: Array,
-    tangents: tuple[Array, Array],
-) -> tuple[Array, Array]:
-    """Return the tangents after a kink at a fixed time, and those of the state at the kink.
+    tangents: tuple[Array, Array, Array],
+) -> tuple[Array, Array, Array]:
+    """Return tangents after a kink at a fixed time, and of the state and the time at the kink.
 
     - `kink_state`: state after the kink;
     - `tangents`: results for batch elements that are not at a kink.
@@ -251,7 +302,10 @@ def _pass_tangents(
     )
     tangents_after = kink_tangents - time_tangent[:, None] * evaluate_motion_rates(kink_state)
     held_tangents = end_tangents[:, kink_tangents.shape[1] :]
-    return tuple(
-        jnp.where(is_passed, jnp.concatenate([x, held_tangents], 1), y)
-        for x, y in zip((tangents_after, kink_tangents), tangents, strict=True)
+    return (
+        *(
+            jnp.where(is_passed, jnp.concatenate([x, held_tangents], 1), y)
+            for x, y in zip((tangents_after, kink_tangents), tangents[:2], strict=True)
+        ),
+        jnp.where(is_passed, time_tangent, tangents[2]),
     )  # type: ignore[return-value]

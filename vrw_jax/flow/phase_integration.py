@@ -31,6 +31,7 @@ from vrw_jax.flow.event_location import (
 )
 from vrw_jax.flow.integrate import (
     PhaseEnd,
+    divide_equally,
     integrate_to_event,
     sample_batch_phase,
 )
@@ -402,5 +403,5 @@ def sample_phase(
     tolerance is multiplied by `state_units`.
     """
     phase, tableau = _make_phase(vector_field, options, state_units)
-    samples = sample_batch_phase(phase, tableau, (), (start_state,), duration, n_samples, options)
-    return samples[:, 0]
+    lengths = divide_equally(duration, n_samples)
+    return sample_batch_phase(phase, tableau, (), (start_state,), lengths, options)[:, 0]

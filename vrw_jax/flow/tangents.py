@@ -104,6 +104,8 @@ class BatchPhase(NamedTuple):
     """
     sides: Vector = ()
     """Signs for which the equations are smooth; empty without kinks."""
+    n_logged_kinks: int = 0
+    """Largest number of kinks that the end of the phase lists, see `kinks.KinkLog`."""
 
     def make_state(self, q: Any, v: Any) -> StageState:
         """Return the state with positions `q`, rates `v` and the accelerations there."""

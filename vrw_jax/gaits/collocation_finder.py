@@ -89,6 +89,7 @@ class CollocationFinder(AbstractGaitFinder):
         if not MEASURES[measure_name].leg_dimension
     )
     supports_cold_start: ClassVar[bool] = True
+    has_own_measures: ClassVar[bool] = True
     default_measures: ClassVar[tuple[str, ...]] = tuple(
         measure_name
         for measure_name in cycle_measures
@@ -294,10 +295,17 @@ class KinkedGaitFinder(ReturnMapFinder):
     therefore only finds the start of Newton's method on the return map.
     """
 
+    has_own_measures: ClassVar[bool] = True
+    cycle_measures: ClassVar[tuple[str, ...]] = (
+        *ReturnMapFinder.cycle_measures,
+        *FORCE_PEAK_MEASURES,
+    )
     readable_measures: ClassVar[tuple[str, ...]] = tuple(
         measure_name
         for measure_name in CollocationFinder.readable_measures
-        if measure_name in ReturnMapFinder.readable_measures or measure_name in MARGIN_MEASURES
+        if measure_name in ReturnMapFinder.readable_measures
+        or measure_name in MARGIN_MEASURES
+        or measure_name in FORCE_PEAK_MEASURES
     )
     differentiable_measures: ClassVar[tuple[str, ...]] = tuple(
         measure_name

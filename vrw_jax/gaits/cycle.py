@@ -122,8 +122,8 @@ class AbstractCycle(AbstractPrintable):
 
         After `replace_missing_gaits_by_nan` the result and its derivatives are NaN instead of zero.
         """
-        # The derivative of this value 0 is also 0.
-        return jnp.where(self.found, value_of_gait, 0.0 * self.monodromy_value[..., 0, 0])
+        # The derivative of this value 0 is also 0, unlike that of multipliers, which may be NaN.
+        return jnp.where(self.found, value_of_gait, 0.0 * self.section_state[..., 0])
 
     def reduce_over_steps(
         self, values_by_step: Array, reduce_values: Callable[[Array, int], Array]
@@ -162,13 +162,15 @@ class AbstractCycle(AbstractPrintable):
         def describe_element(flat_index: int, failed_check: float) -> str:
             element_index = np.unravel_index(flat_index, outcomes.shape)
             outcome_code = int(outcomes[element_index])
-            if outcome_code in RETRY_OUTCOMES:
-                model, params = jax.tree.map(
-                    lambda x: x[element_index] if x.ndim else x, searched_wheels
-                )
-                if impossibility_text := model.explain_impossible_gait(params):
-                    return impossibility_text
-            return describe_outcome(outcome_code, failed_check)
+            model, params = jax.tree.map(
+                lambda x: x[element_index] if x.ndim else x, searched_wheels
+            )
+            reason = ""
+            if outcome_code == Outcome.BAD_INPUT:
+                reason = model.attach_laws(params).describe_error()
+            elif outcome_code in RETRY_OUTCOMES:
+                reason = model.explain_impossible_gait(params)
+            return reason or describe_outcome(outcome_code, failed_check)
 
         flat_indices = np.arange(outcomes.size).reshape(outcomes.shape)
         return format_each_batch_element(describe_element, flat_indices, failed_checks)
@@ -280,13 +282,9 @@ class AbstractCycle(AbstractPrintable):
             for measure, name in zip(measure_names, name_measures(measure_names), strict=True)
         }
 
+    @abc.abstractmethod
     def _evaluate_own_measure(self, measure: Measure) -> Array:
         """Return the value of a measure of the user, which is undefined without a gait."""
-        raise ValueError(
-            f"{measure.name} is a measure of your own, but it is known for gaits of the paper's "
-            "model and of your own walkers only: take model=vrw.ViscoelasticWheel(), without "
-            "declared kinks of the legs."
-        )
 
     @property
     def force_peaks(self) -> dict[str, Array]:

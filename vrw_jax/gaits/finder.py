@@ -157,6 +157,8 @@ class AbstractGaitFinder(eqx.Module):
     readable_measures: eqx.AbstractClassVar[tuple[str, ...]]
     # whether the search requires no start near the gait
     supports_cold_start: eqx.AbstractClassVar[bool]
+    has_own_measures: ClassVar[bool] = False
+    """Whether studies accept measures of the user."""
     is_multistable: ClassVar[bool] = False
     """Whether several gaits of a wheel may be attracting. Walks from several starts
     distinguish them.

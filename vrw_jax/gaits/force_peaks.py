@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
+from vrw_jax.flow.smooth_parts import StepForceExtrema, summarize_forces
 from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem
 from vrw_jax.gaits.derivatives import attach_derivatives, make_tangent_function
 from vrw_jax.gaits.extrema import (
@@ -111,7 +112,7 @@ def _summarize_steps(
         extrema_by_step, values_by_step, durations, landing_impulses, strict=True
     ):
         forces = (_join_phases(extrema, values, step_durations, index) for index in range(2))
-        step_peaks = {**_summarize_forces(jnp, *forces), "landing_impulse": landing_impulse}
+        step_peaks = {**summarize_forces(jnp, *forces), "landing_impulse": landing_impulse}
         peaks_by_step.append(jax.tree.map(lambda x: x.astype(durations.dtype), step_peaks))
     return jax.tree.map(lambda *values: functools.reduce(jnp.fmax, values), *peaks_by_step)
 
@@ -223,25 +224,12 @@ def measure_force_peaks(
     return attach_derivatives(compute_derivatives, peaks, parameters, (state, extrema))
 
 
-class _ForceExtrema(NamedTuple):
-    """Extrema of a force in one gait step, in chronological order."""
-
-    times: Any  # s
-    forces: Any  # N
-    is_peak: Any
-    is_trough: Any
-    rate_times: Any  # of extrema of the rate, s
-    rates: Any  # N/s
-    is_rate_maximum: Any
-    other_forces: Any  # at the ends of phases, or at all samples, N
-
-
 def _join_phases(
     extrema_of_phases: list[LocatedExtrema],
     values_of_phases: list[ExtremumValues],
     phase_durations: Array,
     force_index: int,
-) -> _ForceExtrema:
+) -> StepForceExtrema:
     """Return the extrema of one force over a gait step, from the extrema in each phase.
 
     - `force_index`: 0 for the force on the fore foot, 1 for the total force.
@@ -261,7 +249,7 @@ def _join_phases(
         for name in ("times", "rate_times")
     )
     has_phase_occurred = jnp.repeat(phase_durations > 0.0, 2)
-    return _ForceExtrema(
+    return StepForceExtrema(
         times,
         join("values", values_of_phases),
         join("is_maximum", extrema_of_phases),
@@ -271,55 +259,6 @@ def _join_phases(
         join("is_rate_maximum", extrema_of_phases),
         jnp.where(has_phase_occurred, join("ends", values_of_phases), -jnp.inf),
     )
-
-
-def _summarize_forces(xp: Any, fore: _ForceExtrema, total: _ForceExtrema) -> dict[str, Any]:
-    """Return the measures of a step from extrema of the force on the fore foot and of their sum.
-
-    - `xp`: `jax.numpy`, or `numpy` for numbers of extrema that differ from step to step.
-    """
-    fore_peaks, total_peaks = (_summarize_force(extrema, xp) for extrema in (fore, total))
-    names = {"n_force_peaks": "n_total_force_peaks", "peak_force": "peak_total_force"}
-    names["smooth_peak_force"] = "smooth_peak_total_force"
-    return fore_peaks | {names[name]: total_peaks[name] for name in names}
-
-
-def _summarize_force(extrema: _ForceExtrema, xp: Any) -> dict[str, Any]:
-    """Return the measures of the fore foot in `measures.FORCE_PEAK_MEASURES`, by name."""
-    find_largest = lambda values: xp.max(values, initial=-xp.inf)
-    peak_forces = xp.where(extrema.is_peak, extrema.forces, -xp.inf)
-    lower_neighbor_peak = xp.minimum(
-        _find_highest_before(peak_forces, xp), _find_highest_before(peak_forces, xp, True)
-    )
-    is_trough = extrema.is_trough & xp.isfinite(lower_neighbor_peak)
-    trough_depths = xp.where(
-        is_trough, xp.where(is_trough, lower_neighbor_peak, 0.0) - extrema.forces, 0.0
-    )
-    first_peak_time = xp.min(xp.where(extrema.is_peak, extrema.times, xp.inf), initial=xp.inf)
-    is_later_rate_maximum = extrema.is_rate_maximum & (extrema.rate_times > first_peak_time)
-    largest_rate = find_largest(xp.where(is_later_rate_maximum, extrema.rates, -xp.inf))
-    candidate_forces = xp.append(peak_forces, extrema.other_forces)
-    return {
-        "n_force_peaks": xp.sum(extrema.is_peak),
-        # The maximum of tied forces has one-sided derivatives. Selection returns one of them.
-        "peak_force": candidate_forces[xp.argmax(candidate_forces)],
-        "smooth_peak_force": xp.where(xp.any(extrema.is_peak), find_largest(peak_forces), xp.nan),
-        "force_trough_depth": xp.max(trough_depths, initial=0.0),
-        "second_peak_rate": xp.where(xp.any(is_later_rate_maximum), largest_rate, xp.nan),
-    }
-
-
-def _find_highest_before(forces: Any, xp: Any, is_reversed: bool = False) -> Any:
-    """Return the largest force before each one, or after it, and -inf if there is none.
-
-    JAX computes it in a loop, because comparisons of all pairs would double the compiled code.
-    """
-    if xp is np:
-        order = slice(None, None, -1 if is_reversed else 1)
-        return np.maximum.accumulate(np.append(-np.inf, forces[order])[:-1])[order]
-    start = jnp.asarray(-jnp.inf, forces.dtype)
-    keep_highest = lambda highest, force: (jnp.maximum(highest, force), highest)
-    return lax.scan(keep_highest, start, forces, reverse=is_reversed)[1]
 
 
 SPLINE_DEGREE = 7
@@ -411,7 +350,7 @@ def force_peaks(walk: xr.Dataset) -> xr.Dataset:
             for force in (fore_force, total_force)
         ]
         fore_force_extrema.append(extrema[0])
-        measures_by_step.append(_summarize_forces(np, *extrema))
+        measures_by_step.append(summarize_forces(np, *extrema))
     dataset_variables = {
         measure_name: (
             "step",
@@ -439,7 +378,7 @@ def _find_force_extrema(
     sample_times: np.ndarray,
     sampled_forces: np.ndarray,
     sample_indices_by_interval: list[np.ndarray],
-) -> _ForceExtrema:
+) -> StepForceExtrema:
     """Return the extrema of a force within the intervals between the events of one step.
 
     - `sample_indices_by_interval`: indices of the samples in each interval between two events.
@@ -490,6 +429,6 @@ def _find_force_extrema(
         )
     times, forces, is_maximum = map(np.concatenate, zip(*extrema_by_interval, strict=True))
     rate_times, rate_maxima = map(np.concatenate, zip(*rate_maxima_by_interval, strict=True))
-    return _ForceExtrema(
+    return StepForceExtrema(
         times, forces, is_maximum, ~is_maximum, rate_times, rate_maxima, rate_times > 0.0, ()
     )

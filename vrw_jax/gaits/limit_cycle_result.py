@@ -221,8 +221,10 @@ class LimitCycle(AbstractCycle):
 
     @property
     def searched_wheel(self) -> tuple[ViscoelasticWheel, WheelParams]:
-        parameters = jnp.moveaxis(self.searched_parameters, -1, 0)
-        return self.model, self.system.make_wheel(parameters)
+        # A single wheel outside its domain would raise an error, and a batch of one does not.
+        parameters = jnp.moveaxis(self.searched_parameters, -1, 0)[..., None]
+        wheels = self.system.make_wheel(parameters)
+        return self.model, jax.tree.map(lambda x: x[..., 0], wheels)
 
     @property
     def ending(self) -> Any:
@@ -316,9 +318,9 @@ def _solve_limit_cycle(
     """Find the cycle of one wheel on the mesh of the collocation system."""
     is_in_domain = params.is_in_domain()
     parameters = stack_parameters(params)
+    searched_parameters = lax.stop_gradient(parameters)
     table_1_parameters = stack_parameters(params.make_table_1_wheel()).astype(parameters.dtype)
     parameters = jnp.where(is_in_domain, parameters, table_1_parameters)
-    searched_parameters = lax.stop_gradient(parameters)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
         solve_cycle_with_derivatives(
             collocation_system,

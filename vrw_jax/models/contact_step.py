@@ -20,7 +20,7 @@ from jaxtyping import Array
 from vrw_jax import lanes
 from vrw_jax.base.elementwise import make_opaque_loop_condition
 from vrw_jax.base.options import StepOptions
-from vrw_jax.flow.integrate import sample_at_equal_times
+from vrw_jax.flow.integrate import divide_equally, sample_between_intervals
 from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.flow.tableaus import ButcherTableau, StageState, load_explicit_tableau
 from vrw_jax.models.contact_integrator import make_contact_phase
@@ -219,13 +219,12 @@ def sample_contact_interval(
         slot_forces = contact_quantities.normal_forces, contact_quantities.tangential_forces
         return jnp.concatenate([state.q, state.v, *slot_forces])
 
-    return sample_at_equal_times(
+    return sample_between_intervals(
         take_sample_step,
         pack_sample,
         phase.make_state(q, v),
         tableau,
-        duration,
-        n_samples,
+        divide_equally(duration, n_samples),
         options,
     )
 

@@ -1,6 +1,7 @@
 """Interface of every model: its declarations, and the methods that compute its steps."""
 
 import abc
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.base.checks import has_traced_leaf
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.base.printing import format_quantity
@@ -273,9 +275,24 @@ class AbstractWheel(AbstractWalker, eqx.Module):
         """
         raise ValueError(
             f"force peaks are measured for a {type(self).__name__}, but its steps have no such "
-            "measures: take vrw.UnilateralWheel(), or gaits of vrw.ViscoelasticWheel() whose legs "
-            "declare no kinks."
+            "measures: take vrw.ViscoelasticWheel() or vrw.UnilateralWheel()."
         )
+
+    def measure_step(
+        self,
+        params: WheelParams,
+        x: SectionState,
+        step: Any,
+        options: StepOptions,
+        measures: Sequence[Measure] | None = None,
+    ) -> dict[str, Array]:
+        for measure in measures or ():
+            if measure.phases:
+                raise ValueError(
+                    f"{measure.name} is a measure of phases, but a {type(self).__name__} has none: "
+                    "take model=vrw.ViscoelasticWheel()."
+                )
+        return super().measure_step(params, x, step, options, measures)
 
     @abc.abstractmethod
     def sample_step(

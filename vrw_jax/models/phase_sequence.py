@@ -75,6 +75,7 @@ class PhaseResult(NamedTuple):
     n_solver_steps: Int[Array, "..."]  # attempted, accepted or not
     margin_minima: Array | None  # one minimum per margin on the leading axis, if recorded
     next_phase_inputs: Any = None  # data that the engine passes to the next phase
+    kink_log: Any = None  # a `KinkLog` of the kinks of the legs' forces, if requested
 
 
 PhaseRunner = Callable[[AbstractPhase, Vector, Vector, Array, PhaseResult | None], PhaseResult]

@@ -11,22 +11,25 @@ import dataclasses
 import functools
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
 from vrw_jax.base.elementwise import approximate_power, compute_sine_cosine
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.flow.integrate import integrate_batch_phase, sample_batch_phase
+from vrw_jax.flow.integrate import divide_equally, integrate_batch_phase, sample_batch_phase
+from vrw_jax.flow.kinks import find_sides
 from vrw_jax.flow.phase_integration import (
     GuardsAndMargins,
     PhaseKinks,
@@ -35,6 +38,7 @@ from vrw_jax.flow.phase_integration import (
     integrate_phase,
     sample_phase,
 )
+from vrw_jax.flow.smooth_parts import NODE_FRACTIONS, SmoothParts
 from vrw_jax.flow.tableaus import (
     ButcherTableau,
     StageAccelerations,
@@ -43,6 +47,7 @@ from vrw_jax.flow.tableaus import (
 )
 from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
 from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.phase_measures import evaluate_own_measure, measure_forces
 from vrw_jax.models.phase_sequence import (
     PhaseResult,
     PhaseRunner,
@@ -144,6 +149,42 @@ class ViscoelasticWheel(AbstractWheel):
         if can_use_batch_kernel(options):
             return _compile_sampling(self.stop_at_lift_off, n_samples)(params, x, options)
         return self._sample_element(params, x, options, n_samples)
+
+    def measure_force_peaks(
+        self, params: WheelParams, x: SectionState, options: StepOptions
+    ) -> dict[str, Array]:
+        params = self.attach_laws(params)
+        return measure_forces(params, x, self._sample_parts(params, x, options))
+
+    def measure_step(
+        self,
+        params: WheelParams,
+        x: SectionState,
+        step: StepResult,
+        options: StepOptions,
+        measures: Sequence[Measure] | None = None,
+    ) -> dict[str, Array]:
+        measures = self.measures if measures is None else measures
+        of_phases = [measure for measure in measures if measure.phases]
+        of_step = [measure for measure in measures if not measure.phases]
+        values = super().measure_step(params, x, step, options, of_step)
+        if of_phases:
+            with_laws = self.attach_laws(params)
+            parts = self._sample_parts(with_laws, x, options)
+            for measure in of_phases:
+                values[measure.name] = evaluate_own_measure(measure, params, with_laws, x, parts)
+        return values
+
+    def _sample_parts(
+        self, params: WheelParams, x: SectionState, options: StepOptions
+    ) -> tuple[SmoothParts, ...]:
+        """Return the smooth parts of each phase in a step, whose laws `params` contains."""
+        if load_explicit_tableau(options.solver) is None:
+            raise ValueError(
+                f"solver is {options.solver}, but force peaks and measures of phases need an "
+                "explicit one: take 'Dopri8'."
+            )
+        return _compile_part_sampling(self.stop_at_lift_off)(params, x, options)
 
     def _sample_element(
         self, params: WheelParams, x: SectionState, options: StepOptions, n_samples: int
@@ -270,6 +311,27 @@ def _compile_sampling(stop_at_lift_off: bool, n_samples: int) -> Callable:
     )
 
 
+@functools.cache
+def _compile_part_sampling(stop_at_lift_off: bool) -> Callable:
+    """Return a compiled function of (params, x, options) that samples the smooth parts of a step.
+
+    It has first derivatives.
+    """
+
+    def refuse(*_: Any) -> Any:
+        raise NotImplementedError(
+            "force peaks and own measures of legs that declare kinks have first derivatives only: "
+            "take differences of their gradients."
+        )
+
+    sample_lane_parts = functools.partial(_sample_lane_parts, stop_at_lift_off)
+    return lanes.differentiate(
+        lanes.jit_batch(sample_lane_parts),
+        refuse,
+        functools.partial(_make_column_function, sample_lane_parts),
+    )
+
+
 def take_steps_of_lanes(
     stop_at_lift_off: bool,
     friction: float | None,
@@ -358,9 +420,73 @@ def _sample_lane_steps(
     """Return samples of a batch of walking steps at equidistant times of each phase."""
     phase_sequence, tableau = _run_lane_phases(stop_at_lift_off, False, params, x, options)
     sample = lambda phase, q, v, duration, options: sample_batch_phase(
-        make_batch_phase(phase, False), tableau, q, v, duration, n_samples, options
+        make_batch_phase(phase, False), tableau, q, v, divide_equally(duration, n_samples), options
     )
     return make_trajectory(phase_sequence, sample, options)
+
+
+MAX_LOGGED_KINKS = 7
+"""Largest number of kinks in a phase whose smooth parts are measured.
+
+The value is chosen because a leg passes a kink once or twice in a phase.
+"""
+
+
+def _sample_lane_parts(
+    stop_at_lift_off: bool, params: WheelParams, x: Array, options: StepOptions
+) -> tuple[SmoothParts, ...]:
+    """Return the smooth parts of each phase, between its kinks, for a batch of steps."""
+    sequence, tableau = _run_lane_phases(
+        stop_at_lift_off, False, params, x, options, MAX_LOGGED_KINKS
+    )
+    return tuple(
+        _sample_parts_of_phase(tableau, options, *phase_and_ends)
+        for phase_and_ends in zip(
+            sequence.phases, sequence.phase_start_states, sequence.phase_end_results, strict=True
+        )
+    )
+
+
+def _sample_parts_of_phase(
+    tableau: ButcherTableau,
+    options: StepOptions,
+    phase: AbstractPhase,
+    start: tuple[Vector, Vector],
+    phase_end: PhaseResult,
+) -> SmoothParts:
+    options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
+    duration, n_dof, log = phase_end.duration, phase.n_dof, phase_end.kink_log
+    first_state = jnp.stack([*start[0], *start[1]])
+    if log is None:
+        n_kinks = jnp.zeros_like(phase_end.end_guard_index)
+        sides, states, durations = (x[None] for x in (first_state, first_state, duration))
+    else:
+        batch_phase = make_batch_phase(phase, False)
+        first_sides = jnp.stack(find_sides(batch_phase, batch_phase.make_state(*start)))
+        n_kinks = log.n_kinks
+        is_passed = jnp.arange(len(log.times))[:, None] < n_kinks
+        times = jnp.where(is_passed, log.times, duration)
+        durations = jnp.diff(jnp.concatenate([0.0 * times[:1], times, duration[None]]), axis=0)
+        # Absent parts begin where the phase does, since their states must be regular.
+        append = lambda first, later: jnp.concatenate(
+            [first[None], jnp.where(is_passed[:, None], later, first)]
+        )
+        sides, states = append(first_sides, log.sides), append(first_state, log.states)
+
+    def sample(part: tuple[Array, Array, Array]) -> Array:
+        sides, state, duration = part
+        smooth_phase = phase.on_sides(tuple(sides)) if log is not None else phase
+        return sample_batch_phase(
+            make_batch_phase(smooth_phase, False),
+            tableau,
+            tuple(state[:n_dof]),
+            tuple(state[n_dof:]),
+            jnp.asarray(np.diff(NODE_FRACTIONS)[:, None], duration.dtype) * duration,
+            options,
+        )
+
+    samples = lax.map(sample, (sides, states, durations))
+    return SmoothParts(n_kinks, sides, durations, samples)
 
 
 class _NextPhaseInputs(NamedTuple):
@@ -472,6 +598,7 @@ def run_batch_phases(
     records_margins: bool,
     straggler_count: Array | None = None,
     is_compiled_separately: bool = False,
+    n_logged_kinks: int = 0,
 ) -> PhaseSequenceResult:
     """Integrate all phases of one walking step per batch element and return their starts and ends.
 
@@ -480,10 +607,10 @@ def run_batch_phases(
     - `records_margins`: whether the minima of the margins are computed;
     - `straggler_count`: largest number of batch elements that may remain unfinished, see
       `integrate_batch_phase`;
-    - `is_compiled_separately`: see `BatchPhase`.
+    - `is_compiled_separately`, `n_logged_kinks`: see `BatchPhase`.
     """
     phase_runner = _make_phase_runner(
-        options, tableau, records_margins, straggler_count, is_compiled_separately
+        options, tableau, records_margins, straggler_count, is_compiled_separately, n_logged_kinks
     )
     landing_function = with_batched_jvp(transitions.resolve_landing)
     return run_step_phases(phase_runner, params, x, options, stop_at_lift_off, landing_function)
@@ -506,6 +633,7 @@ def _make_phase_runner(
     records_margins: bool,
     straggler_count: Array | None,
     is_compiled_separately: bool,
+    n_logged_kinks: int = 0,
 ) -> PhaseRunner:
     """Return a function that integrates one phase to its end, for all batch elements.
 
@@ -542,7 +670,7 @@ def _make_phase_runner(
             )
             return make_batch_phase(
                 phase_with_traced_inputs, records_margins, is_compiled_separately
-            )
+            )._replace(n_logged_kinks=n_logged_kinks)
 
         phase_end = integrate_batch_phase(
             make_phase,
@@ -567,6 +695,7 @@ def _make_phase_runner(
             next_phase_inputs=_NextPhaseInputs(
                 phase_end.next_solver_dt, is_active_lane, phase_end.is_unfinished
             ),
+            kink_log=phase_end.kink_log,
         )
 
     return run_phase
@@ -593,6 +722,7 @@ def _run_lane_phases(
     params: WheelParams,
     x: Array,
     options: StepOptions,
+    n_logged_kinks: int = 0,
 ) -> tuple[PhaseSequenceResult, ButcherTableau]:
     """Return the starts and ends of the phases of a batch of walking steps, and the tableau."""
     tableau = load_explicit_tableau(options.solver)
@@ -605,6 +735,7 @@ def _run_lane_phases(
         stop_at_lift_off,
         records_margins,
         is_compiled_separately=True,
+        n_logged_kinks=n_logged_kinks,
     ), tableau
 
 

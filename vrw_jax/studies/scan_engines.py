@@ -450,10 +450,11 @@ def evaluate_gaits_with_kinks(
     rows = jnp.asarray(evaluation_request.stack_parameter_rows(samples_by_parameter))
     cycles = jax.tree.map(lambda *x: jnp.stack(x), *map(finder.find_cycle_from_values, rows))
     names = (*dict.fromkeys((*evaluation_request.direct_names, *MARGIN_MEASURES)),)
+    own = {measure.name: measure for measure in evaluation_request.own_measures}
+    find_measures = lambda names: tuple(own.get(name, name) for name in names)
+    reader = MeasureReader(finder.measure_reader, find_measures(names))
     results = map_in_batches(
-        functools.partial(
-            _read_gaits_with_kinks, finder, MeasureReader(finder.measure_reader, names)
-        ),
+        functools.partial(_read_gaits_with_kinks, finder, reader),
         (batch_sizes.GAIT_READ_BATCH_SIZE,),
         rows,
         cycles,
@@ -461,7 +462,7 @@ def evaluate_gaits_with_kinks(
 
     def differentiate(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         jacobians = [
-            finder.measure_gait(row, state, names).parameter_jacobian
+            finder.measure_gait(row, state, find_measures(names)).parameter_jacobian
             for row, state in zip(rows, cycles.section_state, strict=True)
         ]
         return dict(zip(names, np.stack(jacobians, 1), strict=True))

@@ -293,11 +293,10 @@ def plan_scan(
         find_own_measures(measures, measure_catalog.requestable_measures) if model.is_wheel else {}
     )
     if own_measures:
-        if not gait_finder.supports_cold_start or tol is not None:
+        if not gait_finder.has_own_measures or tol is not None:
             raise ValueError(
                 f"{', '.join(own_measures)} is a measure of your own, but it is known for gaits of "
-                "the paper's model only: take model=vrw.ViscoelasticWheel() without declared "
-                "kinks, and no tol."
+                "the paper's model only: take model=vrw.ViscoelasticWheel(), and no tol."
             )
         measure_catalog = measure_catalog._replace(
             requestable_measures=(*measure_catalog.requestable_measures, *own_measures),

@@ -334,6 +334,18 @@ class WheelParams(AbstractPrintable):
             is_in_all_domains &= law_parameter.domain.contains_parameter_value(law_value)
         return is_in_all_domains
 
+    def describe_error(self) -> str:
+        """Return a sentence on the first parameter of one wheel outside its domain, or ""."""
+        try:
+            self.__check_init__()
+            for law_parameter in list_law_parameters(self.laws):
+                law_parameter.domain.require_value_in_domain(
+                    law_parameter.name, float(law_parameter.value)
+                )
+        except ValueError as error:
+            return str(error)
+        return ""
+
     def attach_laws(self, laws: WheelLaws | None) -> "WheelParams":
         """Return these parameters with the laws of a model, so that all equations contain them.
 
