@@ -149,6 +149,8 @@ def test_a_batch_of_data_sets_has_the_estimates_of_each(small_fit):
     for k, name in enumerate(("period", "dls_fraction", "speed")):
         dataset[name] = (("dataset", "trial"), numbers[:2, :, k])
     of_dimension = vrw.fit(dataset, SMALL_WHEEL)
+    of_one_row = vrw.fit(dataset.isel(trial=0, drop=True), SMALL_WHEEL)
+    np.testing.assert_array_equal(of_one_row.values, of_dimension.values)
     np.testing.assert_allclose(of_dimension.values, batch.values[:2], rtol=1e-4)
     assert "spread" in str(of_dimension)
     assert "spread" not in str(vrw.fit(dataset.isel(dataset=[0]), SMALL_WHEEL))
