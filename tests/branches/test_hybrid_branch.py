@@ -292,3 +292,75 @@ def test_a_branch_of_a_walker_in_closed_form_has_its_states_and_periods():
         vrw.continue_branch(
             params, "kick", (0.5, 2.0), model=ball, cycle=gait, margins={"m": lambda y, p: y[0]}
         )
+
+
+class Logistic(vrw.AbstractWalker):
+    """x -> r x (1 - x) has the fixed point 1 - 1 / r, and x -> x the period 2 from r = 3."""
+
+    def advance(self, params, x, options):
+        return vrw.AdvanceResult(params["r"] * x * (1.0 - x), jnp.ones(1))
+
+    def starts(self, params):
+        return jnp.array([0.6])
+
+
+def continue_logistic(r, **arguments):
+    return vrw.continue_branch({"r": r}, "r", (2.8, 3.6), model=Logistic(), **arguments)
+
+
+def test_a_branch_begins_at_the_gait_of_the_starts_if_no_gait_is_given():
+    (doubling,) = continue_logistic(2.9).special_points
+    assert doubling.value == pytest.approx(3.0, abs=1e-8)
+
+
+def test_a_branch_has_the_period_of_its_gait():
+    gait = vrw.limit_cycle({"r": 3.2}, model=Logistic(), guess=[0.513], period_n=2)
+    branch = continue_logistic(3.2, cycle=gait)
+    assert branch.period_n == 2
+    r, x = branch.dataset.r.values, branch.dataset.x.values[:, 0]
+    # Two steps of a gait lead back to its start, and one does not.
+    step = lambda x: r * x * (1.0 - x)
+    np.testing.assert_allclose(step(step(x)), x, rtol=1e-9)
+    assert abs(step(x) - x).max() > 0.1
+
+
+def test_a_gait_that_was_not_found_begins_no_branch():
+    gait = vrw.limit_cycle({"r": 3.2}, model=Logistic(), guess=[np.nan])
+    branch = continue_logistic(3.2, cycle=gait)
+    assert branch.outcome == vrw.Outcome.BAD_INPUT
+    assert branch.dataset.sizes["point"] == 0
+    assert "BAD_INPUT" in branch.ends[0]
+
+
+def test_a_margin_that_is_zero_at_a_computed_gait_is_found():
+    """Each step lasts p, and the state is 2 p, so that the margin p - 0.25 vanishes at 0.25."""
+    field = lambda y, p: jnp.stack([1.0 + 0.0 * y[0], 0.0 * y[1]])
+    reset = lambda y, p: jnp.stack([0.0 * y[0], 0.5 * y[1] + p["p"]])
+    walker = HybridSystem(
+        modes={"run": Mode(field, {"end": Guard(lambda y, p: p["p"] - y[0], reset)})},
+        section="end",
+        state=("time", "level"),
+        project=lambda y, p: y[1:],
+        embed=lambda x, p: jnp.stack([0.0 * x[0], x[0]]),
+        starts=lambda p: jnp.array([0.5]),
+    )
+    margins = {"low": lambda y, p: y[1] - 0.5}
+    branch = vrw.continue_branch({"p": 0.25}, "p", (0.1, 0.4), model=walker, margins=margins)
+    (border,) = branch.special_points
+    assert border.name == "low"
+    assert border.value == pytest.approx(0.25, abs=1e-9)
+    for name in ("fold", "p"):
+        with pytest.raises(ValueError, match=f"'{name}' names a parameter, margin or measure"):
+            vrw.continue_branch(
+                {"p": 0.25}, "p", (0.1, 0.4), model=walker, margins={name: margins["low"]}
+            )
+
+
+def test_wrong_arguments_of_a_map_are_refused_before_the_continuation():
+    logistic = lambda _, x, r: r * x * (1.0 - x)
+    with pytest.raises(ValueError, match="'x' names a parameter"):
+        vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5), name="x")
+    with pytest.raises(ValueError, match="float32, in which .*start_jax"):
+        vrw.continue_map(logistic, jnp.array([0.6], jnp.float32), 2.5, (2.0, 3.5))
+    # Integers are numbers too.
+    assert vrw.continue_map(logistic, [2.0 / 3.0], 3, (2, 4)).special_points

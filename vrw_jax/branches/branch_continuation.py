@@ -72,10 +72,14 @@ class PointTable(NamedTuple):
         pairs = zip(indices[:-1].tolist(), indices[1:].tolist(), strict=True)
         return [(i, j) for i, j in pairs if self.owners[i] == self.owners[j]]
 
-    def changes_sign(self, name: str, pair: tuple[int, int]) -> bool:
-        """Return whether a test function has opposite signs at two points."""
+    def changes_sign(self, name: str, pair: tuple[int, int], counts_zero: bool = False) -> bool:
+        """Return whether a test function has opposite signs at two points.
+
+        - `counts_zero`: whether it may also be zero at one of them and positive at the other.
+        """
         left, right = self.tests[name][list(pair)]
-        return bool(left * right < 0.0)
+        is_zero = counts_zero and left * right == 0.0 and left + right > 0.0
+        return bool(left * right < 0.0 or is_zero)
 
 
 # Largest number of jumps in one direction of a branch.

@@ -437,7 +437,8 @@ class _SpecialPointLocator(NamedTuple):
             )
             for pair in regular_pairs
             for name, test in located.items()
-            if not test.is_stepwise and self.table.changes_sign(name, pair)
+            if not test.is_stepwise
+            and self.table.changes_sign(name, pair, test.kind == BORDER_COLLISION)
         ]
         # On the side branch of a pitchfork, the margin touches zero where the parameter turns.
         requests += [

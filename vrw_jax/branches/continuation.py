@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -49,7 +50,7 @@ from vrw_jax.branches.map_branch import (
 )
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.gait_search import limit_cycles, resolve_model
+from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_model
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_collocation import CollocationSolution
@@ -275,15 +276,22 @@ def continue_branch(
         lambda_4_plus 219.847688 lambda 4 plus at 219.847688 ends it.
     """
     if is_own_walker(model):
-        check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
         if cycle_options is not None or force_peaks:
             raise ValueError(
                 "cycle_options or force_peaks is given for a wheel, but the model is a walker of "
                 "yours: give step_options=vrw.StepOptions(...), and measures= for peaks."
             )
+        if cycle is None:
+            cycle = limit_cycle(params, model=model, period_n=period_n, options=step_options)
+        check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
+        period_n = math.lcm(check_int("period_n", period_n), int(cycle.period_n))
         problem, wheel = make_walker_problem(
             model, params, (name,), cycle, period_n, step_options, margins, measures
         )
+        if not cycle.found:
+            attributes = {"title": f"Branch of fixed points along {name}"}
+            outcome = Outcome(int(cycle.outcome))
+            return make_branch(problem, None, name, attributes, params, outcome, cycle.why)
         value = float(wheel.values[problem.parameter_indices[0]])
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
         return trace_fixed_points(

@@ -50,7 +50,13 @@ from vrw_jax.branches.branch import (
     TestFunction,
     compute_multipliers,
 )
-from vrw_jax.branches.branch_continuation import BORDER_COLLISION, EVENT_ORDER, Continuation
+from vrw_jax.branches.branch_continuation import (
+    ADMISSIBILITY,
+    BORDER_COLLISION,
+    EVENT_ORDER,
+    MODULI,
+    Continuation,
+)
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation_problems import (
     POINT_BATCH_SIZES,
@@ -182,6 +188,7 @@ def continue_map(
     check_callable("function", function, "of constants, x and p")
     require_untraced_arguments("vrw.continue_map", "use vrw.solve_fixed_point", x, p, constants)
     require_no_masked_entries("constants", jax.tree.leaves(constants))
+    check_branch_names(name)
     constants = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), constants)
     return trace_fixed_points(
         MapProblem((), function), check_reals("x", x), p, bounds, constants, name, options,
@@ -208,6 +215,32 @@ def read_switch(switch_at: SpecialPoint, units: Any, limits: Any) -> tuple[int, 
     return SWITCHED_KINDS[switch_at.kind], tangent / scales
 
 
+NO_START_TEXT = (
+    "Newton's method found no fixed point from which the branch could begin: start nearer to one, "
+    "or give units= of the state."
+)
+
+RESERVED_NAMES = {
+    *BIFURCATIONS, BRANCH_POINT, MODULI, ADMISSIBILITY, EVENT_ORDER, "closure", "x", "period",
+    "outcome", "spectral_radius", "spectral_margin", "multiplier_real", "multiplier_imag",
+    "multiplier", "point", "component",
+}  # fmt: skip
+"""Names in the dataset of a branch that no parameter, margin or measure may have."""
+
+
+def check_branch_names(*names: str) -> None:
+    """Raise an error unless parameters, margins and measures of a branch have names of their
+    own.
+    """
+    for name in names:
+        check_type("name", name, str, "give a text")
+        if name in RESERVED_NAMES or names.count(name) > 1:
+            raise ValueError(
+                f"{name!r} names a parameter, margin or measure of the branch, but is also the "
+                "name of another quantity in its dataset: rename it."
+            )
+
+
 def trace_fixed_points(
     problem: MapProblem | ReturnMapProblem,
     x: Array,
@@ -226,7 +259,8 @@ def trace_fixed_points(
     - `args`: the other inputs of the map.
     """
     lower_bound, upper_bound = limits = check_range("bounds", bounds)
-    if not lower_bound <= check_real("p", p) <= upper_bound:
+    p = float(check_real("p", p))
+    if not lower_bound <= p <= upper_bound:
         raise ValueError(
             f"p is {p:g}, but the branch must start within its bounds: give one in "
             f"[{lower_bound:g}, {upper_bound:g}]."
@@ -234,6 +268,12 @@ def trace_fixed_points(
     options = check_arclength_options(options)
     evaluate = lambda x, p: problem.function(args, x, p)
     check_vector_map(lambda x: evaluate(x, jnp.asarray(p, float)), "x", x)
+    if options.tolerance < (eps := float(jnp.finfo(x.dtype).eps)):
+        raise ValueError(
+            f"the numbers are {x.dtype.name}, in which corrections do not fall to "
+            f"{options.tolerance:g}: call vrw.start_jax() before anything else, or give "
+            f"options=vrw.ArclengthOptions(tolerance={100.0 * eps:.0e})."
+        )
     if units is None:
         units = estimate_state_units(problem.function, args, np.asarray(x), p, limits)
     units = tuple(np.asarray(check_state_units(units, x)).tolist())
@@ -253,7 +293,7 @@ def trace_fixed_points(
     if data is None:
         start_jacobian = jax.jacfwd(evaluate)(x, jnp.asarray(p, float))
         is_singular = count_unit_multipliers(np.asarray(start_jacobian)) > 0
-        failure = UNIT_MULTIPLIER_ADVICE if is_singular else ""
+        failure = UNIT_MULTIPLIER_ADVICE if is_singular else NO_START_TEXT
     outcome = Outcome.STEPPED if data else Outcome.NO_CYCLE_FOUND
     return make_branch(problem, data, name, title, params, outcome, failure)
 
@@ -396,6 +436,7 @@ def make_walker_problem(
     """
     measures = select_measures(measures, walker.measures)
     own_margins = declare_margins(walker, margins)
+    check_branch_names(*names, *(own.name for own in (*own_margins, *measures)))
     if isinstance(walker, HybridSystem):
         for own in (*measures, *own_margins):
             walker.find_modes(own)
