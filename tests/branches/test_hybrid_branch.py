@@ -360,7 +360,7 @@ def test_wrong_arguments_of_a_map_are_refused_before_the_continuation():
     logistic = lambda _, x, r: r * x * (1.0 - x)
     with pytest.raises(ValueError, match="'x' names a parameter"):
         vrw.continue_map(logistic, [0.6], 2.5, (2.0, 3.5), name="x")
-    with pytest.raises(ValueError, match="float32, in which .*start_jax"):
+    with pytest.raises(ValueError, match=r"float32, in which .*start_jax"):
         vrw.continue_map(logistic, jnp.array([0.6], jnp.float32), 2.5, (2.0, 3.5))
     # Integers are numbers too.
     assert vrw.continue_map(logistic, [2.0 / 3.0], 3, (2, 4)).special_points
