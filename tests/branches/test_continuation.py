@@ -191,6 +191,17 @@ def test_a_pitchfork_is_met_along_its_side_branch():
     np.testing.assert_allclose(branch.dataset.x[:, 0] ** 2, branch.values, atol=1e-9)
 
 
+@pytest.mark.parametrize("tolerance", [1e-10, 1e-12])
+def test_a_crossing_of_two_branches_is_located_between_the_points_that_are_found(tolerance):
+    """x = sin p crosses another branch at p = 0.4321, next to which Newton's method fails."""
+    cross = lambda _, x, p: x + 0.1 * (x - jnp.sin(p)) * (p - 0.4321 - 0.3 * (x - jnp.sin(p)))
+    options = vrw.ArclengthOptions(tolerance=tolerance)
+    branch = vrw.continue_map(cross, [np.sin(0.1)], 0.1, (0.0, 1.0), options=options)
+    (border,) = branch.special_points
+    assert border.kind == "branch_point"
+    assert abs(border.value - 0.4321) < LOCATION_TOLERANCE
+
+
 @pytest.mark.parametrize("offset", [1e-3, 1e-6, 1e-9])
 def test_beside_a_pitchfork_that_nearly_is_one_the_branch_is_not_left(offset):
     """Above, the branch is x > 0 and stable; below, it turns back at 3 (offset/2)^(2/3)."""

@@ -179,6 +179,10 @@ MIN_BRACKET_FRACTION = 1e-6
 # Fractions of the chord up to an ill-conditioned root, at which the point next to the root is
 # computed again.
 RETRY_CHORD_FRACTIONS = (0.99, 0.9)
+# Offsets of the inner points, as fractions of a chord, between which a crossing of two branches is
+# interpolated. They grow until all points are found. The first is chosen because the error of a
+# cubic polynomial is then below round-off.
+CROSSING_OFFSETS = (1e-3, 1e-2, 1e-1, 3e-1)
 # Largest absolute value of a margin to the fold whose sign is only round-off. The value is chosen
 # above the round-off of a determinant of numbers of order one, which is 1e-15. Points so near to a
 # branch point are rare.
@@ -286,14 +290,33 @@ class _SpecialPointLocator(NamedTuple):
             if len(failed):
                 retried = solve(retry_fraction * locations.left_bracket_ends[failed], failed)
                 beside = replace_rows(beside, failed, retried)
+        fractions = locations.best_locations
+        roots = np.array([parameters[i, x] for i, x in enumerate(fractions)])
+        crossings = np.array([i for i in every if requests[i].name == BRANCH_POINT], int)
+        for offset in CROSSING_OFFSETS:
+            # Next to a crossing of two branches no point is found, or only an inaccurate one.
+            if not len(crossings):
+                break
+            nodes = fractions[crossings, None] + offset * np.array([-3.0, -1.0, 1.0, 3.0])
+            indices = np.repeat(crossings, 4)
+            table = solve(nodes.ravel(), indices)
+            values, p = evaluate(table, indices).reshape(-1, 4), table.points.p.reshape(-1, 4)
+            is_monotonic = np.abs(np.sum(np.sign(np.diff(values)), -1)) == 3.0
+            has_sign_change = np.prod(values[:, 1:3], -1) < 0.0
+            for row in np.flatnonzero(is_monotonic & has_sign_change):
+                scaled_values, i = values[row] / np.ptp(values[row]), crossings[row]
+                # The location and the parameter are cubic polynomials of the value.
+                fit = np.polyfit(scaled_values, np.stack([nodes[row], p[row] - p[row, 0]], -1), 3)
+                fractions[i], roots[i] = fit[-1] + [0.0, p[row, 0]]
+            crossings = crossings[~(is_monotonic & has_sign_change)]
         return [
             request._replace(
-                parameter=float(parameters[i, fraction]),
+                parameter=float(parameter),
                 fraction=float(fraction),
                 beside=select_tree_rows(beside, slice(i, i + 1)),
             )
-            for i, (request, fraction) in enumerate(
-                zip(requests, locations.best_locations, strict=True)
+            for i, (request, fraction, parameter) in enumerate(
+                zip(requests, fractions, roots, strict=True)
             )
         ]
 
