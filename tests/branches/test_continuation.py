@@ -202,6 +202,42 @@ def test_a_crossing_of_two_branches_is_located_between_the_points_that_are_found
     assert abs(border.value - 0.4321) < LOCATION_TOLERANCE
 
 
+@pytest.mark.parametrize("p", [0.8661, 0.87, -0.86])
+def test_a_closed_branch_that_starts_next_to_a_special_point_has_it_once(p):
+    """x^2 + p^2 = 1 has folds at p = -1 and 1, and period doublings at x = 1/2."""
+    closed = lambda _, x, p: x - 2.0 * (x**2 + p**2 - 1.0)
+    branch = vrw.continue_map(closed, [np.sqrt(1.0 - p**2)], p, (-2.0, 2.0))
+    found = sorted((point.value, point.kind) for point in branch.special_points)
+    values, kinds = zip(*found, strict=True)
+    assert kinds == ("fold", "period_doubling", "period_doubling", "fold")
+    half_width = np.sqrt(0.75)
+    np.testing.assert_allclose(
+        values, [-1.0, -half_width, half_width, 1.0], atol=LOCATION_TOLERANCE
+    )
+    np.testing.assert_allclose(branch.values[[0, -1]], p, rtol=1e-15)
+
+
+@pytest.mark.parametrize("bound", [0.0, -1e-12, -1e-6, 1e-6])
+def test_a_fold_at_a_bound_of_the_parameter_is_passed(bound):
+    """x^2 = p has its fold at 0, and both halves reach the other bound."""
+    parabola = lambda _, x, p: x - (x**2 - p)
+    branch = vrw.continue_map(parabola, [np.sqrt(0.5)], 0.5, (bound, 1.0))
+    folds = [point.value for point in branch.special_points if point.kind == "fold"]
+    assert branch.ends == ("The parameter's range ended.",) * 2
+    assert branch.values[[0, -1]].tolist() == [1.0 if bound <= 0.0 else bound, 1.0]
+    np.testing.assert_allclose(folds, [0.0] * (bound <= 0.0), atol=LOCATION_TOLERANCE)
+
+
+def test_a_branch_that_bends_toward_a_bound_ends_on_it():
+    """With 0.1 as the longest step, the tangent misses p = 0, beyond which the parabola bends."""
+    offset = 0.00990523733462663
+    parabola = lambda _, x, p: x + 0.5 * (1.0 + offset - p - x**2)
+    options = vrw.ArclengthOptions(max_ds=0.1)
+    x = [np.sqrt(0.5 + offset)]
+    branch = vrw.continue_map(parabola, x, 0.5, (0.0, 1.0), options=options)
+    assert branch.values[[0, -1]].tolist() == [0.0, 1.0]
+
+
 @pytest.mark.parametrize("offset", [1e-3, 1e-6, 1e-9])
 def test_beside_a_pitchfork_that_nearly_is_one_the_branch_is_not_left(offset):
     """Above, the branch is x > 0 and stable; below, it turns back at 3 (offset/2)^(2/3)."""

@@ -43,8 +43,9 @@ class ArclengthOptions:
     - `tolerance`: largest norm of Newton's last correction;
     - `max_turn_angle`: largest angle between the tangents at neighboring points, rad;
     - `kink_step_factor`: continuation steps shorter than this multiple of `min_ds` may pass a kink
-      of the branch at any angle. The value is chosen because three halvings of the step then remain
-      for failures of Newton's method between two smooth pieces;
+      of the branch at any angle, or a fold at a bound of the parameter. The value is chosen because
+      three halvings of the step then remain for failures of Newton's method between two smooth
+      pieces;
     - `jacobian_reuse_fraction`: if a correction is below this fraction of `tolerance`, the
       iteration ends and the Jacobian at the trial is returned. The value is chosen because that
       Jacobian is then exact.
@@ -238,6 +239,9 @@ class Correction(NamedTuple):
     n_iterations: int
 
 
+MAX_RANGE_EXCESS = 1e-12
+"""Largest round-off of the parameter beyond its bounds, as a fraction of its range."""
+
 Plane = tuple[np.ndarray, np.ndarray]
 """Plane across a branch: one of its points and its normal, in the coordinates of arc length."""
 PointRequests = Generator[tuple[Unknowns, float], NewtonStep, Any]
@@ -381,19 +385,26 @@ class ArclengthDriver:
         )
 
     def predict(
-        self, previous: ContinuationPoint, current: ContinuationPoint, ds: float
+        self,
+        previous: ContinuationPoint,
+        current: ContinuationPoint,
+        ds: float,
+        is_plane_inverted: bool = False,
     ) -> tuple[Unknowns, float, Plane, float, bool]:
         """Predict the point one continuation step ahead, or at a nearer end of the range.
 
         Return its unknowns and fraction, the plane on which they are corrected, the predicted arc
-        length, and whether the plane is the end of the range. The prediction is the cubic
-        polynomial through the last two points and their tangents, whose error is two orders smaller
-        than that of the tangent. This saves one of three Newton iterations.
+        length to the end of the range, and whether the plane is that end. The plane is normal to
+        the branch if the end is farther than `ds`; `is_plane_inverted` selects the opposite plane.
+        The prediction is the cubic polynomial through the last two points and their tangents, whose
+        error is two orders smaller than that of the tangent. This saves one of three Newton
+        iterations.
         """
         fraction, fraction_rate = self.compute_fraction(current.p), current.fraction_rate
         range_end = 1.0 if fraction_rate > 0.0 else 0.0
         length_to_end = (range_end - fraction) / fraction_rate if fraction_rate else np.inf
-        is_range_end, length = bool(length_to_end <= ds), min(length_to_end, ds)
+        is_range_end = bool(length_to_end <= ds) != is_plane_inverted
+        length = length_to_end if is_range_end else ds
         state, rate = (
             np.append(current.z, fraction),
             np.append(current.arclength_tangent, fraction_rate),
@@ -418,7 +429,7 @@ class ArclengthDriver:
         if is_range_end:
             prediction[-1] = target[-1] = range_end
             tangent = self.coordinates(0.0 * current.z, 1.0)
-        return prediction[:-1], prediction[-1], (target, tangent), length, is_range_end
+        return prediction[:-1], prediction[-1], (target, tangent), length_to_end, is_range_end
 
     def is_closed_by(self, points: list[ContinuationPoint]) -> bool:
         """Return whether the start of a branch lies on the segment up to its last point."""
@@ -434,8 +445,9 @@ class ArclengthDriver:
         """Continue a branch from the point near (z, p), and return its `Track`.
 
         The sign 1 increases the parameter at first. A branch ends at the end of the parameter's
-        range, or at its first point that is not admissible. That point is included. A step is
-        lengthened after few Newton iterations, shortened after many, and halved after a failure.
+        range, or at its first point that is not admissible. That point is included. A closed branch
+        ends with its start. A step is lengthened after few Newton iterations, shortened after many,
+        and halved after a failure.
         """
         options, fraction = self.options, self.compute_fraction(p)
         along_parameter = self.coordinates(0.0 * z, 1.0)
@@ -449,18 +461,22 @@ class ArclengthDriver:
         # A suspicious step may have reached another branch; shorter steps then avoid the jump. If
         # they do not, the next step is accepted with any multipliers.
         suspicious_ds, accepts_any_multipliers, is_point_new = 0.0, False, True
+        is_plane_inverted = False
         while True:
-            trial_z, trial_fraction, plane, length, is_next_range_end = self.predict(
-                previous, points[-1], ds
+            trial_z, trial_fraction, plane, length_to_end, is_next_range_end = self.predict(
+                previous, points[-1], ds, is_plane_inverted
             )
             if is_point_new:
                 has_ended = {
                     ContinuationStatus.CURVE_CLOSED: len(points) > 3 and self.is_closed_by(points),
                     ContinuationStatus.POINT_NOT_ADMISSIBLE: not points[-1].is_admissible,
-                    ContinuationStatus.RANGE_END_REACHED: is_range_end or length <= 1e-12,
+                    ContinuationStatus.RANGE_END_REACHED: is_range_end
+                    or length_to_end <= MAX_RANGE_EXCESS,
                     ContinuationStatus.MAX_POINTS_REACHED: len(points) >= options.max_points,
                 }
                 for status in filter(has_ended.get, has_ended):
+                    if status == ContinuationStatus.CURVE_CLOSED:
+                        points[-1] = points[0]
                     return Track(points, status)
             if ds < options.min_ds:
                 return Track(points, ContinuationStatus.STEP_SIZE_UNDERFLOW)
@@ -472,9 +488,17 @@ class ArclengthDriver:
             is_kink = abs(tangent @ new_tangent) < np.cos(options.max_turn_angle) * np.linalg.norm(
                 new_tangent
             )
-            is_point_new = correction.has_converged and (
-                not is_kink
-                or (self.problem.has_kinks and ds < options.kink_step_factor * options.min_ds)
+            is_within = abs(correction.fraction - 0.5) <= 0.5 + MAX_RANGE_EXCESS
+            is_short = ds < options.kink_step_factor * options.min_ds
+            # A branch that turns at the end of the range touches the plane there. A step that is
+            # too short for that plane by the tangent may pass it nevertheless.
+            is_plane_inverted = not is_plane_inverted and (
+                is_short and not correction.has_converged
+                if is_range_end
+                else correction.has_converged and not is_within and length_to_end <= 2.0 * ds
+            )
+            is_point_new = (correction.has_converged and is_within) and (
+                not is_kink or (self.problem.has_kinks and is_short)
             )
             is_suspicious, trial_ds = False, ds
             if is_point_new:
@@ -494,12 +518,12 @@ class ArclengthDriver:
             is_point_new &= not is_suspicious
             if is_point_new:
                 # The cubic prediction must not cross a kink.
-                previous = point if is_kink else current
+                previous, is_plane_inverted = point if is_kink else current, False
                 points.append(point)
                 growth = 1.4 if correction.n_iterations < 5 else 1.0
                 growth = 0.6 if correction.n_iterations > 6 else growth
                 ds = min(ds * growth, options.max_ds)
-            else:
+            elif not is_plane_inverted:
                 ds *= 0.5
             if is_suspicious and suspicious_ds == 0.0:
                 suspicious_ds = trial_ds
