@@ -288,3 +288,46 @@ def test_branches_turn_back_at_the_meeting_of_a_margin_and_a_fold(step_margin_cu
         branch = vrw.continue_branch(before, "stiffness", bounds)
         (fold,) = [border.value for border in branch.special_points if border.name == "fold"]
         assert abs(fold - stiffness) < 1e-9
+
+
+class FoldCircle(vrw.AbstractWalker):
+    """Its folds are at a^2 + c^2 = 1/4."""
+
+    def advance(self, params, x, options):
+        return vrw.AdvanceResult(
+            x + (params["a"] ** 2 + params["c"] ** 2 - 0.25) - x**2, jnp.ones(1)
+        )
+
+
+class NeimarkSackerLine(vrw.AbstractWalker):
+    """Its Neimark-Sacker bifurcations are at a = 0, for any angle."""
+
+    def advance(self, params, x, options):
+        cosine, sine = jnp.cos(params["angle"]), jnp.sin(params["angle"])
+        turned = jnp.stack([cosine * x[0] - sine * x[1], sine * x[0] + cosine * x[1]])
+        return vrw.AdvanceResult((1.0 + params["a"] - x @ x) * turned, jnp.ones(1))
+
+
+@pytest.mark.parametrize(
+    ("walker", "params", "guess", "name", "compute_defect"),
+    [
+        (FoldCircle(), {"a": 1.0, "c": 0.0}, [0.8], "fold", lambda a, c: a**2 + c**2 - 0.25),
+        (
+            NeimarkSackerLine(), {"a": -0.3, "angle": 1.0}, [0.0, 0.0],
+            "neimark_sacker", lambda a, angle: a,
+        ),
+    ],
+)  # fmt: skip
+def test_a_curve_starts_where_it_is_parallel_to_the_second_parameter(
+    walker, params, guess, name, compute_defect
+):
+    first, second = params
+    bounds = {"a": (-1.0, 1.0), second: (-1.0, 1.0) if second == "c" else (0.2, 3.0)}
+    gait = vrw.limit_cycle(params, model=walker, guess=guess)
+    curve = vrw.continue_special_point(
+        name, (first, second), gait, bounds=bounds, model=walker, params=params
+    )
+    values = curve.dataset[first].values, curve.dataset[second].values
+    np.testing.assert_allclose(compute_defect(*values), 0.0, atol=1e-9)
+    assert np.ptp(values[1]) > 0.99 * (1.0 if second == "c" else 2.8)
+    assert not curve.codim2_points

@@ -123,6 +123,9 @@ class AbstractContinuationProblem(abc.ABC):
     may_start_singular: ClassVar[bool] = False
     """Whether a branch starts next to a given start at which the equations are singular."""
 
+    may_start_vertical: ClassVar[bool] = False
+    """Whether a branch may start where only its first unknown varies, and not the parameter."""
+
     @abc.abstractmethod
     def linearize(
         self, args: Any, z: Float[np.ndarray, "points unknowns"], p: Float[np.ndarray, " points"]
@@ -454,6 +457,11 @@ class ArclengthDriver:
         correction = yield from self.correct(
             z, fraction, (self.coordinates(z, fraction), along_parameter)
         )
+        if self.problem.may_start_vertical and not correction.has_converged:
+            along_unknown = np.eye(len(along_parameter))[0]
+            start_plane = self.coordinates(z, fraction), along_unknown
+            correction = yield from self.correct(z, fraction, start_plane, options.initial_ds)
+            fraction = correction.fraction
         if not correction.has_converged:
             return Track([], ContinuationStatus.START_NOT_FOUND)
         points = [self.make_point(args, correction, direction_sign * along_parameter, fraction)]

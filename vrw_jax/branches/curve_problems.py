@@ -55,6 +55,12 @@ class TwoParameterStep(NamedTuple):
 RELATIVE_DIFFERENCE_STEP = 1e-6
 
 
+MIN_GRADIENT_RATIO = 1e-9
+"""Smallest ratio of the derivatives of a test function by the second and by the first parameter.
+The value is chosen because the round-off of finite differences is smaller.
+"""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AbstractCurveProblem(AbstractContinuationProblem):
     """Continuation problem for the curve on which a test function of two parameters is zero.
@@ -62,11 +68,15 @@ class AbstractCurveProblem(AbstractContinuationProblem):
     The curve is continued in the first parameter, and turns back like a branch at a fold. The
     unknowns begin with the second parameter as a fraction of its range, and then those of the fixed
     point. The curve ends when this fraction leaves [0, 1].
+
+    - `first_range`: range of the first parameter, in which it is measured, or None for its value.
     """
 
     second_bounds: tuple[float, float]
+    first_range: float | None = None
 
     has_multipliers: ClassVar[bool] = False
+    may_start_vertical: ClassVar[bool] = True
 
     @abc.abstractmethod
     def linearize_in_two_parameters(
@@ -84,7 +94,12 @@ class AbstractCurveProblem(AbstractContinuationProblem):
             args, y[:, 1:], np.stack([p, self.compute_second_parameter(y)], 1)
         )
         parameter_range = self.second_bounds[1] - self.second_bounds[0]
+        # Where the curve is parallel to the second parameter, its tangent would be infinite, and
+        # round-off would turn the curve.
         by_fraction = parameter_range * step.test_gradient[:, 1:]
+        unit = np.abs(p[:, None]) if self.first_range is None else self.first_range
+        least = MIN_GRADIENT_RATIO * unit * step.test_gradient[:, :1]
+        by_fraction = np.where(np.abs(by_fraction) < np.abs(least), least, by_fraction)
         changes = (
             (-step.test_value[:, None] / by_fraction, step.newton_correction),
             (-step.test_gradient[:, :1] / by_fraction, step.tangents[:, 0]),
@@ -260,14 +275,12 @@ class GaitCurveProblem(AbstractCurveProblem):
 
     - `gaits`: problem of the gaits in both parameters;
     - `quantity_names`: names of the quantities in one group, which are evaluated together;
-    - `special_point_names`: name of the special point on each curve;
-    - `first_range`: range of the first parameter, in which it is measured, or None for its value.
+    - `special_point_names`: name of the special point on each curve.
     """
 
     gaits: Any
     quantity_names: tuple[str, ...]
     special_point_names: tuple[str, ...]
-    first_range: float | None = None
 
     @property
     def test_functions(self) -> Mapping[str, TestFunction]:  # type: ignore[override]
