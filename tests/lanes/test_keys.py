@@ -47,6 +47,7 @@ from vrw_jax.models.phase_sequence import make_step_result
 from vrw_jax.models.step_batch import _compile_lane_step
 from vrw_jax.models.viscoelastic import (
     _finish_lane_steps,
+    _sample_lane_parts,
     _sample_lane_steps,
     take_steps_of_lanes,
 )
@@ -370,6 +371,7 @@ WALK_SETTINGS = _make_static_walk_settings(vrw.UnilateralWheel(), vrw.StepOption
         (take_steps_of_lanes, (True, 0.7)),
         (_finish_lane_steps, (True, 1)),
         (_sample_lane_steps, (True, 40)),
+        (_sample_lane_parts, (True, 40)),
         (run_walks, WALK_SETTINGS),
         (_run_lane_walks, WALK_SETTINGS),
         (prepare_walk, (True, "lanes", False, False)),
@@ -459,5 +461,5 @@ def test_no_other_function_is_compiled():
         "models/contact_walks.py": 2,
         "models/step_batch.py": 1,
         "models/unilateral_wheel.py": 1,
-        "models/viscoelastic.py": 5,
+        "models/viscoelastic.py": 6,
     }

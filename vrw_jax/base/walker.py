@@ -276,7 +276,7 @@ def propose_starts(walker: AbstractWalker, params: Any) -> Array:
     if walker.starts is None:
         raise ValueError(
             "this walker has no starts, from which a search or a walk begins: give section "
-            "coordinates, or starts= in the definition of the walker."
+            "coordinates as guess or start, or starts= in the definition of the walker."
         )
     with name_missing_parameters(params):
         return jnp.atleast_2d(check_reals("starts", walker.starts(params)))

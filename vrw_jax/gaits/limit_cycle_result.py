@@ -318,8 +318,9 @@ def _solve_limit_cycle(
     """Find the cycle of one wheel on the mesh of the collocation system."""
     is_in_domain = params.is_in_domain()
     parameters = stack_parameters(params)
-    searched_parameters = lax.stop_gradient(parameters)
     table_1_parameters = stack_parameters(params.make_table_1_wheel()).astype(parameters.dtype)
+    is_finite = jnp.isfinite(parameters)
+    searched_parameters = lax.stop_gradient(jnp.where(is_finite, parameters, table_1_parameters))
     parameters = jnp.where(is_in_domain, parameters, table_1_parameters)
     collocation_state, (monodromy_value, newton_residual, n_newton_iterations) = (
         solve_cycle_with_derivatives(
