@@ -275,8 +275,8 @@ def propose_starts(walker: AbstractWalker, params: Any) -> Array:
     """Return the starts of a walker with these parameters, shape (starts, n)."""
     if walker.starts is None:
         raise ValueError(
-            "this walker has no starts, from which a search or a walk begins: give section "
-            "coordinates as guess or start, or starts= in the definition of the walker."
+            "this walker has no starts for searches and walks: give section coordinates as guess "
+            "or start, or starts= in the definition of the walker."
         )
     with name_missing_parameters(params):
         return jnp.atleast_2d(check_reals("starts", walker.starts(params)))

@@ -392,13 +392,13 @@ class ArclengthDriver:
         previous: ContinuationPoint,
         current: ContinuationPoint,
         ds: float,
-        is_plane_inverted: bool = False,
+        takes_other_plane: bool = False,
     ) -> tuple[Unknowns, float, Plane, float, bool]:
         """Predict the point one continuation step ahead, or at a nearer end of the range.
 
         Return its unknowns and fraction, the plane on which they are corrected, the predicted arc
         length to the end of the range, and whether the plane is that end. The plane is normal to
-        the branch if the end is farther than `ds`; `is_plane_inverted` selects the opposite plane.
+        the branch if the end is farther than `ds`; `takes_other_plane` selects the opposite plane.
         The prediction is the cubic polynomial through the last two points and their tangents, whose
         error is two orders smaller than that of the tangent. This saves one of three Newton
         iterations.
@@ -406,7 +406,7 @@ class ArclengthDriver:
         fraction, fraction_rate = self.compute_fraction(current.p), current.fraction_rate
         range_end = 1.0 if fraction_rate > 0.0 else 0.0
         length_to_end = (range_end - fraction) / fraction_rate if fraction_rate else np.inf
-        is_range_end = bool(length_to_end <= ds) != is_plane_inverted
+        is_range_end = bool(length_to_end <= ds) != takes_other_plane
         length = length_to_end if is_range_end else ds
         state, rate = (
             np.append(current.z, fraction),
@@ -469,10 +469,10 @@ class ArclengthDriver:
         # A suspicious step may have reached another branch; shorter steps then avoid the jump. If
         # they do not, the next step is accepted with any multipliers.
         suspicious_ds, accepts_any_multipliers, is_point_new = 0.0, False, True
-        is_plane_inverted = False
+        takes_other_plane = False
         while True:
             trial_z, trial_fraction, plane, length_to_end, is_next_range_end = self.predict(
-                previous, points[-1], ds, is_plane_inverted
+                previous, points[-1], ds, takes_other_plane
             )
             if is_point_new:
                 has_ended = {
@@ -498,9 +498,9 @@ class ArclengthDriver:
             )
             is_within = abs(correction.fraction - 0.5) <= 0.5 + MAX_RANGE_EXCESS
             is_short = ds < options.kink_step_factor * options.min_ds
-            # A branch that turns at the end of the range touches the plane there. A step that is
-            # too short for that plane by the tangent may pass it nevertheless.
-            is_plane_inverted = not is_plane_inverted and (
+            # A branch that turns back at the end of the range only touches the plane there. A step
+            # that ends before that plane by its tangent may pass it, because the branch curves.
+            takes_other_plane = not takes_other_plane and (
                 is_short and not correction.has_converged
                 if is_range_end
                 else correction.has_converged and not is_within and length_to_end <= 2.0 * ds
@@ -526,12 +526,12 @@ class ArclengthDriver:
             is_point_new &= not is_suspicious
             if is_point_new:
                 # The cubic prediction must not cross a kink.
-                previous, is_plane_inverted = point if is_kink else current, False
+                previous, takes_other_plane = point if is_kink else current, False
                 points.append(point)
                 growth = 1.4 if correction.n_iterations < 5 else 1.0
                 growth = 0.6 if correction.n_iterations > 6 else growth
                 ds = min(ds * growth, options.max_ds)
-            elif not is_plane_inverted:
+            elif not takes_other_plane:
                 ds *= 0.5
             if is_suspicious and suspicious_ds == 0.0:
                 suspicious_ds = trial_ds

@@ -45,7 +45,7 @@ from vrw_jax.branches.map_branch import (
     check_arclength_options,
     make_branch,
     make_walker_problem,
-    read_switch,
+    parse_switch_point,
     trace_fixed_points,
 )
 from vrw_jax.gaits.cycle import AbstractCycle
@@ -289,9 +289,8 @@ def continue_branch(
             model, params, (name,), cycle, period_n, step_options, margins, measures
         )
         if not cycle.found:
-            attributes = {"title": f"Branch of fixed points along {name}"}
             outcome = Outcome(int(cycle.outcome))
-            return make_branch(problem, None, name, attributes, params, outcome, cycle.why)
+            return make_branch(problem, None, name, params, outcome, cycle.why)
         value = float(wheel.values[problem.parameter_indices[0]])
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
         return trace_fixed_points(
@@ -386,7 +385,7 @@ def continue_branches(
         return ()
     tangent = None
     if switch_at is not None:
-        n_periods, tangent = read_switch(switch_at, 1.0, limits)
+        n_periods, tangent = parse_switch_point(switch_at, 1.0, limits)
         problem_fields["period_n"] = n_periods * period_n
         if n_wheels > 1:
             raise ValueError("switch_at is for one wheel, but the batch has more: give one wheel.")
@@ -513,4 +512,4 @@ def _make_gait_branch(
     if data is None and outcome == Outcome.STEPPED:
         outcome = Outcome.NO_CYCLE_FOUND
     start_params = None if data is None else params.attach_laws(None)
-    return make_branch(problem, data, name, attributes, start_params, outcome)
+    return make_branch(problem, data, name, start_params, outcome, dataset_attributes=attributes)

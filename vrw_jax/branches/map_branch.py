@@ -111,16 +111,18 @@ def make_branch(
     problem: Any,
     data: BranchData | None,
     name: str,
-    dataset_attributes: Mapping,
     params: Any,
     outcome: Outcome,
     failure: str = "",
+    dataset_attributes: Mapping | None = None,
 ) -> Branch:
     """Return the labeled branch of a problem, without points if `data` is None.
 
     - `failure`: reason for which there are no points, if it is more than the outcome.
     """
     period_n = problem.period_n
+    if dataset_attributes is None:
+        dataset_attributes = {"title": f"Branch of fixed points along {name}"}
     if data is None:
         empty = xr.Dataset(coords={name: ("point", np.zeros(0))}, attrs=dataset_attributes)
         return Branch(name, empty, (), (failure, failure), outcome, params, period_n)
@@ -200,7 +202,7 @@ SWITCHED_KINDS = {BRANCH_POINT: 1, PERIOD_DOUBLING: 2}
 """Numbers of iterates of the map whose fixed points cross the branch, by the kind of the point."""
 
 
-def read_switch(switch_at: SpecialPoint, units: Any, limits: Any) -> tuple[int, np.ndarray]:
+def parse_switch_point(switch_at: SpecialPoint, units: Any, limits: Any) -> tuple[int, np.ndarray]:
     """Return how many periods of the known branch a period of the switched branch has, and the
     tangent of the known branch in the coordinates of arc length.
     """
@@ -217,7 +219,7 @@ def read_switch(switch_at: SpecialPoint, units: Any, limits: Any) -> tuple[int, 
 
 NO_START_TEXT = (
     "Newton's method found no fixed point from which the branch could begin: start nearer to one, "
-    "or give units= of the state."
+    "or give units=, the typical sizes of the entries of the state."
 )
 
 RESERVED_NAMES = {
@@ -280,7 +282,7 @@ def trace_fixed_points(
     problem = dataclasses.replace(problem, units=units)
     start, start_p, tangent = np.asarray(x), p, None
     if switch_at is not None:
-        n, tangent = read_switch(switch_at, problem.section_units, limits)
+        n, tangent = parse_switch_point(switch_at, problem.section_units, limits)
         problem = dataclasses.replace(problem, period_n=n * problem.period_n)
         start, start_p, *_ = switch_at.point
     (data,) = continue_and_locate_special_points(
@@ -289,13 +291,13 @@ def trace_fixed_points(
         np.array([start_p], float),
         np.array([True]),
     )
-    title, failure = {"title": f"Branch of fixed points along {name}"}, ""
+    failure = ""
     if data is None:
         start_jacobian = jax.jacfwd(evaluate)(x, jnp.asarray(p, float))
         is_singular = count_unit_multipliers(np.asarray(start_jacobian)) > 0
         failure = UNIT_MULTIPLIER_ADVICE if is_singular else NO_START_TEXT
     outcome = Outcome.STEPPED if data else Outcome.NO_CYCLE_FOUND
-    return make_branch(problem, data, name, title, params, outcome, failure)
+    return make_branch(problem, data, name, params, outcome, failure)
 
 
 MarginFunctions = Mapping[str, Callable[[Array, Any], Array]]

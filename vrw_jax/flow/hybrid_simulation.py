@@ -425,17 +425,18 @@ def _simulate_one_event(
 def _find_rising_ties(mode: Mode, state: StateArray) -> Bool[Array, " n_guards"]:
     """Return which guards are zero together with `armed`, and positive or not armed from then on.
 
-    The larger rate is then that of the guard, but the derivative of a maximum is the mean of both.
+    These do not end the mode. The value that ends it is the maximum of the guard and -`armed`, and
+    rises at the larger of both rates. JAX returns the mean of both where they are equal.
     """
-    ties = []
-    for guard in mode.guards:
-        evaluate = lambda y, g=guard: jnp.stack([g.value(y), -g.armed(y)])
+
+    def is_rising_tie(guard: Guard) -> Array:
         if guard.armed is None:
-            ties.append(jnp.asarray(False))
-        else:
-            values, rates = jax.jvp(evaluate, (state,), (mode.field(state),))
-            ties.append(jnp.all(values == 0.0) & (jnp.max(rates) > 0.0))
-    return jnp.stack(ties)
+            return jnp.asarray(False)
+        evaluate = lambda y: jnp.stack([guard.value(y), -guard.armed(y)])
+        values, rates = jax.jvp(evaluate, (state,), (mode.field(state),))
+        return jnp.all(values == 0.0) & (jnp.max(rates) > 0.0)
+
+    return jnp.stack([is_rising_tie(guard) for guard in mode.guards])
 
 
 class EventRun(NamedTuple):

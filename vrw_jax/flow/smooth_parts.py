@@ -39,10 +39,10 @@ _POWERS = np.arange(2 * len(NODES))
 N_BRACKETS = 8
 """Number of brackets in an interval, each of which may contain one extremum."""
 _BRACKET_ENDS = np.linspace(-1.0, 1.0, N_BRACKETS + 1)
-N_BISECTIONS, N_NEWTON_STEPS = 12, 3
-"""Numbers of iterations that find an extremum in a bracket. The values are chosen because Newton's
-method then reaches round-off.
-"""
+N_BISECTIONS = 12
+"""Number of bisections of a bracket. The value is chosen because Newton's method then converges."""
+N_NEWTON_STEPS = 3
+"""Number of Newton's steps after them. The value is chosen because they reach round-off."""
 
 
 def _evaluate_powers(location: Any, order: int = 0) -> Any:

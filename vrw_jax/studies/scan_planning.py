@@ -267,7 +267,7 @@ def plan_scan(
             )
         if options != StepOptions():
             raise ValueError(
-                "tol and options are both given, but a tolerance determines the options of each "
+                "tol and options are both given, but a tolerance itself sets the options of each "
                 "sample: drop one of them."
             )
     if slope_sd is not None:
