@@ -222,6 +222,31 @@ def test_a_guard_that_is_zero_with_armed_ends_the_mode_only_if_it_falls(
     assert step.duration == pytest.approx(0.0 if ends_at_start else 2.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("armed", [None, lambda y, p: -y[1]], ids=["plain", "armed"])
+@pytest.mark.parametrize("options", [vrw.StepOptions(), TIGHT], ids=["default", "tight"])
+def test_a_foot_that_lifts_off_with_zero_height_rate_and_acceleration_flies(armed, options):
+    """Height h and rate v, with v' = s (1 - s) at the time s after take-off: h = 0 at s = 2."""
+    stance = lambda y, p: jnp.stack([0.0 * y[0], 0.0 * y[0], 1.0 + 0.0 * y[0]])
+    fly = lambda y, p: jnp.stack(
+        [y[1], (y[2] - p["end"]) * (1.0 - y[2] + p["end"]), 1.0 + 0.0 * y[0]]
+    )
+    take_off = Guard(lambda y, p: p["end"] - y[2], target_mode="flight")
+    land = Guard(lambda y, p: y[0], target_mode="stance", armed=armed)
+    system = vrw.HybridSystem(
+        modes={
+            "stance": Mode(stance, {"take_off": take_off}),
+            "flight": Mode(fly, {"landing": land}),
+        },
+        section="landing",
+        state=("height", "rate", "time"),
+    )
+    ends = np.linspace(0.3, 2.0, 50)
+    batch = system.step_batch({"end": ends}, np.zeros(3), options=options)
+    assert np.all(np.asarray(batch.outcome) == vrw.Outcome.STEPPED)
+    np.testing.assert_allclose(batch.mode_durations[:, 1], 2.0, atol=1e-6)
+    np.testing.assert_allclose(batch.section_state[:, 1], 2.0**2 / 2 - 2.0**3 / 3, atol=1e-6)
+
+
 def test_a_start_that_is_not_finite_is_a_bad_input():
     outcome = SPRING_BIPED.step(SPRING_PARAMS, [np.nan, *SPRING_START[1:]]).outcome
     assert outcome == vrw.Outcome.BAD_INPUT

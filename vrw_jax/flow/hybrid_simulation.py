@@ -385,25 +385,26 @@ def _simulate_one_event(
     next state and the next mode, which is -1 if the guard ends the walk.
     """
     mode = modes[mode_index]
-    compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
-    guard_values = mode.guard_values(state)
-    guard_rates, second_guard_rates = jax.jvp(compute_guard_rates, (state,), (mode.field(state),))
-    guard_values, guard_rates, second_guard_rates = lax.stop_gradient(
-        (guard_values, guard_rates, second_guard_rates)
+    guard_values, guard_rates = lax.stop_gradient(
+        jax.jvp(mode.guard_values, (state,), (mode.field(state),))
     )
+    growth = _find_growth_from_rest(
+        mode, guard_values, guard_rates, *lax.stop_gradient((state, options.dt0))
+    )
+    will_guard_rise = (growth > 0.0) | lax.stop_gradient(_find_rising_ties(mode, state))
     time_after_first_step = lax.stop_gradient(time + options.dt0)
     time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
-    is_guard_near_zero = -guard_values <= jnp.abs(guard_rates) * time_resolution
+    is_guard_near_zero = will_guard_rise | (-guard_values <= jnp.abs(guard_rates) * time_resolution)
     are_violated = (guard_values < 0.0) & ~is_guard_near_zero
     violated_guard = jnp.where(jnp.any(are_violated), jnp.argmax(are_violated), -1)
     guard_offset = jnp.where(
         (guard_values < 0.0) & is_guard_near_zero & (guard_rates > 0.0), -guard_values, 0.0
     )
-    # For a guard at rest the second derivative decides: the guard does not end the mode if it will
-    # rise.
-    will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
-    will_guard_rise |= lax.stop_gradient(_find_rising_ties(mode, state))
-    guard_offset = jnp.where(will_guard_rise, jnp.finfo(state.dtype).tiny, guard_offset)
+    # The offset keeps such a guard positive where round-off of its rates makes it fall at first.
+    least_value = jnp.finfo(state.dtype).tiny + GROWTH_SHARE_AT_START * growth
+    guard_offset = jnp.where(
+        will_guard_rise, least_value + jnp.maximum(-guard_values, 0.0), guard_offset
+    )
     n_margins = jax.eval_shape(evaluate_margins, state).size
     guards_and_margins = GuardsAndMargins(
         lambda y: jnp.append(mode.guard_values(y) + guard_offset, evaluate_margins(y)),
@@ -420,6 +421,49 @@ def _simulate_one_event(
     ]
     next_mode = select_entry_by_mask(guard_index, jnp.asarray(next_modes, jnp.int32))
     return phase_end, violated_guard.astype(jnp.int32), next_state, next_mode.astype(jnp.int32)
+
+
+PROBE_LENGTH = 1e-2
+"""Time after which a guard at rest is evaluated again, as a fraction of the first solver step.
+
+The value is chosen because the cube of the time, with which the height of a foot begins to grow, is
+then above round-off.
+"""
+
+MAX_SHARE_AT_REST = 1e-3
+"""Largest change of a guard by its initial rate, as a fraction of its growth over the probe, for
+which the guard begins at rest. A guard that falls so slowly would be negative by round-off only.
+"""
+
+MAX_SHARE_OF_ROUNDOFF = 1e-6
+"""Largest negative value of a guard, as a fraction of its growth, that is treated as zero."""
+
+
+GROWTH_SHARE_AT_START = 1e-9
+"""Initial value of a guard that rises from rest, as a fraction of its growth over the probe. The
+value is chosen between the guard's round-off there and that at its next event.
+"""
+
+
+def _find_growth_from_rest(
+    mode: Mode, guard_values: Array, guard_rates: Array, state: StateArray, dt0: Array
+) -> Float[Array, " n_guards"]:
+    """Return the growth of guards that are zero and at rest at first, up to round-off, or zero.
+
+    A guard that grows does not end the mode. A foot that lifts off smoothly has no height, no rate
+    and no acceleration at first. Only the values after a short time, by Heun's method of third
+    order, determine its direction.
+    """
+    h, field = PROBE_LENGTH * dt0, mode.field
+    start_rates = field(state)
+    middle_rates = field(state + (h / 3.0) * start_rates)
+    last_rates = field(state + (2.0 * h / 3.0) * middle_rates)
+    growth = lax.stop_gradient(
+        mode.guard_values(state + (0.25 * h) * (start_rates + 3.0 * last_rates))
+    )
+    is_at_rest = h * jnp.abs(guard_rates) <= MAX_SHARE_AT_REST * growth
+    is_zero = (guard_values <= 0.0) & (-guard_values <= MAX_SHARE_OF_ROUNDOFF * growth)
+    return jnp.where(is_zero & is_at_rest & (growth > 0.0), growth, 0.0)
 
 
 def _find_rising_ties(mode: Mode, state: StateArray) -> Bool[Array, " n_guards"]:
