@@ -305,6 +305,21 @@ def test_newtons_method_finds_a_repeating_state_next_to_a_jump_of_the_map():
     assert cycle.residual < 1e-12
 
 
+@pytest.mark.parametrize("start", [np.pi, np.pi + 1e-12, 2.0 * np.pi])
+def test_a_map_without_fixed_points_has_none_however_far_newtons_method_goes(start):
+    """x moves by 0.1 at least, but from these starts to 1e12 and more, where 0.1 is round-off."""
+    fixed_point = solve_fixed_point(lambda x: x + 1.1 + jnp.cos(x), jnp.array([start]))
+    assert not fixed_point.converged
+    assert fixed_point.x == start
+
+
+@pytest.mark.parametrize("start", [0.0, 1.0])
+def test_a_distant_fixed_point_is_found(start):
+    fixed_point = solve_fixed_point(lambda x: 0.5 * x + 1e14, jnp.array([start]))
+    assert fixed_point.converged
+    np.testing.assert_allclose(fixed_point.x, 2e14, rtol=1e-12)
+
+
 def test_volumes_shrink_by_friction_and_by_every_bounce():
     """x' = v, v' = -g - v: exp(-t) in all, and r² at each bounce."""
     drag = lambda y: jnp.stack([y[1], -G - y[1]])

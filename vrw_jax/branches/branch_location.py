@@ -307,7 +307,9 @@ class _SpecialPointLocator(NamedTuple):
                 scaled_values, i = values[row] / np.ptp(values[row]), crossings[row]
                 # The location and the parameter are cubic polynomials of the value.
                 fit = np.polyfit(scaled_values, np.stack([nodes[row], p[row] - p[row, 0]], -1), 3)
-                fractions[i], roots[i] = fit[-1] + [0.0, p[row, 0]]
+                location, parameter = fit[-1] + [0.0, p[row, 0]]
+                if nodes[row, 1] <= location <= nodes[row, 2]:
+                    fractions[i], roots[i] = location, parameter
             crossings = crossings[~(is_monotonic & has_sign_change)]
         return [
             request._replace(

@@ -131,10 +131,16 @@ the fixed point needs.
 
 
 MAX_RESIDUAL = 1e-6
-"""Largest change of a fixed point, relative to its size, if invariants are kept.
+"""Largest change of a fixed point, relative to the sizes of the start and its image.
 
-The equations then have no solution if the map does not conserve the invariants, although the
-corrections vanish. The value is chosen far above the error of a step with default options.
+If the map does not conserve the invariants, the equations have no solution, although the
+corrections vanish. From a start with a singular Jacobian, Newton's method may also move so far that
+any change is round-off. The value is chosen far above the error of a step with default options.
+"""
+
+MAX_SIZE_RATIO = 1e3
+"""Largest ratio of the sizes of a fixed point and of its start up to which the residual is relative
+to the fixed point. Beyond it, residuals that are round-off of a distant state would be accepted.
 """
 
 
@@ -368,7 +374,7 @@ def _run_newton_loop(
         )
 
     def iterate_newton(loop_state: tuple) -> tuple:
-        x, last_norm, n_iterations, n_final_iterations, n_stalled, *_ = loop_state
+        x, last_norm, n_iterations, n_final_iterations, n_stalled, size, *_ = loop_state
         is_searching_iteration = is_newton_searching(last_norm, n_iterations).astype(
             n_iterations.dtype
         )
@@ -378,6 +384,8 @@ def _run_newton_loop(
         defect = values - jnp.pad(x, (0, len(values) - len(x)))
         newton_correction = _solve_fixed_point_equations(jacobian, defect)
         jacobian, residual = jacobian[: len(x)], jnp.max(jnp.abs(defect[: len(x)]))
+        is_at_start = n_iterations == 0
+        size = jnp.where(is_at_start, jnp.max(jnp.maximum(size, jnp.abs(values[: len(x)]))), size)
         # The sum of the terms of a component is no more accurate than its largest term.
         component_sizes = jnp.max(
             jnp.abs(jnp.stack([start, x, x + newton_correction, jnp.abs(jacobian) @ jnp.abs(x)])), 0
@@ -401,6 +409,7 @@ def _run_newton_loop(
             n_iterations + is_searching_iteration,
             n_final_iterations + 1 - is_searching_iteration,
             n_stalled,
+            size,
             jacobian,
             residual,
         )
@@ -412,17 +421,18 @@ def _run_newton_loop(
         initial_count,
         initial_count,
         initial_count,
+        jnp.max(jnp.maximum(units, jnp.abs(start))),
         jnp.zeros((start.size,) * 2, start.dtype),
         initial_norm,
     )
-    x, correction_norm, n_iterations, *_, jacobian, residual = lax.while_loop(
+    x, correction_norm, n_iterations, *_, size, jacobian, residual = lax.while_loop(
         needs_newton_iteration, iterate_newton, initial_loop_state
     )
+    size = jnp.maximum(size, jnp.minimum(jnp.max(jnp.abs(x)), MAX_SIZE_RATIO * size))
+    # The residual is the last correction times a matrix of the size of the Jacobian.
+    growth = 1.0 + jnp.max(jnp.sum(jnp.abs(jacobian), 1))
     has_newton_converged = correction_norm <= tolerance
-    n_equations = jax.eval_shape(closure_converted_map, start, *closed_over_values).size
-    if n_equations > start.size:
-        size = jnp.max(jnp.maximum(units, jnp.abs(x)))
-        has_newton_converged &= residual <= max_residual * size
+    has_newton_converged &= residual <= max_residual * growth * size
     return FixedPointResult(
         jnp.where(has_newton_converged, x, start),
         jacobian,
