@@ -336,12 +336,14 @@ def check_path(argument_name: str, given_value: Any, remedy_text: str) -> Path:
     """
     check_type(argument_name, given_value, (str, Path), remedy_text)
     try:
-        os.fsencode(given_value)
+        is_possible = str(given_value) and b"\0" not in os.fsencode(given_value)
     except UnicodeEncodeError:
+        is_possible = False
+    if not is_possible:
         raise ValueError(
-            f"{argument_name} is {given_value!r}, but the file system cannot encode this name: "
+            f"{argument_name} is {str(given_value)!r}, but the file system cannot have this name: "
             f"{remedy_text}."
-        ) from None
+        )
     if URL_PATTERN.match(str(given_value)):
         raise ValueError(
             f"{argument_name} is {str(given_value)!r}, a URL, but files are locked and renamed "
