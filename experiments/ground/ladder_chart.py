@@ -16,7 +16,7 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import FIGURES, read_table, write_table
 from vrw_jax import plot as plots
 from vrw_jax.models import MARGIN_MEASURES, SELECTION_MARGIN_NAMES
-from vrw_jax.studies import plan_scan
+from vrw_jax.studies import find_selection_reasons, plan_scan
 
 DAMPING = np.linspace(20.0, 400.0, 77)
 FRICTION = (0.7, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 50.0, np.inf)
@@ -31,11 +31,9 @@ def compute() -> None:
     paper = vrw.scan(vrw.grid(damping=DAMPING), MEASURES[:3], options=options)
     engine = plan_scan(vrw.grid(damping=DAMPING), MEASURES[:3], options=options).build_scan_engine()
     paper_gaits = engine({"damping": DAMPING})
-    ladder = plan_scan(
-        vrw.grid(damping=DAMPING), MEASURES, model="auto", options=options
-    ).build_scan_engine()
     reasons = [
-        ladder.compute_selection_reasons(paper_gaits, np.full(len(DAMPING), mu)) for mu in FRICTION
+        find_selection_reasons(vrw.LadderWheel(), paper_gaits, np.full(len(DAMPING), mu))
+        for mu in FRICTION
     ]
     rows = [
         [f"{c:g}", mu, int(reason), f"{float(paper.dls_fraction[i]):.6g}"]

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -244,13 +244,29 @@ def find_walker_gaits(
             params, guesses, gaits
         )
     find_each = functools.partial(map_in_batches, find_gaits, batch_sizes.GAIT_BATCH_SIZES)
-    gaits = find_each(params, guesses)
+    return find_gaits_with_walks(find_each, walker, params, guesses, options, period_n)
+
+
+def find_gaits_with_walks(
+    find_gaits: Callable,
+    walker: AbstractWalker,
+    params: Any,
+    guesses: Any,
+    options: StepOptions,
+    period_n: int,
+) -> HybridGait:
+    """Return the gaits of a batch near guesses, or near the ends of walks from them.
+
+    - `find_gaits`: function of parameters and guesses that returns the gaits of a batch;
+    - `params`, `guesses`: as in `collect_walk_ends`.
+    """
+    gaits = find_gaits(params, guesses)
     rows, starts = collect_walk_ends(
         walker, params, guesses, np.asarray(gaits.outcome), options, period_n
     )
     if not len(rows):
         return gaits
-    found = find_each(select_tree_rows(params, rows), starts)
+    found = find_gaits(select_tree_rows(params, rows), starts)
     is_found = np.asarray(found.converged)
     return replace_rows(gaits, rows[is_found], select_tree_rows(found, is_found))
 

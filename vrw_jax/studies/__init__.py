@@ -1,5 +1,6 @@
 """Studies of many gaits: tuning, scans, basins, robustness, tolerances, fits."""
 
+from vrw_jax.studies.scan_engines import find_selection_reasons
 from vrw_jax.studies.scan_execution import (
     ScanProgress,
     SpecialPointMap,

@@ -6,15 +6,16 @@ its position nor on the other samples. Batches run in parallel with one compiled
 per core, or one thread per GPU. Samples that need walks or finer meshes are then gathered in
 smaller batches of one size.
 
-With unilateral contact, the engine returns the gait to which a walk from a slow start converges. If
-that walk does not converge, it returns the slowest gait of all starts. For the simplest valid
-model, all samples are first evaluated with the paper's model. Samples that violate a margin are
-then evaluated with unilateral contact.
+All other gaits are found, measured and differentiated by `evaluate_gaits`. With unilateral contact,
+the gait is the one to which a walk from a slow start converges. If that walk does not converge, it
+is the slowest gait of all starts. For the simplest valid model, all samples are first evaluated
+with the paper's model. Samples that violate a margin are then evaluated with unilateral contact.
 """
 
 import contextlib
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
@@ -32,6 +33,7 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.gaits.collocation_finder import KinkedGaitFinder
 from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.finder import MeasureReader, confirm_outcome_by_step, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
@@ -42,12 +44,10 @@ from vrw_jax.gaits.further_search import (
 )
 from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.gaits.return_map_finder import ReturnMapCycle
-from vrw_jax.gaits.walker_finder import WalkerFinder, collect_walk_ends, make_walker_finder
+from vrw_jax.gaits.walker_finder import find_gaits_with_walks, make_walker_finder
 from vrw_jax.lanes.batching import (
     choose_batch_size,
     concatenate_tree_rows,
-    map_in_batches,
     map_in_numpy_batches,
     replace_rows,
     select_tree_rows,
@@ -61,6 +61,7 @@ from vrw_jax.studies.first_passage import first_passage
 from vrw_jax.studies.measure_catalog import (
     DIFFERENTIABLE_MEASURES,
     ERROR_VARIABLE_SUFFIX,
+    MeasureDerivative,
     ValuesByVariable,
     parse_derivative,
 )
@@ -126,6 +127,8 @@ class EvaluationRequest(NamedTuple):
 
         These values are in the rows of parameters.
         """
+        if not self.wheel_model.is_wheel:
+            return make_walker_finder(self.wheel_model.walker, self.base_wheel, self.step_options)
         return make_finder(
             self.wheel_model.without_values(),
             self.base_wheel.n_legs,
@@ -134,29 +137,17 @@ class EvaluationRequest(NamedTuple):
             step_options=self.step_options,
         )
 
+    def make_reader(self, finder: Any, names: Iterable[str]) -> MeasureReader:
+        """Return the function of a cycle and a step that returns the named measures."""
+        own = {measure.name: measure for measure in self.own_measures}
+        return MeasureReader(
+            finder.measure_reader, tuple(own.get(name, name) for name in dict.fromkeys(names))
+        )
+
     @property
-    def direct_names(self) -> tuple[str, ...]:
-        """Return the names of the measures that are no derivatives, and of the spectral radius."""
-        names = (name for name in self.measure_names if parse_derivative(name) is None)
-        return tuple(dict.fromkeys((*names, "spectral_radius")))
-
-    def read_derivatives(
-        self, differentiate: Callable[..., Mapping[str, Any]], model: Any
-    ) -> dict[str, Any]:
-        """Return the requested derivatives by the names of their variables.
-
-        - `differentiate`: function of names of measures that returns the derivatives of each
-          measure by all parameters of the model, (samples, parameters).
-        """
-        derivatives = list(filter(None, map(parse_derivative, self.measure_names)))
-        if not derivatives:
-            return {}
-        jacobians = differentiate(tuple(dict.fromkeys(x.measure_name for x in derivatives)))
-        index = model.parameter_names.index
-        return {
-            x.variable_name: jacobians[x.measure_name][:, index(x.parameter_name)]
-            for x in derivatives
-        }
+    def derivatives(self) -> tuple[MeasureDerivative, ...]:
+        """Return the requested derivatives."""
+        return tuple(filter(None, map(parse_derivative, self.measure_names)))
 
 
 class CollocationScanEngine:
@@ -202,12 +193,11 @@ class CollocationScanEngine:
         finder, step_options = self._finder, self._request.step_options
         rows = self._request.stack_parameter_rows(samples_by_parameter)
         size = choose_batch_size(batch_sizes.SCAN_BATCH_SIZE, batch_sizes.GPU_SCAN_BATCH_SIZE)
-        row_shapes, state_shapes = (
-            jax.ShapeDtypeStruct((size, n), rows.dtype) for n in (rows.shape[1], 3)
-        )
         with self._compilation_lock, ThreadPoolExecutor(2) as pool:
-            cycles = pool.submit(self._compile, "cycles", self.evaluate_cycles, row_shapes)
-            self._compile("steps", self.evaluate_steps, row_shapes, state_shapes, step_options)
+            cycles = pool.submit(self._compile, "cycles", self.evaluate_cycles, size, rows)
+            # The dtype and the number of entries of a section state are those of three columns.
+            step_arrays = rows, rows[:, :3]
+            self._compile("steps", self.evaluate_steps, size, *step_arrays, shared=(step_options,))
             cycles.result()
 
         def find_from_starts(
@@ -215,11 +205,8 @@ class CollocationScanEngine:
         ) -> MeshSearch:
             size, key = batch_sizes.GAIT_READ_BATCH_SIZE, mesh_finder.cycle_options
             arguments = (mesh_finder.model.collect_batch_parameter_values(params), starts)
-            shapes = jax.tree.map(
-                lambda x: jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype), arguments
-            )
             with self._compilation_lock:
-                self._compile(key, self._make_cycle_function(mesh_finder), *shapes)
+                self._compile(key, self._make_cycle_function(mesh_finder), size, *arguments)
             return MeshSearch(*self._run(key, size, *arguments))
 
         search = MeshSearch(*self._run("cycles", size, rows))
@@ -263,9 +250,16 @@ class CollocationScanEngine:
             search, max_mesh_error = select_tree_rows(search, searched), UNSTABLE_GAIT_MESH_ERROR
         return mask_failed_samples(outcomes, measures | step_measures)
 
-    def _compile(self, key: Any, function: Callable, *arguments: Any) -> None:
-        """Compile a function once for each device. All cores of a CPU use the same program."""
+    def _compile(
+        self, key: Any, function: Callable, size: int, *trees: Any, shared: tuple = ()
+    ) -> None:
+        """Compile a function of trees of arrays for batches of one size, once for each device.
+
+        All cores of a CPU use the same program.
+        """
         if key not in self.programs:
+            get_shape = lambda x: jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype)
+            arguments = (*jax.tree.map(get_shape, trees), *shared)
             # Threads have separate settings.
             compile_function = with_default_jax_settings(compile_exported_function)
             self.programs[key] = {
@@ -370,117 +364,106 @@ SampleEvaluator = Callable[[ParameterSamples], ValuesByVariable]
 """Function that returns the values of each variable for samples, by the name of the variable."""
 
 
-def _evaluate_blocks(
-    evaluate: Callable[[np.ndarray], ValuesByVariable],
-    blocks: Iterable[np.ndarray],
-    n_threads: int,
+def evaluate_gaits(
+    request: EvaluationRequest, n_threads: int, samples_by_parameter: ParameterSamples
 ) -> ValuesByVariable:
-    first_block, *other_blocks = blocks
+    """Return the value of each variable for all samples, by name.
+
+    Blocks of samples are computed in threads. Samples that can have no gait are not searched.
+    """
+    rows, finder = request.stack_parameter_rows(samples_by_parameter), request.make_gait_finder()
+    is_in_domain = is_searched = request.are_rows_in_domain(rows)
+    if finder.is_multistable:
+        finder = dataclasses.replace(finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,))
+        # Over a period friction balances the weight along the slope.
+        friction, slope = rows[:, -1], rows[:, PARAMETER_NAMES.index("slope")]
+        is_searched = is_in_domain & (friction >= np.tan(slope))
+    searched_rows = rows[is_searched] if is_searched.any() else rows[:1]
+    # Walkers of the user are computed in batches of one size, which are not divided.
+    unit = 1 if finder.model.is_wheel else batch_sizes.GAIT_READ_BATCH_SIZE
+    size = min(batch_sizes.SCAN_TASK_SIZE, unit * -(-len(searched_rows) // (unit * n_threads)))
+    first_block, *other_blocks = np.split(searched_rows, range(size, len(searched_rows), size))
+    evaluate = functools.partial(_evaluate_block, request, finder)
     first_results = evaluate(first_block)  # This call compiles for all threads.
-    return concatenate_tree_rows(first_results, *map_in_threads(evaluate, other_blocks, n_threads))
-
-
-def evaluate_contact_gaits(
-    evaluation_request: EvaluationRequest, n_threads: int, samples_by_parameter: ParameterSamples
-) -> ValuesByVariable:
-    """Return the value of each variable for all samples, with unilateral contact, by name."""
-    rows = evaluation_request.stack_parameter_rows(samples_by_parameter)
-    n_blocks = max(n_threads, -(-len(rows) // batch_sizes.SCAN_TASK_SIZE))
-    # Of few samples, the last blocks are empty.
-    blocks = filter(len, np.array_split(rows, n_blocks))
-    return _evaluate_blocks(
-        functools.partial(_evaluate_contact_block, evaluation_request), blocks, n_threads
+    results = concatenate_tree_rows(
+        first_results, *map_in_threads(evaluate, other_blocks, n_threads)
     )
+    # Samples that are not searched may have any row.
+    results = select_tree_rows(results, np.maximum(np.cumsum(is_searched) - 1, 0))
+    failures = np.where(is_in_domain, Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
+    return mask_failed_samples(np.where(is_searched, results.pop("outcome"), failures), results)
 
 
-def _evaluate_contact_block(
-    evaluation_request: EvaluationRequest, rows: np.ndarray
-) -> ValuesByVariable:
-    """Return the values of the gaits to which walks from slow starts converge, by name.
+def _evaluate_block(request: EvaluationRequest, finder: Any, rows: np.ndarray) -> ValuesByVariable:
+    """Return outcomes, measures and derivatives of the gaits of all rows, by name."""
+    size, has_kinks = (batch_sizes.GAIT_READ_BATCH_SIZE,), isinstance(finder, KinkedGaitFinder)
+    cycles, derivatives = _find_gaits(finder, rows), request.derivatives
+    names = [name for name in request.measure_names if parse_derivative(name) is None]
+    reader = request.make_reader(finder, [*names, *(MARGIN_MEASURES if has_kinks else ())])
+    results = map_in_numpy_batches(functools.partial(_read_gaits, finder, reader), size, cycles)
+    if derivatives:
+        reader = request.make_reader(finder, (x.measure_name for x in derivatives))
+        starts = cycles.section_state
+        if finder.is_multistable:  # The search needs no batches of one size.
+            gaits = finder.find_gaits(jnp.asarray(rows), starts)
+            _, jacobians = map_in_numpy_batches(
+                functools.partial(evaluate_on_gaits, reader), size, gaits
+            )
+        else:
+            differentiate = functools.partial(_differentiate_gaits, finder, reader)
+            jacobians = map_in_numpy_batches(
+                differentiate, (1,) if has_kinks else size, rows, starts
+            )
+        index = finder.model.parameter_names.index
+        for x in derivatives:
+            results[x.variable_name] = jacobians[x.measure_name][:, index(x.parameter_name)]
+    return results
 
-    - `rows`: parameters of the wheels, shape (samples, parameters).
-    """
-    model, batch_size = evaluation_request.wheel_model, (batch_sizes.GAIT_READ_BATCH_SIZE,)
-    gait_finder: Any = make_finder(
-        model, evaluation_request.base_wheel.n_legs, step_options=evaluation_request.step_options
+
+def _find_gaits(finder: Any, rows: np.ndarray) -> Any:
+    """Return the gait of each row, with unilateral contact that of a walk from a slow start."""
+    if finder.is_multistable:
+        return find_slow_gaits(finder, rows)
+    if finder.model.is_wheel:
+        return jax.tree.map(
+            lambda *x: jnp.stack(x), *map(finder.find_cycle_from_values, jnp.asarray(rows))
+        )
+    size = (batch_sizes.GAIT_READ_BATCH_SIZE,)
+    return find_gaits_with_walks(
+        functools.partial(map_in_numpy_batches, functools.partial(_find_cycles, finder), size),
+        finder.model.walker,
+        finder.model.from_parameter_values(list(rows.T), 0)[1],
+        map_in_numpy_batches(functools.partial(_propose_starts, finder), size, rows),
+        finder.step_options,
+        finder.period_n,
     )
-    gait_finder = dataclasses.replace(gait_finder, gait_batch_sizes=batch_size)
-    # Over a period friction balances the weight along the slope. Without enough friction no gait
-    # exists.
-    friction, slope = rows[:, -1], rows[:, PARAMETER_NAMES.index("slope")]
-    is_in_domain = evaluation_request.are_rows_in_domain(rows)
-    may_have_gait = is_in_domain & (friction >= np.tan(slope))
-    rows = rows[may_have_gait] if may_have_gait.any() else rows[:1]
-    slow_gaits = find_slow_gaits(gait_finder, rows)
-    make_reader = functools.partial(MeasureReader, gait_finder.measure_reader)
-    read_gaits = functools.partial(
-        _read_gait_measures, make_reader(evaluation_request.direct_names)
-    )
-    results = map_in_batches(read_gaits, batch_size, slow_gaits)
-    differentiate = lambda names: map_in_batches(
-        functools.partial(evaluate_on_gaits, make_reader(names)),
-        batch_size,
-        gait_finder.find_gaits(jnp.asarray(rows), slow_gaits.section_state),
-    )[1]
-    results |= evaluation_request.read_derivatives(differentiate, model)
-    # Samples without a gait may have any index.
-    gait_indices = np.maximum(np.cumsum(may_have_gait) - 1, 0)
-    outcomes, results = select_tree_rows((slow_gaits.outcome, results), gait_indices)
-    outcomes = np.where(may_have_gait, outcomes, Outcome.NO_CYCLE_FOUND)
-    outcomes = np.where(is_in_domain, outcomes, Outcome.BAD_INPUT)
-    return mask_failed_samples(outcomes, results)
 
 
 @eqx.filter_jit
-def _read_gait_measures(
-    measure_reader: MeasureReader, gait_batch: ReturnMapCycle
-) -> dict[str, Array]:
-    first_gait_step = jax.tree.map(lambda values_by_step: values_by_step[:, 0], gait_batch.steps)
-    return eqx.filter_vmap(measure_reader)(gait_batch, first_gait_step)
-
-
-def evaluate_gaits_with_kinks(
-    evaluation_request: EvaluationRequest, samples_by_parameter: ParameterSamples
-) -> ValuesByVariable:
-    """Return the value of each variable for all samples of a force with kinks, by name.
-
-    Event-driven steps stop at the kinks. The gaits are found one after another.
-    """
-    finder = evaluation_request.make_gait_finder()
-    rows = jnp.asarray(evaluation_request.stack_parameter_rows(samples_by_parameter))
-    cycles = jax.tree.map(lambda *x: jnp.stack(x), *map(finder.find_cycle_from_values, rows))
-    names = (*dict.fromkeys((*evaluation_request.direct_names, *MARGIN_MEASURES)),)
-    own = {measure.name: measure for measure in evaluation_request.own_measures}
-    find_measures = lambda names: tuple(own.get(name, name) for name in names)
-    reader = MeasureReader(finder.measure_reader, find_measures(names))
-    results = map_in_batches(
-        functools.partial(_read_gaits_with_kinks, finder, reader),
-        (batch_sizes.GAIT_READ_BATCH_SIZE,),
-        rows,
-        cycles,
-    )
-
-    def differentiate(names: tuple[str, ...]) -> dict[str, np.ndarray]:
-        jacobians = [
-            finder.measure_gait(row, state, find_measures(names)).parameter_jacobian
-            for row, state in zip(rows, cycles.section_state, strict=True)
-        ]
-        return dict(zip(names, np.stack(jacobians, 1), strict=True))
-
-    results |= evaluation_request.read_derivatives(differentiate, finder.model)
-    return mask_failed_samples(np.asarray(cycles.outcome), results)
+def _propose_starts(finder: Any, rows: Any) -> Array:
+    return jax.vmap(finder.make_initial_guess)(rows)
 
 
 @eqx.filter_jit
-def _read_gaits_with_kinks(
-    finder: Any, reader: MeasureReader, rows: Array, cycles: ReturnMapCycle
-) -> dict[str, Array]:
-    def read(row: Array, cycle: ReturnMapCycle) -> dict[str, Array]:
-        model, params = finder.model.from_parameter_values(row, finder.n_legs)
-        step = model.take_step_of_gait(params, cycle.section_state, finder.step_options)
-        return reader(cycle, step)
+def _find_cycles(finder: Any, params: Any, guesses: Any) -> Any:
+    # No measure is read from the step.
+    return jax.vmap(finder.find_cycle)(params, guesses)._replace(last_step=None)
 
-    return eqx.filter_vmap(read)(rows, cycles)
+
+@eqx.filter_jit
+def _read_gaits(finder: Any, reader: MeasureReader, cycles: Any) -> dict[str, Array]:
+    def read(cycle: Any) -> dict[str, Array]:
+        results = {"outcome": cycle.outcome, "spectral_radius": cycle.spectral_radius}
+        return results | reader(cycle, finder.read_step(cycle))
+
+    return eqx.filter_vmap(read)(cycles)
+
+
+@eqx.filter_jit
+def _differentiate_gaits(
+    finder: Any, reader: MeasureReader, rows: Any, starts: Any
+) -> dict[str, Array]:
+    return evaluate_on_gaits(reader, finder.find_gaits(rows, starts))[1]
 
 
 PAPER_MEASURES_BY_CONTACT_MEASURE: dict[str, tuple[str, ...]] = {
@@ -499,85 +482,61 @@ The keys are names of measures with unilateral contact.
 _find_selection_reason = jax.jit(find_selection_reason)
 
 
-class ModelSelectionScanEngine:
-    """Scan engine that evaluates each sample with the simplest model that is valid for the
-    sample.
+def find_selection_reasons(
+    wheel_model: Any, paper_results: ValuesByVariable, friction: np.ndarray
+) -> np.ndarray:
+    """Return `ModelChoice.reason_code` for each sample.
+
+    - `wheel_model`: ladder of models;
+    - `paper_results`: margins and outcomes of the gaits computed with the paper's model, by name;
+    - `friction`: friction coefficient of the ground for each sample.
     """
+    reasons, _ = map_in_numpy_batches(
+        _find_selection_reason,
+        (batch_sizes.GAIT_READ_BATCH_SIZE,),
+        {name: paper_results[name] for name in (*SELECTION_MARGIN_NAMES, "outcome")},
+        friction - wheel_model.viscoelastic_model.friction,
+    )
+    return reasons.astype(np.int8)
 
-    def __init__(self, evaluation_request: EvaluationRequest, n_threads: int) -> None:
-        self._measure_names, self._base_wheel, self._wheel_model, *_ = evaluation_request
-        self._paper_model = self._wheel_model.viscoelastic_model
-        paper_measure_names = (
-            paper_measure
-            for measure_name in self._measure_names
-            for paper_measure in PAPER_MEASURES_BY_CONTACT_MEASURE.get(
-                measure_name, (measure_name,)
+
+def evaluate_selected_models(
+    request: EvaluationRequest,
+    evaluate_paper_gaits: SampleEvaluator,
+    evaluate_contact_gaits: SampleEvaluator,
+    samples_by_parameter: ParameterSamples,
+) -> ValuesByVariable:
+    """Return the value of each variable for all samples, by name, each with the simplest model
+    that is valid for the sample.
+
+    The variables include `rung`, the code of the model, and `reason`, the code of the reason for
+    the choice of this model.
+    """
+    n_samples = len(next(iter(samples_by_parameter.values())))
+    paper_samples = {"damping": np.full(n_samples, float(request.base_wheel.damping))}
+    paper_samples |= samples_by_parameter
+    friction = paper_samples.pop(
+        FRICTION_NAME, np.full(n_samples, float(request.wheel_model.friction))
+    )
+    results = evaluate_paper_gaits(paper_samples)
+    reasons = find_selection_reasons(request.wheel_model, results, friction)
+    for contact_measure, paper_measures in PAPER_MEASURES_BY_CONTACT_MEASURE.items():
+        if contact_measure in request.measure_names:
+            results[contact_measure] = sum(
+                map(results.__getitem__, paper_measures), start=np.zeros(n_samples)
             )
-        )
-        self._paper_engine = make_scan_engine(
-            evaluation_request._replace(
-                measure_names=tuple(dict.fromkeys(paper_measure_names)),
-                wheel_model=self._paper_model,
-            ),
-            n_threads,
-        )
-        self._evaluate_contact_gaits = functools.partial(
-            evaluate_contact_gaits,
-            evaluation_request._replace(wheel_model=self._wheel_model.fallback_model),
-            n_threads,
-        )
-
-    def __call__(self, samples_by_parameter: ParameterSamples) -> ValuesByVariable:
-        """Return the value of each variable for all samples, by the name of the variable.
-
-        The variables include `rung`, the code of the model, and `reason`, the code of the reason
-        for the choice of this model.
-        """
-        n_samples = len(next(iter(samples_by_parameter.values())))
-        paper_samples = {"damping": np.full(n_samples, float(self._base_wheel.damping))}
-        paper_samples |= samples_by_parameter
-        friction = paper_samples.pop(
-            FRICTION_NAME, np.full(n_samples, float(self._wheel_model.friction))
-        )
-        paper_results = self._paper_engine(paper_samples)
-        reasons = self.compute_selection_reasons(paper_results, friction)
-        model_codes = np.where(reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL)
-        variable_names = (*self._measure_names, "outcome", "spectral_radius")
-        for contact_measure, paper_measures in PAPER_MEASURES_BY_CONTACT_MEASURE.items():
-            if contact_measure in variable_names:
-                paper_results[contact_measure] = sum(
-                    map(paper_results.__getitem__, paper_measures), start=np.zeros(n_samples)
-                )
-        results = {name: paper_results[name] for name in variable_names}
-        contact_samples = np.flatnonzero(model_codes == ModelCode.UNILATERAL)
-        if contact_samples.size:
-            contact_results = self._evaluate_contact_gaits(
-                select_tree_rows(samples_by_parameter, contact_samples)
-            )
-            for name, values in results.items():
-                values[contact_samples] = contact_results[name]
-        return results | {"rung": model_codes.astype(np.int8), "reason": reasons}
-
-    def compute_selection_reasons(
-        self, paper_results: ValuesByVariable, friction: np.ndarray
-    ) -> np.ndarray:
-        """Return `ModelChoice.reason_code` for each sample.
-
-        - `paper_results`: margins and outcomes of the gaits computed with the paper's model, by
-          name;
-        - `friction`: friction coefficient of the ground for each sample.
-        """
-        reasons, _ = map_in_numpy_batches(
-            _find_selection_reason,
-            (batch_sizes.GAIT_READ_BATCH_SIZE,),
-            {name: paper_results[name] for name in (*SELECTION_MARGIN_NAMES, "outcome")},
-            friction - self._paper_model.friction,
-        )
-        return reasons.astype(np.int8)
+    names = (*request.measure_names, "outcome", "spectral_radius")
+    results = {name: results[name] for name in names}
+    contact_samples = np.flatnonzero(reasons)
+    if contact_samples.size:
+        contact_rows = select_tree_rows(samples_by_parameter, contact_samples)
+        results = replace_rows(results, contact_samples, evaluate_contact_gaits(contact_rows))
+    model_codes = np.where(reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL)
+    return results | {"rung": model_codes.astype(np.int8), "reason": reasons}
 
 
 def evaluate_to_tolerance(
-    evaluation_request: EvaluationRequest, samples_by_parameter: ParameterSamples
+    request: EvaluationRequest, samples_by_parameter: ParameterSamples
 ) -> ValuesByVariable:
     """Return the value of each variable for all samples, computed to a tolerance, by the name of
     the variable.
@@ -586,155 +545,87 @@ def evaluate_to_tolerance(
 
     - `samples_by_parameter`: value of each swept parameter for each sample.
     """
-    assert evaluation_request.error_tolerance is not None
-    measure_names = evaluation_request.measure_names
-    rows = evaluation_request.stack_parameter_rows(samples_by_parameter)
-    *wheel_parameter_columns, sample_friction = rows.T
-    params = make_wheel_from_parameters(
-        tuple(map(jnp.asarray, wheel_parameter_columns)), evaluation_request.base_wheel.n_legs
+    assert request.error_tolerance is not None
+    names, rows = request.measure_names, request.stack_parameter_rows(samples_by_parameter)
+    result = measure_to_tolerance(
+        names,
+        make_wheel_from_parameters(tuple(map(jnp.asarray, rows.T[:-1])), request.base_wheel.n_legs),
+        request.error_tolerance,
+        friction=rows[:, -1],
+        stoppers=request.wheel_model.stoppers,
     )
-    measure_result = measure_to_tolerance(
-        measure_names,
-        params,
-        evaluation_request.error_tolerance,
-        friction=sample_friction,
-        stoppers=evaluation_request.wheel_model.stoppers,
-    )
-    error_names = (name + ERROR_VARIABLE_SUFFIX for name in measure_names)
-    sample_results = dict(zip(measure_names, measure_result.values.T, strict=True))
-    sample_results |= dict(zip(error_names, measure_result.errors.T, strict=True))
-    model_codes = np.maximum(measure_result.models - ModelIndex.RIGID, 0).astype(np.int8)
-    is_in_domain = evaluation_request.are_rows_in_domain(rows)
-    outcomes = np.where(is_in_domain, measure_result.outcomes, Outcome.BAD_INPUT)
-    return mask_failed_samples(outcomes, sample_results | {"rung": model_codes})
-
-
-def evaluate_own_gaits(
-    evaluation_request: EvaluationRequest, n_threads: int, samples_by_parameter: ParameterSamples
-) -> ValuesByVariable:
-    """Return the value of each variable for all samples, for a walker of the user, by name."""
-    rows = evaluation_request.stack_parameter_rows(samples_by_parameter)
-    finder = make_walker_finder(
-        evaluation_request.wheel_model.walker,
-        evaluation_request.base_wheel,
-        evaluation_request.step_options,
-    )
-    propose = functools.partial(_propose_starts, finder)
-    evaluate = functools.partial(_evaluate_walkers, finder, evaluation_request.measure_names)
-
-    def evaluate_block(block: np.ndarray) -> ValuesByVariable:
-        guesses = map_in_numpy_batches(propose, (WALKER_BLOCK_SIZE,), block)
-        results = map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block, guesses)
-        params = finder.model.from_parameter_values(list(block.T), 0)[1]
-        failed, starts = collect_walk_ends(
-            finder.model.walker, params, guesses, results["outcome"], finder.step_options,
-            finder.period_n,
-        )  # fmt: skip
-        if not len(failed):
-            return results
-        found = map_in_numpy_batches(evaluate, (WALKER_BLOCK_SIZE,), block[failed], starts)
-        is_found = found["outcome"] == Outcome.STEPPED
-        return replace_rows(results, failed[is_found], select_tree_rows(found, is_found))
-
-    results = _evaluate_blocks(
-        evaluate_block,
-        np.split(rows, range(WALKER_BLOCK_SIZE, len(rows), WALKER_BLOCK_SIZE)),
-        n_threads,
-    )
-    is_in_domain = evaluation_request.are_rows_in_domain(rows)
-    outcomes = np.where(is_in_domain, results.pop("outcome"), Outcome.BAD_INPUT)
-    return mask_failed_samples(outcomes, results)
-
-
-WALKER_BLOCK_SIZE = 64
-"""Number of samples that one call computes, fixed so that the results for a sample do not depend on
-other samples. It is small, because a walker whose functions have no machine code is slow.
-"""
-
-
-@eqx.filter_jit
-def _propose_starts(finder: WalkerFinder, rows: Any) -> Array:
-    return jax.vmap(finder.make_initial_guess)(rows)
-
-
-@eqx.filter_jit
-def _evaluate_walkers(
-    finder: WalkerFinder, variable_names: tuple[str, ...], rows: Any, guesses: Any
-) -> dict[str, Array]:
-    read = finder.measure_reader
-    derivatives = {name: parse_derivative(name) for name in variable_names}
-    if any(derivatives.values()):
-        gaits = finder.find_gaits(rows, guesses)
-        cycles, cycle_derivatives = gaits.cycle, gaits.cycle_derivatives
-    else:
-        cycles = jax.vmap(finder.find_cycle_from_values)(rows, guesses)
-    results = {"outcome": cycles.outcome, "spectral_radius": cycles.spectral_radius}
-    for name, derivative in derivatives.items():
-        if derivative is None:
-            results[name] = read(name, cycles)
-        else:
-            index = finder.model.parameter_names.index(derivative.parameter_name)
-            results[name] = read(derivative.measure_name, cycle_derivatives)[:, index]
-    return results
+    measures = dict(zip(names, result.values.T, strict=True))
+    error_names = (name + ERROR_VARIABLE_SUFFIX for name in names)
+    measures |= dict(zip(error_names, result.errors.T, strict=True))
+    measures["rung"] = np.maximum(result.models - ModelIndex.RIGID, 0).astype(np.int8)
+    outcomes = np.where(request.are_rows_in_domain(rows), result.outcomes, Outcome.BAD_INPUT)
+    return mask_failed_samples(outcomes, measures)
 
 
 def evaluate_passages(
-    evaluation_request: EvaluationRequest,
-    evaluate_gaits: SampleEvaluator,
+    request: EvaluationRequest,
+    evaluate_steady_gaits: SampleEvaluator,
     samples_by_parameter: ParameterSamples,
 ) -> ValuesByVariable:
     """Return the results of another engine, with measures of walks over random slopes.
 
     Samples are computed one after another, each with the same random numbers.
     """
-    results = evaluate_gaits(samples_by_parameter)
-    slope_sd = evaluation_request.slope_standard_deviation
+    results, slope_sd = (
+        evaluate_steady_gaits(samples_by_parameter),
+        request.slope_standard_deviation,
+    )
     assert slope_sd is not None  # The measures need it.
-    outcomes, dtype = results["outcome"], evaluation_request.base_wheel.damping.dtype
-    passage_measures = {
+    outcomes, dtype = results["outcome"], request.base_wheel.damping.dtype
+    measures = {
         name: np.full(len(outcomes), np.nan, dtype)
-        for name in evaluation_request.measure_names
+        for name in request.measure_names
         if name in PASSAGE_MEASURES
     }
     # The default options of walks have larger tolerances.
-    given_options = evaluation_request.step_options
-    options = None if given_options == StepOptions() else given_options
-    for index in np.flatnonzero(outcomes == Outcome.STEPPED) if passage_measures else ():
-        model, params = evaluation_request.wheel_model, evaluation_request.base_wheel
+    options = None if request.step_options == StepOptions() else request.step_options
+    for index in np.flatnonzero(outcomes == Outcome.STEPPED) if measures else ():
+        model, params = request.wheel_model, request.base_wheel
         for name, samples in samples_by_parameter.items():
             model, params = model.with_parameter(params, name, jnp.asarray(float(samples[index])))
         # Hardly any step of the walks succeeds if `first_passage` raises an error.
         with contextlib.suppress(ValueError):
             passage = first_passage(params, slope_sd, model=model, options=options)
-            for name, values in passage_measures.items():
+            for name, values in measures.items():
                 values[index] = getattr(passage, "error" if name == "mean_steps_error" else name)
-    return results | passage_measures
+    return results | measures
 
 
-def make_scan_engine(
-    evaluation_request: EvaluationRequest, n_threads: int | None = None
-) -> SampleEvaluator:
+def make_scan_engine(request: EvaluationRequest, n_threads: int | None = None) -> SampleEvaluator:
     """Return the engine that computes the measures of an `EvaluationRequest`.
 
     - `n_threads`: number of CPU threads, by default one per core.
     """
-    n_threads, model = n_threads or lanes.count_available_cores(), evaluation_request.wheel_model
-    if evaluation_request.error_tolerance is not None:
-        return functools.partial(evaluate_to_tolerance, evaluation_request)
-    if evaluation_request.slope_standard_deviation is not None:
-        names = evaluation_request.measure_names
-        gait_request = evaluation_request._replace(
+    n_threads, model = n_threads or lanes.count_available_cores(), request.wheel_model
+    if request.error_tolerance is not None:
+        return functools.partial(evaluate_to_tolerance, request)
+    if request.slope_standard_deviation is not None:
+        names = request.measure_names
+        gait_request = request._replace(
             measure_names=tuple(name for name in names if name not in PASSAGE_MEASURES),
             slope_standard_deviation=None,
         )
         gait_engine = make_scan_engine(gait_request, n_threads)
-        return functools.partial(evaluate_passages, evaluation_request, gait_engine)
-    if not model.is_wheel:
-        return functools.partial(evaluate_own_gaits, evaluation_request, n_threads)
-    if model.fallback_model is not model:
-        return ModelSelectionScanEngine(evaluation_request, n_threads)
-    if model.batch_kernel == "legs":
-        return functools.partial(evaluate_contact_gaits, evaluation_request, n_threads)
-    if model.has_kinks:
-        return functools.partial(evaluate_gaits_with_kinks, evaluation_request)
-    return CollocationScanEngine(evaluation_request, n_threads)
+        return functools.partial(evaluate_passages, request, gait_engine)
+    if model.is_wheel and model.fallback_model is not model:
+        names = request.measure_names
+        paper_names = (PAPER_MEASURES_BY_CONTACT_MEASURE.get(name, (name,)) for name in names)
+        paper_request = request._replace(
+            measure_names=tuple(dict.fromkeys(itertools.chain(*paper_names))),
+            wheel_model=model.viscoelastic_model,
+        )
+        contact_request = request._replace(wheel_model=model.fallback_model)
+        return functools.partial(
+            evaluate_selected_models,
+            request,
+            make_scan_engine(paper_request, n_threads),
+            make_scan_engine(contact_request, n_threads),
+        )
+    if model.is_wheel and model.batch_kernel == "phases" and not model.has_kinks:
+        return CollocationScanEngine(request, n_threads)
+    return functools.partial(evaluate_gaits, request, n_threads)
