@@ -65,7 +65,7 @@ def test_the_error_bound_holds_next_to_a_jump_of_the_map(side):
     gaits = refine_fixed_point(np.array([side * 2e-6, 4e-6]), 1e-2, add_jump)
     assert gaits.is_found[0]
     assert gaits.is_attracting[0]
-    assert abs(gaits.measure_values[0, 0] - FIXED_VALUE) <= gaits.measure_error_bounds[0, 0] <= 1e-2
+    assert abs(gaits.values[0, 0] - FIXED_VALUE) <= gaits.error_bounds[0, 0] <= 1e-2
 
 
 @pytest.mark.parametrize("tol", [1e-2, 1e-4, 1e-6])
@@ -74,7 +74,7 @@ def test_one_jacobian_serves_corrections_whose_remaining_error_is_bounded(tol):
     add_curvature = lambda offset: (offset[:, 0] ** 2, 2.0 * offset[:, 0])
     gaits = refine_fixed_point(np.array([0.02, 0.01]), tol, add_curvature)
     assert gaits.is_found[0]
-    assert abs(gaits.measure_values[0, 0] - FIXED_VALUE) <= gaits.measure_error_bounds[0, 0] <= tol
+    assert abs(gaits.values[0, 0] - FIXED_VALUE) <= gaits.error_bounds[0, 0] <= tol
     n_chord_steps = gaits.n_steps[0] - JACOBIAN_COST_IN_STEPS
     assert 0 < n_chord_steps <= 7
 

@@ -269,13 +269,11 @@ class LowerFidelityGaits(NamedTuple):
     def without_gait(cls, n_wheels: int) -> "LowerFidelityGaits":
         """Return the value in which none of `n_wheels` wheels has a gait."""
         n_quantities = len(QUANTITY_NAMES)
-        return cls(
-            np.full(n_wheels, ModelIndex.NONE),
+        return cls.from_steps(
+            ModelIndex.NONE,
             np.zeros((n_wheels, 3)),
             np.full((n_wheels, n_quantities), np.nan),
-            np.zeros((n_wheels, 3, 3)),
             np.zeros((n_wheels, n_quantities, 3)),
-            np.zeros((n_wheels, 3)),
         )
 
     @classmethod

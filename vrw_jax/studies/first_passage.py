@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -46,50 +46,6 @@ from vrw_jax.wheel.params import (
     compute_wheel_units,
 )
 
-
-class FailingWalks(NamedTuple):
-    """Walks that start from the quasi-stationary distribution and fail in their last step."""
-
-    section_states: np.ndarray  # at the starts, (walks, components)
-    start_ground: np.ndarray  # slope or heights at the starts, as in `WalkerGroups`
-    slope_deviation_directions: np.ndarray  # unit vectors of slope deviations, (walks, lines)
-    slope_deviation_norms: np.ndarray  # norms of the slope deviations, (walks,)
-
-    def test_failures(
-        self, walker_groups: WalkerGroups, params: WheelParams, norms: np.ndarray
-    ) -> np.ndarray:
-        """Return whether each walk of the wheel `params` fails if its slope deviations are scaled
-        to `norms`, shape (walks,).
-        """
-        walk_results = walker_groups.run_walks_with_changes(
-            params,
-            self.section_states,
-            self.start_ground,
-            norms[:, None] * self.slope_deviation_directions,
-        )
-        return walk_results.outcome != Outcome.STEPPED
-
-    def bisect_failure_radii(
-        self,
-        walker_groups: WalkerGroups,
-        params: WheelParams,
-        lower_radii: np.ndarray,
-        upper_radii: np.ndarray,
-        n_bisections: int,
-    ) -> np.ndarray:
-        """Return the failure radius of each walk, shape (walks,), by bisection.
-
-        - `lower_radii`: radii at which the walks do not fail;
-        - `upper_radii`: radii at which the walks fail.
-        """
-        for _ in range(n_bisections):
-            middle_radii = 0.5 * (lower_radii + upper_radii)
-            has_failed = self.test_failures(walker_groups, params, middle_radii)
-            lower_radii = np.where(has_failed, lower_radii, middle_radii)
-            upper_radii = np.where(has_failed, middle_radii, upper_radii)
-        return 0.5 * (lower_radii + upper_radii)
-
-
 # Relative change of a parameter in a difference quotient of failure radii. The value is chosen
 # because the resulting changes of failure radii are below `BRACKET_HALF_WIDTH`.
 RELATIVE_PARAMETER_STEP = 3e-4
@@ -120,17 +76,34 @@ def differentiate_log_mean_steps(
     from scipy import stats  # This import is slow.
 
     params, ground_sd = walker_groups.params, walker_groups.ground_sd
-    failing_walks = _draw_failing_walks(walker_groups, walk_density)
-    zero_radii = np.zeros_like(failing_walks.slope_deviation_norms)
-    survives_on_mean_slopes = ~failing_walks.test_failures(walker_groups, params, zero_radii)
-    failure_radii = failing_walks.bisect_failure_radii(
-        walker_groups,
-        params,
-        zero_radii,
-        failing_walks.slope_deviation_norms,
-        N_RADIUS_BISECTIONS,
-    )
-    radius_distribution = stats.chi(failing_walks.slope_deviation_directions.shape[1])
+    states, start_ground, directions, norms = _draw_failing_walks(walker_groups, walk_density)
+
+    def test_failures(
+        radii: np.ndarray, params: Any, states: np.ndarray, ground: np.ndarray
+    ) -> np.ndarray:
+        """Return whether each walk fails if its slope deviations have the norms `radii`."""
+        deviations = radii[:, None] * directions
+        walk_results = walker_groups.run_walks_with_changes(params, states, ground, deviations)
+        return walk_results.outcome != Outcome.STEPPED
+
+    def bisect_failure_radii(
+        lower: np.ndarray, upper: np.ndarray, n_bisections: int, *start: Any
+    ) -> np.ndarray:
+        """Return the failure radius of each walk, shape (walks,), by bisection.
+
+        - `lower`, `upper`: radii at which the walks do not fail, and fail;
+        - `start`: wheel, states and ground at the starts.
+        """
+        for _ in range(n_bisections):
+            middle = 0.5 * (lower + upper)
+            has_failed = test_failures(middle, *start)
+            lower, upper = np.where(has_failed, lower, middle), np.where(has_failed, middle, upper)
+        return 0.5 * (lower + upper)
+
+    zero_radii, start = np.zeros_like(norms), (params, states, start_ground)
+    survives_on_mean_slopes = ~test_failures(zero_radii, *start)
+    failure_radii = bisect_failure_radii(zero_radii, norms, N_RADIUS_BISECTIONS, *start)
+    radius_distribution = stats.chi(directions.shape[1])
     hazard_rates = np.exp(
         radius_distribution.logpdf(failure_radii) - radius_distribution.logsf(failure_radii)
     )
@@ -159,24 +132,15 @@ def differentiate_log_mean_steps(
             changed_cycle: Any = limit_cycle(changed_params, model=walker_groups.model)
             if int(changed_cycle.outcome) != Outcome.STEPPED:
                 return np.full_like(failure_radii, np.nan)
-            walks_of_changed_wheel = failing_walks._replace(
-                section_states=failing_walks.section_states
-                + np.asarray(changed_cycle.section_state)
-                - walker_groups.gait_state,
-                start_ground=failing_walks.start_ground
-                + (
-                    parameter_change
-                    if parameter_name == "slope" and not walker_groups.has_heights
-                    else 0.0
-                ),
-            )
+            changes_ground = parameter_name == "slope" and not walker_groups.has_heights
             changed_failure_radii.append(
-                walks_of_changed_wheel.bisect_failure_radii(
-                    walker_groups,
-                    changed_params,
+                bisect_failure_radii(
                     np.maximum(failure_radii - BRACKET_HALF_WIDTH, 0.0),
                     failure_radii + BRACKET_HALF_WIDTH,
                     N_CHANGED_WHEEL_BISECTIONS,
+                    changed_params,
+                    states + np.asarray(changed_cycle.section_state) - walker_groups.gait_state,
+                    start_ground + (parameter_change if changes_ground else 0.0),
                 )
             )
         return (changed_failure_radii[0] - changed_failure_radii[1]) / (changes[0] - changes[1])
@@ -198,11 +162,15 @@ N_FAILING_WALKS = 1024
 MAX_SAMPLING_ROUNDS = 20
 
 
-def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixture) -> FailingWalks:
+def _draw_failing_walks(
+    walker_groups: WalkerGroups, walk_density: GaussianMixture
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return failing walks with equal weights, resampled from many walks.
 
-    The slopes of the many walks are drawn from `walk_density`. Raise ValueError if no walk fails in
-    its last step.
+    The result is (section states at the starts, ground at the starts as in `WalkerGroups`, unit
+    vectors of slope deviations, their norms). The starts have the quasi-stationary distribution,
+    and the walks fail in their last step. The slopes of the many walks are drawn from
+    `walk_density`. Raise ValueError if no walk fails in its last step.
     """
     n_effective_walks = 0.0
     n_walkers = walker_groups.n_walkers
@@ -227,7 +195,7 @@ def _draw_failing_walks(walker_groups: WalkerGroups, walk_density: GaussianMixtu
     )
     slope_deviations = np.concatenate(deviations_by_round)[walk_indices]
     slope_deviation_norms = np.linalg.norm(slope_deviations, axis=1)
-    return FailingWalks(
+    return (
         walker_groups.states[walk_indices % n_walkers],
         walker_groups.ground[walk_indices % n_walkers],
         slope_deviations / slope_deviation_norms[:, None],
@@ -626,7 +594,7 @@ def _solve_passage_by_quadrature(
     coarse_passage = solve_passage(n_nodes=n_nodes // 2)
     if not is_traced and (
         coarse_passage.omitted_probability
-        > 0.5 * relative_tolerance * coarse_passage.survival_analysis.failure_probability
+        > 0.5 * relative_tolerance * coarse_passage.failure_probability
     ):
         solve_passage = solve_by_interpolation
         coarse_passage = solve_passage(n_nodes=n_nodes // 2)
@@ -649,17 +617,16 @@ def _solve_passage_by_quadrature(
     status = jnp.where(
         is_within_tolerance, PassageStatus.CONVERGED, PassageStatus.TOLERANCE_NOT_MET
     )
-    survival_analysis = passage.survival_analysis
     return FirstPassage(
         mean_steps=mean_steps,
         mean_steps_from_gait=passage.mean_steps_from_gait,
         mean_distance=mean_distance,
         distance_error=lax.stop_gradient(distance_error),
-        failure_probability=survival_analysis.failure_probability,
-        kappa_2=survival_analysis.kappa_2,
+        failure_probability=passage.failure_probability,
+        kappa_2=passage.kappa_2,
         error=lax.stop_gradient(error),
         states=passage.states,
-        weights=survival_analysis.quasi_stationary_weights,
+        weights=passage.quasi_stationary_weights,
         status=status.astype(jnp.int32),
         end_fractions=jnp.ones(1, mean_steps.dtype),
         end_names=(Outcome.FELL_BACK.name,),

@@ -11,6 +11,7 @@ and the mean is unbiased. If some wheels have no gait, the mean is a ratio of su
 Its bias is then inversely proportional to the number of sampled wheels.
 """
 
+import functools
 import math
 import operator
 from typing import Any
@@ -187,10 +188,9 @@ def multifidelity_mean(
             stoppers=stoppers,
         )
 
-    def evaluate_control(indices: np.ndarray, control: str) -> np.ndarray:
-        wheels = select_rows_on_device(params, indices)
-        return _evaluate_control(measure, wheels, friction_by_wheel[indices], stoppers, control)
-
+    evaluate_control = functools.partial(
+        _evaluate_control, measure, params, friction_by_wheel, stoppers
+    )
     pilot_wheels, other_wheels = np.split(
         np.random.default_rng(seed).permutation(n_wheels), [pilot]
     )
@@ -236,13 +236,21 @@ def _zero_missing(results: MeasureResult) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _evaluate_control(
-    measure: str, params: WheelParams, friction: np.ndarray, stoppers: str, control: str
+    measure: str,
+    params: WheelParams,
+    friction: np.ndarray,
+    stoppers: str,
+    indices: np.ndarray,
+    control: str,
 ) -> np.ndarray:
     """Return the two regressors for the regression on a control variate, shape (wheels, 2).
+
+    - `indices`: indices of the evaluated wheels.
 
     The first column is the control variate, or zero for a wheel for which the paper's model has no
     gait. The second column is 1 for a wheel with a finite control variate and 0 otherwise.
     """
+    params, friction = select_rows_on_device(params, indices), friction[indices]
     control_values = np.full(len(friction), np.nan)
     no_control, _, one_step = CONTROL_VARIATES
     if control != no_control:

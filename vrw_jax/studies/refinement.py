@@ -13,6 +13,7 @@ several corrections (chord iteration). It is computed again if corrections contr
 contact codes of the legs change.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -301,31 +302,6 @@ def estimate_measures_from_lower_gaits(
     return section_states, contact_step, measure_estimates
 
 
-class RefinedGaits(NamedTuple):
-    """Gaits with unilateral contact after the refinement, with their measures."""
-
-    is_found: np.ndarray  # whether the iteration has converged
-    is_attracting: np.ndarray  # whether all multipliers are inside the unit circle
-    measure_values: np.ndarray  # (gaits, measures)
-    measure_error_bounds: np.ndarray  # (gaits, measures)
-    n_steps: np.ndarray  # walking steps; a Jacobian costs `JACOBIAN_COST_IN_STEPS`
-    section_states: np.ndarray  # (gaits, 4 + 3 n)
-    walking_speed: np.ndarray  # mean speed of the last step, m/s
-
-    def find_distinct_gaits(self, gait_indices: np.ndarray) -> list[int]:
-        """Return the indices of the different attracting gaits of one wheel, slowest first.
-
-        `gait_indices` are the indices of the wheel's gaits. Two gaits are different if a measure
-        differs by more than the sum of both error bounds.
-        """
-        values, bounds, distinct = self.measure_values, self.measure_error_bounds, list[int]()
-        for i in gait_indices[(self.is_found & self.is_attracting)[gait_indices]].tolist():
-            is_different = np.abs(values[i] - values[distinct]) > bounds[i] + bounds[distinct]
-            if np.all(np.any(is_different, axis=1)):
-                distinct.append(i)
-        return sorted(distinct, key=lambda i: self.walking_speed[i])
-
-
 # Largest number of Jacobians computed for one gait.
 MAX_JACOBIANS_PER_GAIT = 4
 # Largest number of Newton corrections with one Jacobian, chosen because this number of corrections
@@ -358,7 +334,7 @@ def refine_gaits(
     measure_names: Sequence[str],
     compute_error_goal: Callable[[np.ndarray], np.ndarray],
     is_every_gait_compared: bool,
-) -> RefinedGaits:
+) -> "RefinedGaits":
     """Return the gaits near full section states, with their measures and bounds for the errors.
 
     - `wheel_indices`: index of the wheel of each gait, (gaits,);
@@ -370,34 +346,32 @@ def refine_gaits(
 
     Newton's corrections of a gait end when the remaining error is below the allowed error.
     """
-    refinement = _Refinement(
+    gaits = RefinedGaits(
         wheel_batch, wheel_indices, section_states.copy(), measure_names, compute_error_goal
     )
     remaining = np.arange(len(section_states))
     for _ in range(MAX_JACOBIANS_PER_GAIT):
         if len(remaining):
-            remaining = refinement.correct(remaining)
-    refinement.compare_tolerances(
-        refinement.is_found & (is_every_gait_compared | refinement.has_large_presumed_error)
+            remaining = gaits.correct(remaining)
+    gaits.compare_tolerances(
+        gaits.is_found & (is_every_gait_compared | gaits.has_large_presumed_error)
     )
-    error_bounds = refinement.error_bounds + refinement.numerical_bounds
-    # All multipliers are inside the unit circle if all eigenvalues of (I - DP)^-1 have real parts
-    # above a half.
-    eigenvalues = np.linalg.eigvals(np.nan_to_num(refinement.inverses, posinf=0.0, neginf=0.0))
-    return RefinedGaits(
-        refinement.is_found & np.isfinite(error_bounds).all(1),
-        eigenvalues.real.min(-1) > 0.5,
-        refinement.values,
-        error_bounds,
-        refinement.n_steps,
-        refinement.section_states,
-        refinement.speeds,
-    )
+    gaits.error_bounds += gaits.numerical_bounds
+    gaits.is_found &= np.isfinite(gaits.error_bounds).all(1)
+    return gaits
 
 
 @dataclass
-class _Refinement:
-    """Gaits during their refinement, with a leading axis over the gaits in every array."""
+class RefinedGaits:
+    """Gaits with unilateral contact and their measures, with a leading axis over the gaits in
+    every array.
+
+    - `section_states`: full section states, (gaits, 4 + 3 n);
+    - `is_found`: whether the iteration has converged;
+    - `values`, `error_bounds`: measures and bounds of their errors, (gaits, measures);
+    - `n_steps`: walking steps; a Jacobian costs `JACOBIAN_COST_IN_STEPS`;
+    - `speeds`: mean speed of the last step, m/s.
+    """
 
     wheel_batch: ContactWheelBatch
     wheel_indices: np.ndarray
@@ -413,6 +387,28 @@ class _Refinement:
         self.n_steps, self.speeds = np.zeros(n_gaits, int), np.full(n_gaits, np.nan)
         self.inverses = np.zeros((n_gaits, n_coordinates, n_coordinates))
         self.quantity_jacobians = np.zeros((n_gaits, len(QUANTITY_NAMES), n_coordinates))
+
+    @functools.cached_property
+    def is_attracting(self) -> np.ndarray:
+        """Return whether all multipliers of each gait are inside the unit circle.
+
+        This is so if all eigenvalues of (I - DP)^-1 have real parts above a half.
+        """
+        inverses = np.nan_to_num(self.inverses, posinf=0.0, neginf=0.0)
+        return np.linalg.eigvals(inverses).real.min(-1) > 0.5
+
+    def find_distinct_gaits(self, gait_indices: np.ndarray) -> list[int]:
+        """Return the indices of the different attracting gaits of one wheel, slowest first.
+
+        `gait_indices` are the indices of the wheel's gaits. Two gaits are different if a measure
+        differs by more than the sum of both error bounds.
+        """
+        values, bounds, distinct = self.values, self.error_bounds, list[int]()
+        for i in gait_indices[(self.is_found & self.is_attracting)[gait_indices]].tolist():
+            is_different = np.abs(values[i] - values[distinct]) > bounds[i] + bounds[distinct]
+            if np.all(np.any(is_different, axis=1)):
+                distinct.append(i)
+        return sorted(distinct, key=lambda i: self.speeds[i])
 
     def take_steps(self, batch: ContactWheelBatch, gaits: np.ndarray) -> StepQuantities:
         self.n_steps[gaits] += 1

@@ -34,19 +34,13 @@ POWER_ITERATION_TOLERANCE = 1e-15
 """Relative change of an eigenvector at which power iteration ends, chosen near round-off."""
 
 
-class SurvivalAnalysis(NamedTuple):
-    """Leading eigenvalues of a survival operator, and its left and right leading eigenvectors."""
-
-    failure_probability: Scalar  # 1 - kappa_1, without cancellation
-    kappa_2: Scalar
-    quasi_stationary_weights: Float[Array, " n"]  # of the nodes, sum 1
-    survival_eigenvector: Float[Array, " n"]  # scaled to a mean of 1 over the distribution
-
-
-def analyze_survival_operator(
+def _analyze_survival_operator(
     survival_matrix: Float[Array, "n n"], failure_probabilities: Float[Array, " n"]
-) -> SurvivalAnalysis:
+) -> tuple[Scalar, Scalar, Array, Array]:
     """Return the leading eigenvalues and eigenvectors of the survival operator `survival_matrix`.
+
+    The result is (1 - kappa_1 without cancellation, kappa_2, quasi-stationary weights of the nodes
+    with the sum 1, right eigenvector with a mean of 1 over this distribution).
 
     Let q be the quasi-stationary distribution and u the right eigenvector, with q.1 = q.u = 1. The
     failure probability is q.F, where F is `failure_probabilities`. Its first derivatives are those
@@ -68,7 +62,7 @@ def analyze_survival_operator(
     q_change = jnp.linalg.solve(regular_matrix.T, q @ K_change - kappa_change * q)
     u_change = jnp.linalg.solve(regular_matrix, K_change @ u - kappa_change * u)
     scale_change = jnp.sum(q_change)
-    return SurvivalAnalysis(
+    return (
         failure_probability,
         kappa_2,
         q + q_change - scale_change * q,
@@ -137,7 +131,9 @@ The limits bound the states. The values are chosen because larger slopes have a 
 class RigidPassage(NamedTuple):
     """First-passage times of the rigid wheel, computed with one number of nodes."""
 
-    survival_analysis: SurvivalAnalysis
+    failure_probability: Scalar  # 1 - kappa_1
+    kappa_2: Scalar
+    quasi_stationary_weights: Float[Array, " n"]
     mean_steps_from_gait: Scalar
     mean_step_distance: Scalar  # to the next foothold, from the quasi-stationary distribution, m
     states: Float[Array, "n n_state"]
@@ -145,7 +141,7 @@ class RigidPassage(NamedTuple):
 
     def compute_means(self) -> tuple[Scalar, Scalar]:
         """Return the mean number of steps, and the mean distance of their footholds, m."""
-        mean_steps = 1.0 / self.survival_analysis.failure_probability
+        mean_steps = 1.0 / self.failure_probability
         return mean_steps, mean_steps * self.mean_step_distance
 
 
@@ -354,13 +350,14 @@ def _analyze_passage(
     - `step_distances`: mean distance to the next foothold from each state, m;
     - `start_row`: row of the operator for a start on the gait, and its failure probability.
     """
-    survival_analysis = analyze_survival_operator(survival_matrix, failure_probabilities)
-    p, _, q, u = survival_analysis
+    p, kappa_2, q, u = _analyze_survival_operator(survival_matrix, failure_probabilities)
     n, (start_survival, start_failure) = len(u), start_row
     remainder = jnp.linalg.solve(jnp.eye(n) - survival_matrix + jnp.outer(u, q), 1.0 - u)
     factor = (1.0 - start_failure + start_survival @ (u - 1.0)) / (1.0 - p)
     return RigidPassage(
-        survival_analysis,
+        p,
+        kappa_2,
+        q,
         factor / p + 1.0 - factor + start_survival @ remainder,
         q @ step_distances,
         states,

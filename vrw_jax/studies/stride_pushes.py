@@ -8,6 +8,7 @@ disturbance that takes a walker out of the basin of its gait is found by search.
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -209,16 +210,6 @@ class _SampledGait(NamedTuple):
     foot_distances: tuple[Array | None, ...]
 
 
-class _DisturbedGait(NamedTuple):
-    """Gait, sampled within its steps, and the limits of the search."""
-
-    stable_gait: StableGait
-    stride: _SampledGait
-    coordinate_index: int  # of the coordinate that changes
-    max_size: float  # largest tried change
-    max_steps: int  # largest number of gait steps after the disturbance
-
-
 class _DirectedInstants(NamedTuple):
     """Instants of a gait, each with the direction of a disturbance, as arrays of shape
     (instants,).
@@ -227,22 +218,6 @@ class _DirectedInstants(NamedTuple):
     interval_indices: np.ndarray
     sample_indices: np.ndarray
     disturbance_signs: np.ndarray
-
-
-class _ExitSizeBrackets(NamedTuple):
-    """Brackets of the smallest disturbance size that takes the state out of the basin.
-
-    Each array has the shape (instants,).
-    """
-
-    lower_disturbance_sizes: np.ndarray
-    upper_disturbance_sizes: np.ndarray  # infinite if no tried size leaves the basin
-    exit_outcomes: np.ndarray  # `Outcome` after a disturbance of the upper size
-
-    @property
-    def middle_disturbance_sizes(self) -> np.ndarray:
-        """Return the middle of each bracket, shape (instants,)."""
-        return 0.5 * (self.lower_disturbance_sizes + self.upper_disturbance_sizes)
 
 
 # Distances between neighboring instants, in samples of a phase, one for each pass of the search.
@@ -283,7 +258,7 @@ def compute_smallest_disturbance(
                 f"{coordinate} is zero during the whole gait, so that its size gives no unit for "
                 "changes: give max_size, the largest change that is tried."
             )
-    gait = _DisturbedGait(stable_gait, stride, index, max_size, max_steps)
+    walk = functools.partial(_walk_after_disturbance, stable_gait, stride, index, max_steps)
     # Each pass considers a window of samples for each phase and direction.
     intervals = np.arange(len(stride.times))
     n_windows = len(intervals) * len(DISTURBANCE_SIGNS)
@@ -300,14 +275,11 @@ def compute_smallest_disturbance(
             np.tile(np.repeat(DISTURBANCE_SIGNS, n_instants), len(intervals)),
         )
         is_last_pass = sample_stride == SAMPLE_STRIDES[-1]
-        brackets = _bracket_exit_sizes(
-            gait,
-            instants,
-            FINAL_DISTURBANCE_TOLERANCE if is_last_pass else EARLY_DISTURBANCE_TOLERANCE,
-        )
-        exit_sizes = brackets.middle_disturbance_sizes.reshape(n_windows, n_instants)
+        tolerance = FINAL_DISTURBANCE_TOLERANCE if is_last_pass else EARLY_DISTURBANCE_TOLERANCE
+        sizes, widths, outcomes = _bracket_exit_sizes(walk, instants, max_size, tolerance)
+        exit_sizes = sizes.reshape(n_windows, n_instants)
         window_centers = window_samples[np.arange(n_windows), exit_sizes.argmin(1)]
-        first_pass_result = first_pass_result or (instants, brackets)
+        first_pass_result = first_pass_result or (instants, sizes)
     assert first_pass_result is not None
     best_instant = int(exit_sizes.argmin())
     window_index, instant_index = divmod(best_instant, n_instants)
@@ -316,26 +288,22 @@ def compute_smallest_disturbance(
     sample_index = instants.sample_indices[best_instant]
     size_error = 0.0
     if np.isfinite(size):
-        size_error = float(
-            brackets.upper_disturbance_sizes[best_instant]
-            - brackets.lower_disturbance_sizes[best_instant]
-        )
+        size_error = float(widths[best_instant])
         if sample_index not in (0, n_phase_samples - 1):
             # Sizes at the neighboring instants of the last pass bound the change between two
             # instants.
             neighbor_sizes = exit_sizes[window_index, max(instant_index - 1, 0) : instant_index + 2]
             size_error += float(np.max(neighbor_sizes[np.isfinite(neighbor_sizes)]) - size)
-    profile_instants, profile_brackets = first_pass_result
+    profile_instants, profile_sizes = first_pass_result
     is_backward = profile_instants.disturbance_signs < 0.0
     profile_intervals = profile_instants.interval_indices[is_backward]
-    profile_sizes = profile_brackets.middle_disturbance_sizes
     return SmallestDisturbance(
         size=size,
         size_error=size_error,
         direction=int(instants.disturbance_signs[best_instant]),
         time=float(stride.times[best_interval, sample_index]),
         phase_index=int(stride.phase_indices[best_interval]),
-        outcome=np.asarray(brackets.exit_outcomes[best_instant]),
+        outcome=np.asarray(outcomes[best_instant]),
         profile_times=stride.times[profile_intervals, profile_instants.sample_indices[is_backward]],
         profile_phase_indices=stride.phase_indices[profile_intervals],
         backward_sizes=profile_sizes[is_backward],
@@ -355,11 +323,13 @@ N_SIZES_PER_BISECTION = 8
 
 
 def _bracket_exit_sizes(
-    gait: _DisturbedGait, instants: _DirectedInstants, size_tolerance: float
-) -> _ExitSizeBrackets:
-    """Return, for each instant and direction, a bracket of the smallest disturbance size that takes
-    the state out of the basin.
+    walk: Callable, instants: _DirectedInstants, max_size: float, size_tolerance: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return, for each instant and direction, the smallest disturbance size that takes the state
+    out of the basin, infinite if no tried size does, the width of its bracket, and the `Outcome`
+    after a slightly larger disturbance.
 
+    - `walk`: `_walk_after_disturbance` of instants and sizes;
     - `size_tolerance`: width of the final brackets, relative to the size.
     """
     n_instants = len(instants.disturbance_signs)
@@ -368,11 +338,9 @@ def _bracket_exit_sizes(
     unresolved = np.arange(n_instants)
     grid_fractions = np.arange(1, N_DISTURBANCE_GRID_SIZES + 1) / N_DISTURBANCE_GRID_SIZES
     bisection_fractions = np.arange(1, N_SIZES_PER_BISECTION + 1) / (N_SIZES_PER_BISECTION + 1.0)
-    tried_sizes = np.tile(gait.max_size * grid_fractions, (n_instants, 1))
+    tried_sizes = np.tile(max_size * grid_fractions, (n_instants, 1))
     while len(unresolved):
-        leaves_basin, walk_outcomes = _walk_after_disturbance(
-            gait, select_tree_rows(instants, unresolved), tried_sizes
-        )
+        leaves_basin, walk_outcomes = walk(select_tree_rows(instants, unresolved), tried_sizes)
         has_exit, first_exit = leaves_basin.any(1), leaves_basin.argmax(1)
         n_sizes_inside = np.where(has_exit, first_exit, tried_sizes.shape[1])
         sizes_from_lower = np.column_stack([lower_sizes[unresolved], tried_sizes])
@@ -384,19 +352,22 @@ def _bracket_exit_sizes(
         tried_sizes = (
             lower_sizes[unresolved, None] + bracket_widths[unresolved, None] * bisection_fractions
         )
-    return _ExitSizeBrackets(
-        np.where(np.isfinite(upper_sizes), lower_sizes, np.inf), upper_sizes, exit_outcomes
-    )
+    return 0.5 * (lower_sizes + upper_sizes), bracket_widths, exit_outcomes
 
 
 def _walk_after_disturbance(
-    gait: _DisturbedGait, instants: _DirectedInstants, disturbance_sizes: np.ndarray
+    stable_gait: StableGait,
+    stride: _SampledGait,
+    coordinate_index: int,
+    max_steps: int,
+    instants: _DirectedInstants,
+    disturbance_sizes: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return whether each walk after a disturbance misses the gait, and the `Outcome` of the walk.
 
     The two arrays have the shape of `disturbance_sizes`, (instants, sizes).
     """
-    stable_gait, stride, n_sizes = gait.stable_gait, gait.stride, disturbance_sizes.shape[1]
+    n_sizes = disturbance_sizes.shape[1]
     step_indices, phase_indices = (
         np.repeat(indices[instants.interval_indices], n_sizes)
         for indices in (stride.step_indices, stride.phase_indices)
@@ -404,7 +375,7 @@ def _walk_after_disturbance(
     disturbed_states = np.repeat(
         stride.states[instants.interval_indices, instants.sample_indices], n_sizes, 0
     )
-    disturbed_states[:, gait.coordinate_index] += (
+    disturbed_states[:, coordinate_index] += (
         instants.disturbance_signs[:, None] * disturbance_sizes
     ).ravel()
     walk_outcomes = np.empty(len(phase_indices), int)
@@ -428,7 +399,7 @@ def _walk_after_disturbance(
         has_stepped = np.flatnonzero((walk_outcomes == Outcome.STEPPED) & (step_indices == k))
         if len(has_stepped):
             has_arrived, walk_outcomes[has_stepped], _ = walk_until_on_gait(
-                stable_gait.start_at_step(k + 1), section_states[has_stepped], gait.max_steps
+                stable_gait.start_at_step(k + 1), section_states[has_stepped], max_steps
             )
             leaves_basin[has_stepped] = ~has_arrived
     shape = disturbance_sizes.shape

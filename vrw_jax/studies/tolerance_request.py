@@ -605,17 +605,19 @@ class _MeasureRequest:
         - `gait_wheels`: index of the wheel of each gait;
         - `selected_gaits`: indices or mask of the selected gaits.
         """
-        wheels, gaits = gait_wheels[selected_gaits], select_tree_rows(gaits, selected_gaits)
+        wheels, values, errors, states = select_tree_rows(
+            (gait_wheels, gaits.values, gaits.error_bounds, gaits.section_states), selected_gaits
+        )
         lower_values = evaluate_measures(
             self.measure_names, self.lower_gaits.step_quantities[wheels]
         )
         gait_results = {
             "models": ModelIndex.UNILATERAL,
-            "values": gaits.measure_values,
-            "errors": gaits.measure_error_bounds,
-            "model_errors": lower_values - gaits.measure_values,
-            "numerical_errors": gaits.measure_error_bounds,
-            "states": gaits.section_states,
+            "values": values,
+            "errors": errors,
+            "model_errors": lower_values - values,
+            "numerical_errors": errors,
+            "states": states,
         }
         self._record_results(wheels, gait_results, status)
 
