@@ -18,7 +18,6 @@ from vrw_jax.base.progress import report_progress
 from vrw_jax.studies.tune_maximization import (
     EvaluatedTrial,
     TuneStatus,
-    compute_optimality_conditions,
     maximize_objective,
 )
 from vrw_jax.studies.tune_objective import UPPER_BOUND_PREFIX
@@ -106,8 +105,6 @@ def follow_optimum(
         *(f"{x} at its lower bound" for x in problem.free_parameters),
         *(f"{x} at its upper bound" for x in problem.free_parameters),
     ]
-    limit_widths = np.r_[np.ones(len(problem.constraint_names)), np.tile(problem.bound_widths, 2)]
-
     failures: list[str] = []
 
     def optimize(value: float, neighbor: EvaluatedTrial) -> _Optimum | None:
@@ -128,14 +125,11 @@ def follow_optimum(
         if result.status != TuneStatus.CONVERGED:
             failures.append(result.status.meaning)
             return None
-        conditions = compute_optimality_conditions(
-            result.best_trial, [x for x in result.evaluated_trials if x.is_usable_trial]
-        )
-        prices = conditions.price_ranges[:, 1]
+        prices = problem.find_prices(result).price_ranges[:, 1]
         active = tuple(x for x, price in zip(limit_names, prices, strict=True) if price > 0.0)
         parameters = local.denormalize_parameters(result.best_trial.normalized_parameters)
         free = parameters[problem.free_parameter_indices]
-        return _Optimum(value, result.best_trial, active, prices / limit_widths, free)
+        return _Optimum(value, result.best_trial, active, prices, free)
 
     first = optimize(float(values[0]), start_trial)
     if first is None:
@@ -174,16 +168,13 @@ def follow_optimum(
     ever_active = [x for x in limit_names if any(x in optimum.active for optimum in optima)]
     columns = np.array([optimum.prices for optimum in optima])
     domains = problem.gait_finder.model.parameter_domains
+    describe = lambda name: {"units": domains[name].unit, "symbol": domains[name].symbol}
     return OptimumCurve(
         name,
         xr.Dataset(
             {
                 **{
-                    free: (
-                        "point",
-                        column,
-                        {"units": domains[free].unit, "symbol": domains[free].symbol},
-                    )
+                    free: ("point", column, describe(free))
                     for free, column in zip(
                         problem.free_parameters,
                         np.array([x.parameters for x in optima]).T,
@@ -197,11 +188,7 @@ def follow_optimum(
                 ),
             },
             {
-                name: (
-                    "point",
-                    np.array([x.value for x in optima]),
-                    {"units": domains[name].unit, "symbol": domains[name].symbol},
-                ),
+                name: ("point", np.array([x.value for x in optima]), describe(name)),
                 "limit": np.array(ever_active, dtype=str),
             },
             {"title": f"Optima of {problem.objective_label} along {name}"},

@@ -69,6 +69,7 @@ from vrw_jax.studies.optimum_curve import follow_optimum
 from vrw_jax.studies.tune_maximization import (
     EvaluatedTrial,
     MaximizationResult,
+    OptimalityConditions,
     TrialKind,
     compute_optimality_conditions,
     maximize_objective,
@@ -445,6 +446,16 @@ class TuneProblem:
             self.evaluate_trial, np.vstack([self.normalized_start, random_normalized_starts])
         )
 
+    def find_prices(self, result: MaximizationResult) -> OptimalityConditions:
+        """Return the optimality conditions at the best trial, with prices per unit of each limit:
+        of the constraints, of the lower bounds and of the upper bounds.
+        """
+        conditions = compute_optimality_conditions(
+            result.best_trial, [x for x in result.evaluated_trials if x.is_usable_trial]
+        )
+        limit_widths = np.r_[np.ones(len(self.constraint_names)), np.tile(self.bound_widths, 2)]
+        return conditions._replace(price_ranges=conditions.price_ranges / limit_widths[:, None])
+
     def make_tune_result(
         self,
         maximization_result: MaximizationResult,
@@ -463,14 +474,10 @@ class TuneProblem:
         if laws is not None:
             model = model.with_laws(laws)
         unit_by_parameter = {name: x.unit for name, x in model.parameter_domains.items()}
-        conditions = compute_optimality_conditions(
-            best_trial,
-            [trial for trial in maximization_result.evaluated_trials if trial.is_usable_trial],
-        )
+        conditions = self.find_prices(maximization_result)
         limited_names = (*self.constraint_names, *self.free_parameters * 2)
         limits = [*self.min_constraint_values, *self.lower_bounds, *self.upper_bounds]
-        limit_widths = np.r_[np.ones(len(self.constraint_names)), np.tile(self.bound_widths, 2)]
-        price_ranges = conditions.price_ranges / limit_widths[:, None]
+        price_ranges = conditions.price_ranges
         if not conditions.are_satisfied:
             price_ranges[price_ranges[:, 1] > 0.0] = np.nan
         active_constraints = [
