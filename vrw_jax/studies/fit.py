@@ -123,10 +123,21 @@ def fit(
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     n_starts = check_int("n_starts", n_starts)
     finder, units, entries = _resolve_walker(params, model, start, options)
+    table = _read_table(data, params, finder, covariance, units)
+    problem, targets, first = _make_problem(
+        table, params, free, finder, entries, bounds, priors, start, extra, observe, window, options
+    )
+    starts = _choose_starts(problem, targets, first, {*bounds}, {*free}, n_starts)
+    return _fit_from_starts(problem, targets, starts, table, units, params, start is None)
+
+
+def _read_table(
+    data: Any, params: Any, finder: Any, covariance: Any, units: dict[str, str]
+) -> fit_data.FitData:
+    """Return the checked data, or raise an error if the model has no data of their kind."""
     model = finder.model
-    domains, parameter_names = model.parameter_domains, model.parameter_names
     time_unit = math.sqrt(params.locked_length / params.gravity) if model.is_wheel else None
-    table = fit_data.read_data(data, covariance, units, parameter_names, time_unit)
+    table = fit_data.read_data(data, covariance, units, model.parameter_names, time_unit)
     if table.kind == "gaits" and finder.leg_period > 1 and finder.is_multistable:
         raise ValueError(
             f"the legs alternate, but with a {type(model).__name__} the data of gaits are of one "
@@ -137,7 +148,28 @@ def fit(
         raise ValueError(
             "data have a column 'time', but series need legs with springs: fit the steps or gaits."
         )
-    n_rows = table.values.shape[1]
+    return table
+
+
+def _make_problem(
+    table: fit_data.FitData,
+    params: Any,
+    free: Sequence[str],
+    finder: Any,
+    entries: tuple[str, ...],
+    bounds: Mapping[str, Any],
+    priors: Mapping[str, Any],
+    start: Any,
+    extra: dict[str, float],
+    observe: Any,
+    window: float | None,
+    options: StepOptions,
+) -> tuple[FitProblem, FitTarget, np.ndarray]:
+    """Return the problem, what its predictions are compared with, and first values of unknowns.
+
+    - `entries`: entries of the start of a walk that may be unknown.
+    """
+    model, n_rows = finder.model, table.values.shape[1]
     walks, row_walks = np.unique(table.labels.get("walk", np.zeros(n_rows)), return_inverse=True)
     starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
     first_states: Any = _find_first_states(
@@ -159,36 +191,33 @@ def fit(
     unknown_names = (*free, *extra, *start_names)
     _check_unknowns(table, finder, free, unknown_names, (*bounds, *priors), observe)
     base_values = np.asarray(model.collect_parameter_values(params), float)
-    known_values = dict(zip(parameter_names, base_values, strict=True)) | extra
+    known_values = dict(zip(model.parameter_names, base_values, strict=True)) | extra
     first = np.array([float(known_values.get(name, 0.0)) for name in (*free, *extra)])
     if start_names:
         first = np.append(first, first_states[:, : len(entries)])
-    lower, upper, scale, prior_means, prior_weights = _describe_unknowns(
-        unknown_names, first, bounds, priors, domains
-    )
     n_numbers = table.values[0].size + len(priors)
+    lower, upper, scale, prior_means, prior_weights = _describe_unknowns(
+        unknown_names, first, bounds, priors, model.parameter_domains
+    )
     if n_numbers < len(first):
         raise ValueError(
             f"data contain {n_numbers} numbers for {len(first)} unknowns ("
             f"{', '.join(unknown_names)}), which cannot be estimated from fewer: measure more, or "
             "give start= or fewer free parameters."
         )
-    arrays = jax.tree.map(
-        jnp.asarray,
-        {
-            "base_values": tuple(base_values),
-            "conditions": _arrange_conditions(table, model, walks, row_walks, row_steps, n_steps),
-            "row_walks": row_walks,
-            "row_steps": row_steps,
-            "times": table.labels.get("time"),
-            "window": window,
-            "starts": first_states,
-            "whitener": table.whitener,
-        },
-    )
+    arrays = {
+        "base_values": tuple(base_values),
+        "conditions": _arrange_conditions(table, model, walks, row_walks, row_steps, n_steps),
+        "row_walks": row_walks,
+        "row_steps": row_steps,
+        "times": table.labels.get("time"),
+        "window": window,
+        "starts": first_states,
+        "whitener": table.whitener,
+    }
     problem = FitProblem(
         finder=finder,
-        **arrays,
+        **jax.tree.map(jnp.asarray, arrays),
         lower=lower,
         upper=upper,
         scale=scale,
@@ -202,12 +231,30 @@ def fit(
         starts_from_gait=starts_from_gait,
         observe=observe,
     )
-    targets = FitTarget(table.values, np.ones((1, n_rows)), prior_means[None], prior_weights[None])
-    starts = _choose_starts(problem, targets, first, {*bounds}, {*free}, n_starts)
+    ones = np.ones((1, n_rows))
+    targets = FitTarget(table.values, ones, prior_means[None], prior_weights[None])
+    return problem, targets, first
+
+
+def _fit_from_starts(
+    problem: FitProblem,
+    targets: FitTarget,
+    starts: np.ndarray,
+    table: fit_data.FitData,
+    units: dict[str, str],
+    params: Any,
+    can_replace_guesses: bool,
+) -> FitResult:
+    """Return the best fit from all starts, and for a batch the fit of each data set from there.
+
+    - `can_replace_guesses`: whether a fit to gaits may replace the guesses from which they are
+      found.
+    """
+    domains = problem.finder.model.parameter_domains
     units = {**units, **{name: domain.unit for name, domain in domains.items()}, "time": "s"}
     quantities = [
         name.removesuffix(fit_problem.OFFSET_SUFFIX).removeprefix(fit_problem.START_PREFIX)
-        for name in unknown_names
+        for name in problem.unknown_names
     ]
     unknown_units = tuple(units.get(name.partition("[")[0], "1") for name in quantities)
     walker = problem.unpack(problem.base_values)[0]
@@ -217,7 +264,7 @@ def fit(
         problem, mean_targets, starts, *arguments, is_batch=False
     )
     mean_fit = fit_mean(problem, starts)
-    if is_own_walker(walker) and table.kind == "gaits" and start is None:
+    if is_own_walker(walker) and table.kind == "gaits" and can_replace_guesses:
         mean_fit = _improve_with_new_guesses(mean_fit, fit_mean)
     if not table.is_batch:
         return mean_fit
