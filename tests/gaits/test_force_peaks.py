@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.polynomial import Chebyshev
+from numpy.polynomial import Chebyshev, Polynomial
 from reference_code import five_coordinates
 
 import vrw_jax as vrw
+from vrw_jax.flow.smooth_parts import NODE_FRACTIONS, find_extrema
 from vrw_jax.models import FORCE_PEAK_MEASURES
 
 TABLE_1 = vrw.WheelParams()
@@ -240,3 +241,27 @@ def test_second_derivatives_of_peaks_are_refused():
 
     with pytest.raises(NotImplementedError, match="first derivatives only"):
         jax.hessian(peak)(165.0)
+
+
+@pytest.mark.parametrize("distance", [0.1, 1e-2, 1e-3])
+def test_a_peak_and_a_trough_close_to_each_other_are_both_found(distance):
+    """Where a second peak appears, its trough is at the same time."""
+    middle, duration = 0.45, 2.0
+    force = Polynomial.fromroots([middle - distance / 2, middle + distance / 2]).integ()
+    times = NODE_FRACTIONS * duration
+    samples = jnp.asarray(force(times)[None]), jnp.asarray(force.deriv()(times)[None])
+    extrema = find_extrema(*samples, jnp.full(1, duration))
+    expected = [middle - distance / 2, middle + distance / 2]
+    is_extremum = extrema.is_maximum | extrema.is_minimum
+    np.testing.assert_allclose(extrema.times[is_extremum], expected, atol=1e-10)
+    assert extrema.is_maximum[is_extremum].tolist() == [True, False]
+
+
+def test_forces_of_a_step_that_the_solver_does_not_finish_are_nan():
+    model, x = vrw.ViscoelasticWheel(), vrw.paper_start()
+    finished, unfinished = (
+        model.measure_force_peaks(TABLE_1, x, vrw.StepOptions(max_solver_steps=n))
+        for n in (1000, 5)
+    )
+    assert np.isfinite(finished["peak_force"])
+    assert np.isnan(unfinished["peak_force"])

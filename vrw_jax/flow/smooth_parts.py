@@ -37,7 +37,7 @@ NODE_FRACTIONS = np.append(
 _NODE_INDICES = (len(NODES) - 1) * np.arange(N_INTERVALS)[:, None] + np.arange(len(NODES))
 _POWERS = np.arange(2 * len(NODES))
 N_BRACKETS = 8
-"""Number of brackets in an interval, each of which may contain one extremum."""
+"""Number of brackets in an interval, each of which may contain one inflection and two extrema."""
 _BRACKET_ENDS = np.linspace(-1.0, 1.0, N_BRACKETS + 1)
 N_BISECTIONS = 12
 """Number of bisections of a bracket. The value is chosen because Newton's method then converges."""
@@ -88,31 +88,44 @@ def find_extrema(values: Array, rates: Array, durations: Array) -> PartExtrema:
     samples = jnp.concatenate([values[:, _NODE_INDICES], slopes], -1)
     coefficients = samples @ _COEFFICIENTS_FROM_NODES.T.astype(values.dtype)
     fixed = lax.stop_gradient(coefficients)
-    inner_slopes = fixed @ _evaluate_powers(_BRACKET_ENDS[1:-1], 1).T.astype(values.dtype)
-    # Neighboring intervals have the same slope at their common node.
-    end_slopes = lax.stop_gradient(jnp.concatenate([slopes[..., :1], slopes[..., -1:]], -1))
-    all_slopes = jnp.concatenate([end_slopes[..., :1], inner_slopes, end_slopes[..., 1:]], -1)
-    is_rising = all_slopes > 0.0
     evaluate = lambda location, order: jnp.sum(
         fixed[..., None, :] * _evaluate_powers(location, order), -1
     )
+
+    def find_roots(order: int, start: Array, end: Array, is_positive: Array) -> Array:
+        """Return a root of a derivative in each bracket, or any location if there is none.
+
+        - `is_positive`: whether the derivative is positive at the start of the bracket.
+        """
+
+        def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            middle = 0.5 * (bracket[0] + bracket[1])
+            is_later = (evaluate(middle, order) > 0.0) == is_positive
+            return jnp.where(is_later, middle, bracket[0]), jnp.where(is_later, bracket[1], middle)
+
+        def correct(_: Any, location: Array) -> Array:
+            rate = evaluate(location, order + 1)
+            change = evaluate(location, order) / jnp.where(rate == 0.0, 1.0, rate)
+            return jnp.clip(location - change, start, end)
+
+        low, high = lax.fori_loop(0, N_BISECTIONS, halve, (start, end))
+        return lax.fori_loop(0, N_NEWTON_STEPS, correct, 0.5 * (low + high))
+
+    shape = (*fixed.shape[:-1], N_BRACKETS)
     start, end = (
-        jnp.broadcast_to(x.astype(values.dtype), is_rising[..., 1:].shape)
+        jnp.broadcast_to(x.astype(values.dtype), shape)
         for x in (_BRACKET_ENDS[:-1], _BRACKET_ENDS[1:])
     )
-
-    def halve(_: Any, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        middle = 0.5 * (bracket[0] + bracket[1])
-        is_later = (evaluate(middle, 1) > 0.0) == is_rising[..., :-1]
-        return jnp.where(is_later, middle, bracket[0]), jnp.where(is_later, bracket[1], middle)
-
-    def correct(_: Any, location: Array) -> Array:
-        curvature = evaluate(location, 2)
-        change = evaluate(location, 1) / jnp.where(curvature == 0.0, 1.0, curvature)
-        return jnp.clip(location - change, start, end)
-
-    low, high = lax.fori_loop(0, N_BISECTIONS, halve, (start, end))
-    locations = lax.fori_loop(0, N_NEWTON_STEPS, correct, 0.5 * (low + high))
+    # Two extrema in one bracket are separated by an inflection.
+    inflections = find_roots(2, start, end, evaluate(start, 2) > 0.0)
+    interleave = lambda *x: jnp.stack(x, -1).reshape(*shape[:-1], -1)
+    start, end = interleave(start, inflections), interleave(inflections, end)
+    # Neighboring intervals have the same slope at their common node.
+    end_slopes = lax.stop_gradient(jnp.concatenate([slopes[..., :1], slopes[..., -1:]], -1))
+    inner_slopes = evaluate(start[..., 1:], 1)
+    all_slopes = jnp.concatenate([end_slopes[..., :1], inner_slopes, end_slopes[..., 1:]], -1)
+    is_rising = all_slopes > 0.0
+    locations = find_roots(1, start, end, is_rising[..., :-1])
     extremum_values = jnp.sum(coefficients[..., None, :] * _evaluate_powers(locations), -1)
     starts = (jnp.cumsum(durations) - durations)[:, None] + durations[:, None] * _BOUNDARIES[:-1]
     times = starts[..., None] + 0.5 * (locations + 1.0) * lengths[..., None]

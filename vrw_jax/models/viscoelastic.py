@@ -26,6 +26,7 @@ from vrw_jax.base.checks import check_bool
 from vrw_jax.base.elementwise import approximate_power, compute_sine_cosine
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.integrate import divide_equally, integrate_batch_phase, sample_batch_phase
@@ -160,7 +161,7 @@ class ViscoelasticWheel(AbstractWheel):
         self,
         params: WheelParams,
         x: SectionState,
-        step: StepResult,
+        step: StepResult | None,
         options: StepOptions,
         measures: Sequence[Measure] | None = None,
     ) -> dict[str, Array]:
@@ -320,8 +321,8 @@ def _compile_part_sampling(stop_at_lift_off: bool) -> Callable:
 
     def refuse(*_: Any) -> Any:
         raise NotImplementedError(
-            "force peaks and own measures of legs that declare kinks have first derivatives only: "
-            "take differences of their gradients."
+            "force peaks, and own measures of a step that are not those of a collocated gait, have "
+            "first derivatives only: take differences of their gradients."
         )
 
     sample_lane_parts = functools.partial(_sample_lane_parts, stop_at_lift_off)
@@ -439,11 +440,17 @@ def _sample_lane_parts(
     sequence, tableau = _run_lane_phases(
         stop_at_lift_off, False, params, x, options, MAX_LOGGED_KINKS
     )
-    return tuple(
+    parts_by_phase = (
         _sample_parts_of_phase(tableau, options, *phase_and_ends)
         for phase_and_ends in zip(
             sequence.phases, sequence.phase_start_states, sequence.phase_end_results, strict=True
         )
+    )
+    # A step that the solver does not finish has no measures, as if it had too many kinks.
+    is_lost = sequence.outcome == Outcome.SOLVER_FAILED
+    return tuple(
+        parts._replace(n_kinks=jnp.where(is_lost, 1 + MAX_LOGGED_KINKS, parts.n_kinks))
+        for parts in parts_by_phase
     )
 
 
