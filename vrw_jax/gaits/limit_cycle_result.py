@@ -27,13 +27,12 @@ from vrw_jax.gaits.collocation_search import (
     CollocationState,
     CollocationSystem,
 )
-from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.cycle import AbstractCycle, average_own_measure
 from vrw_jax.gaits.derivatives import (
     SearchMissingCycles,
     attach_monodromy_derivatives,
     solve_cycle_with_derivatives,
 )
-from vrw_jax.gaits.force_peaks import measure_extremum, measure_force_peaks
 from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
@@ -44,7 +43,11 @@ from vrw_jax.gaits.slope_response import (
     make_slope_response_function,
 )
 from vrw_jax.lanes.batching import is_inside_jit
-from vrw_jax.models.step_results import DoubleSupportIndicators, Margins, SectionState
+from vrw_jax.models.step_results import (
+    DoubleSupportIndicators,
+    Margins,
+    SectionState,
+)
 from vrw_jax.models.stepping import step
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
@@ -98,7 +101,7 @@ class LimitCycle(AbstractCycle):
 
     @property
     def step_ends(self) -> Array:
-        return jnp.asarray(self.collocation_state.gait_step_end_states)
+        return jnp.asarray(self.collocation_state.gait_step_end_states)[..., jnp.array([0, 2, 3])]
 
     @property
     def warm_start(self) -> CollocationState:
@@ -199,15 +202,16 @@ class LimitCycle(AbstractCycle):
         )
 
     def _evaluate_own_measure(self, measure: Measure) -> Array:
+        if measure.phases and measure.reduction in ("min", "max"):
+            average = functools.partial(average_own_measure, measure, StepOptions())
+            return self.map_over_batch_axes(average)(*self._wheel_and_start, self.step_ends)
+
         def make_evaluate(system: CollocationSystem) -> Callable:
             return lambda parameters, state, section_state: evaluate_own_measure(
                 measure, system, self.model, parameters, state.solution, section_state
             )
 
         return self._evaluate_on_mesh(make_evaluate, self.section_state)
-
-    def _locate_force_peaks(self) -> dict[str, Array]:
-        return self._evaluate_on_mesh(lambda system: functools.partial(measure_force_peaks, system))
 
     @property
     def margins(self) -> Margins:
@@ -221,10 +225,21 @@ class LimitCycle(AbstractCycle):
 
     @property
     def searched_wheel(self) -> tuple[ViscoelasticWheel, WheelParams]:
+        return self.model, self._make_wheel(self.searched_parameters)
+
+    def _make_wheel(self, parameters: Array) -> WheelParams:
         # A single wheel outside its domain would raise an error, and a batch of one does not.
-        parameters = jnp.moveaxis(self.searched_parameters, -1, 0)[..., None]
-        wheels = self.system.make_wheel(parameters)
-        return self.model, jax.tree.map(lambda x: x[..., 0], wheels)
+        wheels = self.system.make_wheel(jnp.moveaxis(parameters, -1, 0)[..., None])
+        return jax.tree.map(lambda x: x[..., 0], wheels)
+
+    @property
+    def _wheel_and_start(self) -> tuple[ViscoelasticWheel, WheelParams, Array]:
+        # Without a gait, the wheel is that in Table 1. Its step has finite derivatives, which are
+        # multiplied by zero, from a start that is not zero.
+        params = self._make_wheel(self.parameters)
+        default_start = self.model.compute_default_start(params)
+        start = jnp.where(self.found[..., None], self.section_state, default_start)
+        return self.model, params, start
 
     @property
     def ending(self) -> Any:
@@ -277,8 +292,6 @@ def evaluate_own_measure(
     phase_names = [phase.phase_name for phase in PAPER_PHASES]
     for name in measure.phases:
         require_known_name(name, phase_names, "phase")
-    if measure.reduction in ("min", "max"):
-        return measure_extremum(system, parameters, solution, measure)
     indices, values = [phase_names.index(name) for name in measure.phases], []
     for k, points in enumerate(system.evaluate_phase_points(parameters, solution)):
         params = system.make_wheel(parameters, k)
