@@ -19,7 +19,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, lanes
-from vrw_jax.gaits import floquet, solve_fixed_point_implicit
+from vrw_jax.gaits import floquet
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
 
 TIGHT_OPTIONS = vrw.CycleOptions.tight()
@@ -653,8 +653,10 @@ def test_multipliers_of_a_fixed_point_are_the_eigenvalues_of_its_jacobian(n):
 
 
 def test_a_fixed_point_moves_without_second_derivatives_of_its_map():
-    """Of the same map: its point to third order, its multiplier's derivative is told as unknown."""
-    compute_found = lambda a: solve_fixed_point_implicit(lambda x: a - x**2, jnp.asarray([0.5]))
+    """Its point has derivatives to third order; that of its multiplier is NaN."""
+    compute_found = lambda a: vrw.solve_fixed_point(
+        lambda x: a - x**2, jnp.asarray([0.5]), differentiates_jacobian=False
+    )
     point, a = lambda a: compute_found(a).x[0], 0.7
     root = math.sqrt(1.0 + 4.0 * a)
     expected = [(root - 1.0) / 2.0, 1.0 / root, -2.0 / root**3, 12.0 / root**5]

@@ -28,10 +28,11 @@ from vrw_jax.flow.hybrid_system import (
     compile_simulation,
 )
 from vrw_jax.flow.segments import _integrate_flow_segments, _multiply_event_determinants
-from vrw_jax.gaits.collocation_search import CollocationSystem, run_search_attempts
+from vrw_jax.gaits.collocation_search import run_search_attempts
 from vrw_jax.gaits.derivatives import _compute_collocation_tangents
 from vrw_jax.gaits.fixed_points import _find_fixed_point_of_iterate
 from vrw_jax.gaits.limit_cycle_result import solve_limit_cycle
+from vrw_jax.gaits.phase_sequence import CollocationSystem
 from vrw_jax.gaits.walker_finder import _find_gaits
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.models.contact_kernel import run_walks

@@ -24,6 +24,7 @@ from vrw_jax.gaits.floquet import (
     MAX_CLOSED_FORM_SIZE,
     MIN_IMAGINARY_PART,
     UNIT_CIRCLE_DISTANCE,
+    compute_multipliers,
     list_jury_margins,
 )
 
@@ -80,14 +81,6 @@ def evaluate_bifurcations(jacobians: np.ndarray) -> dict[str, np.ndarray]:
         np.prod(1.0 - multipliers[..., first] * multipliers[..., second], -1).real,
     ]
     return dict(zip(BIFURCATIONS, margins, strict=True))
-
-
-def compute_multipliers(jacobians: np.ndarray) -> np.ndarray:
-    """Return the multipliers in the order of decreasing modulus, NaN if a matrix is not finite."""
-    is_finite = np.isfinite(jacobians).all((-1, -2))[..., None]
-    multipliers = np.linalg.eigvals(np.where(is_finite[..., None], jacobians, 0.0))
-    order = np.argsort(-np.abs(multipliers), -1, kind="stable")
-    return np.where(is_finite, np.take_along_axis(multipliers, order, -1), np.nan)
 
 
 def has_unit_circle_pair(jacobian: np.ndarray) -> bool:

@@ -22,9 +22,9 @@ from vrw_jax.branches.branch import (
     FOLD,
     FixedPoint,
     TestFunction,
-    compute_multipliers,
     evaluate_bifurcations,
 )
+from vrw_jax.gaits.floquet import compute_multipliers
 from vrw_jax.lanes.batching import select_tree_rows
 
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()

@@ -34,11 +34,11 @@ from vrw_jax.branches.arclength import (
 )
 from vrw_jax.branches.branch import BIFURCATIONS, TestFunction
 from vrw_jax.branches.branch_continuation import BORDER_COLLISION, EVENT_ORDER, EVENT_ORDER_CHANGE
-from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem
 from vrw_jax.gaits.cycle import average_own_measure, locate_force_peaks
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.limit_cycle_result import land_foot
 from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows

@@ -31,9 +31,9 @@ from vrw_jax.branches.continuation_problems import (
     SECOND_PEAK_RATE_NAME,
     BranchWheel,
 )
-from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration
 from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.gaits.phase_sequence import CollocationSystem
 from vrw_jax.models.measures import MARGIN_MEASURES
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.params import Symbols

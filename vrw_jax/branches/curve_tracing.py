@@ -43,9 +43,9 @@ from vrw_jax.branches.curve_problems import (
     locate_jump_onset,
     select_test_quantity,
 )
-from vrw_jax.gaits.collocation_search import CollocationSystem
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.gaits.phase_sequence import CollocationSystem
 from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
 from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

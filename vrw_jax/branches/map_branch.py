@@ -48,7 +48,6 @@ from vrw_jax.branches.branch import (
     Branch,
     SpecialPoint,
     TestFunction,
-    compute_multipliers,
 )
 from vrw_jax.branches.branch_continuation import (
     ADMISSIBILITY,
@@ -73,6 +72,7 @@ from vrw_jax.gaits.fixed_points import (
     count_unit_multipliers,
     estimate_state_units,
 )
+from vrw_jax.gaits.floquet import compute_multipliers
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits, parameterize_walker
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 from vrw_jax.models.measures import make_labeled_variables

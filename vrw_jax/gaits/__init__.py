@@ -3,7 +3,6 @@
 from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS
 from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE, confirm_outcome_by_step
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.fixed_points import solve_fixed_point_implicit
 from vrw_jax.gaits.force_peaks import SAMPLED_FORCE_PEAK_MEASURES
 from vrw_jax.gaits.gait_walks import find_attracting_gaits
 from vrw_jax.gaits.gauss import END_WEIGHTS, GAUSS_NODES, INTEGRATION_MATRIX, N_GAUSS_NODES

@@ -14,11 +14,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.options import StepOptions
-from vrw_jax.gaits.collocation_search import (
-    CollocationState,
-    CollocationSystem,
-    predict_start_from_gait_surface,
-)
+from vrw_jax.gaits.collocation_search import predict_start_from_gait_surface
 from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.gaits.derivatives import SearchMissingCycles, attach_derivatives
 from vrw_jax.gaits.finder import (
@@ -36,10 +32,10 @@ from vrw_jax.gaits.limit_cycle_result import (
     solve_limit_cycle,
 )
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
 from vrw_jax.gaits.return_map_finder import (
     ReturnMapCycle,
     ReturnMapFinder,
-    find_return_map_cycle,
 )
 from vrw_jax.gaits.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
@@ -320,14 +316,13 @@ class KinkedGaitFinder(ReturnMapFinder):
         if measure_name in CollocationFinder.default_measures
     )
     cycle_options: CycleOptions = eqx.field(static=True, default_factory=CycleOptions)
+    # Derivatives of the Jacobian would need second derivatives, which compile slowly.
+    differentiates_jacobian: ClassVar[bool] = False
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
         if cycle_guess is None:
             cycle_guess = self._find_start(lax.stop_gradient(params))
-        # The derivative of Newton's method would need second derivatives, which compile slowly.
-        return find_return_map_cycle(
-            *self.prepare_search(params, cycle_guess), self.period_n, uses_implicit_jvp=True
-        )
+        return super().find_cycle(params, cycle_guess)
 
     def _find_start(self, params: WheelParams) -> Array:
         """Return the section state of a gait on a mesh, or of a walk if there is none."""

@@ -284,9 +284,11 @@ class AbstractCycle(AbstractPrintable):
             for measure, name in zip(measure_names, name_measures(measure_names), strict=True)
         }
 
-    @abc.abstractmethod
     def _evaluate_own_measure(self, measure: Measure) -> Array:
         """Return the value of a measure of the user, which is undefined without a gait."""
+        average = functools.partial(average_own_measure, measure, StepOptions())
+        steps = getattr(self, "steps", None)
+        return self.map_over_batch_axes(average)(*self._wheel_and_start, self.step_ends, steps)
 
     @property
     def force_peaks(self) -> dict[str, Array]:
@@ -370,17 +372,19 @@ def average_own_measure(
     params: WheelParams,
     section_state: Array,
     step_ends: Array,
-    steps: Any = None,
+    steps: Any,
 ) -> Array:
     """Return a measure of the user, as the mean over the steps of a cycle.
 
     - `section_state`, `step_ends`: as in `locate_force_peaks`;
-    - `steps`: gait steps of the cycle, on a leading axis. A measure of phases needs none.
+    - `steps`: gait steps of the cycle on a leading axis, or None if they are not known.
     """
     values = []
     for k in range(len(step_ends)):
-        step = jax.tree.map(lambda x, k=k: x[k], steps)
         step_params = model.select_params(params, k)
+        step = jax.tree.map(lambda x, k=k: x[k], steps)
+        if steps is None and not measure.phases:
+            step = model.take_step(step_params, section_state, options)
         values.append(model.measure_step(step_params, section_state, step, options, (measure,)))
         section_state = step_ends[k]
     return jnp.mean(jnp.stack([value[measure.name] for value in values]), 0)
@@ -392,7 +396,7 @@ def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str
     The multipliers are in the order of decreasing modulus. If multipliers are zero to five digits,
     the text contains only their number.
     """
-    floquet_multipliers = sorted(np.linalg.eigvals(monodromy_matrix), key=abs, reverse=True)
+    floquet_multipliers = floquet.compute_multipliers(monodromy_matrix)
     multiplier_texts = [
         f"{multiplier:.5f}" if multiplier.imag else f"{multiplier.real:.5f}"
         for multiplier in floquet_multipliers

@@ -17,16 +17,18 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.gaits.collocation_search import (
-    CollocationState,
-    CollocationSystem,
     CycleSearchResult,
-    LaneParameters,
     init_search_result,
-    pad_with_zeros,
     run_search_attempts,
     search_all_attempts,
 )
 from vrw_jax.gaits.phase_collocation import CollocationSolution
+from vrw_jax.gaits.phase_sequence import (
+    CollocationState,
+    CollocationSystem,
+    LaneParameters,
+    pad_with_zeros,
+)
 from vrw_jax.lanes.autodiff import (
     ExecutionWrapper,
     apply_jacobian,

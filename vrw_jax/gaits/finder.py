@@ -319,7 +319,7 @@ class AbstractGaitFinder(eqx.Module):
 
         A step depends on the slopes of two successive lines of the ground.
         """
-        return _compute_step_slope_response(
+        return compute_step_slope_response(
             self.model, params, cycle.section_state, tuple(measure_names), self.step_options
         )
 
@@ -347,9 +347,6 @@ class AbstractGaitFinder(eqx.Module):
             if isinstance(measure_name, Measure) or measure_name in cls.cycle_measures
             else step.measures()[measure_name]
         )
-
-
-_compute_step_slope_response = eqx.filter_jit(compute_step_slope_response)
 
 
 class GaitMeasures(NamedTuple):

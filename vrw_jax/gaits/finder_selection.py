@@ -13,11 +13,11 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.printing import format_numbers
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.gaits.collocation_finder import CollocationFinder, KinkedGaitFinder
-from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder import AbstractGaitFinder
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.phase_sequence import CollocationState
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
 from vrw_jax.gaits.walker_finder import (

@@ -20,7 +20,11 @@ from vrw_jax.base.printing import (
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.hybrid_simulation import ReturnMap, Termination
-from vrw_jax.gaits.floquet import UNIT_CIRCLE_DISTANCE, floquet_multipliers
+from vrw_jax.gaits.floquet import (
+    UNIT_CIRCLE_DISTANCE,
+    compute_multipliers,
+    floquet_multipliers,
+)
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian, make_zero_tangent
 from vrw_jax.lanes.saved_traces import get_compiled_program
 from vrw_jax.lanes.settings import with_default_jax_settings
@@ -34,8 +38,7 @@ UNIT_MULTIPLIER_ADVICE = (
 
 def count_unit_multipliers(jacobian: Float[np.ndarray, "... n n"]) -> Int[np.ndarray, "..."]:
     """Return how many multipliers are 1, up to the round-off of two equal multipliers."""
-    multipliers = np.linalg.eigvals(np.where(np.isfinite(jacobian), jacobian, 0.0))
-    is_unit_multiplier = np.abs(multipliers - 1.0) < UNIT_CIRCLE_DISTANCE
+    is_unit_multiplier = np.abs(compute_multipliers(jacobian) - 1.0) < UNIT_CIRCLE_DISTANCE
     return np.asarray(is_unit_multiplier.sum(-1))
 
 
@@ -110,14 +113,11 @@ class FixedPointResult(NamedTuple):
     def __repr__(self) -> str:
         if isinstance(self.x, jax.core.Tracer) or np.ndim(self.x) != 1:
             return f"FixedPointResult{tuple(self)}"
-        multipliers = np.full(len(self.x), np.nan)
-        if np.all(np.isfinite(self.jacobian)):
-            multipliers = np.linalg.eigvals(self.jacobian)
         text_rows = [
             ("converged", f"{bool(self.converged)}, after {int(self.n_iterations)} iterations"),
             ("x", format_numbers(self.x)),
             ("residual", format_quantity(self.residual, "")),
-            ("multipliers", format_numbers(multipliers)),
+            ("multipliers", format_numbers(compute_multipliers(np.asarray(self.jacobian)))),
         ]
         if self.termination is not None:
             text_rows.append(("simulation", Termination(int(self.termination)).meaning))
@@ -154,6 +154,8 @@ def solve_fixed_point(
     units: Any = None,
     max_iterations: int = MAX_NEWTON_ITERATIONS,
     invariants: Sequence[Callable[[Array], Array]] = (),
+    max_residual: float | Scalar = MAX_RESIDUAL,
+    differentiates_jacobian: bool = True,
 ) -> FixedPointResult:
     """Find a fixed point of `function` applied `period_n` times, by Newton's method.
 
@@ -177,6 +179,10 @@ def solve_fixed_point(
             conserve them, the search does not converge. Derivatives are those along this curve: by
             a value that breaks the conservation there are none, and what is returned is no
             derivative.
+        max_residual: with `invariants`, largest change of a fixed point by the map, relative to
+            the size of the state.
+        differentiates_jacobian: whether the Jacobian has derivatives. If not, they are NaN, and a
+            map whose second derivatives are expensive is differentiated once.
 
     Returns:
         A `FixedPointResult`: the state, its multipliers, and the status of the iteration.
@@ -189,22 +195,33 @@ def solve_fixed_point(
         >>> print(f"{result.x[0]:.6f} {bool(result.converged)}")
         0.739085 True
     """
+    check_callable("function", function, "that maps a state to the next")
+    start, period_n = check_reals("start", start), check_int("period_n", period_n)
+    max_iterations = check_int("max_iterations", max_iterations)
+    start = lax.stop_gradient(start)
+    check_vector_map(function, "start", start)
+    if isinstance(tolerance, jax.Array):
+        tolerance = check_reals("tolerance", tolerance)
+    else:
+        check_positive("tolerance", tolerance)
 
-    fixed_point = solve_fixed_point_implicit(
-        function,
-        start,
-        period_n=period_n,
-        tolerance=tolerance,
-        units=units,
-        max_iterations=max_iterations,
-        invariants=invariants,
-        differentiates_jacobian=True,
+    tolerance, max_residual = lax.stop_gradient(
+        [jnp.asarray(x, start.dtype) for x in (tolerance, max_residual)]
     )
-    if isinstance(function, ReturnMap):
-        fixed_point = fixed_point._replace(
-            termination=function.find_termination(fixed_point.x, period_n)
-        )
-    return fixed_point
+    # A unit of 0 is replaced by the size of the component.
+    units = jnp.zeros_like(start) if units is None else check_state_units(units, start)
+    newton_configuration = (
+        function, period_n, tuple(invariants), max_iterations, differentiates_jacobian,
+    )  # fmt: skip
+    find_fixed_point: Any = functools.partial(_find_fixed_point_of_iterate, newton_configuration)
+    arguments = start, tolerance, max_residual, units
+    if not isinstance(function, ReturnMap):
+        return find_fixed_point(*arguments)
+    compiled_program = get_compiled_program(
+        _find_fixed_point_of_iterate, newton_configuration, *arguments
+    )
+    fixed_point = (compiled_program or find_fixed_point)(*arguments)
+    return fixed_point._replace(termination=function.find_termination(fixed_point.x, period_n))
 
 
 def check_vector_map(function: Callable, state_name: str, state: Array) -> None:
@@ -234,57 +251,6 @@ def check_state_units(units: Any, state: Float[Array, " n"]) -> Float[Array, " n
             f"number above 0, or an array of shape {state.shape}."
         )
     return jnp.broadcast_to(lax.stop_gradient(units).astype(state.dtype), state.shape)
-
-
-def solve_fixed_point_implicit(
-    function: Callable[[Array], Array],
-    start: Any,
-    *,
-    period_n: int = 1,
-    tolerance: float | Scalar = 1e-12,
-    units: Any = None,
-    max_iterations: int = MAX_NEWTON_ITERATIONS,
-    invariants: Sequence[Callable[[Array], Array]] = (),
-    max_residual: float | Scalar = MAX_RESIDUAL,
-    differentiates_jacobian: bool = False,
-) -> FixedPointResult:
-    """Find a fixed point of a map whose second derivatives are expensive.
-
-    The other arguments are those of `solve_fixed_point`. With `invariants`, a state is a fixed
-    point only if its image differs by at most `max_residual` times the size of the state.
-    Derivatives of order n of the fixed point require only derivatives of order n of `function`.
-    Derivatives of the Jacobian are NaN, unless `differentiates_jacobian` is true.
-    """
-    check_callable("function", function, "that maps a state to the next")
-    start, period_n = check_reals("start", start), check_int("period_n", period_n)
-    max_iterations = check_int("max_iterations", max_iterations)
-    start = lax.stop_gradient(start)
-    check_vector_map(function, "start", start)
-    if isinstance(tolerance, jax.Array):
-        tolerance = check_reals("tolerance", tolerance)
-    else:
-        check_positive("tolerance", tolerance)
-
-    tolerance, max_residual = lax.stop_gradient(
-        [jnp.asarray(x, start.dtype) for x in (tolerance, max_residual)]
-    )
-    # A unit of 0 is replaced by the size of the component.
-    units = jnp.zeros_like(start) if units is None else check_state_units(units, start)
-    newton_configuration = (
-        function, period_n, tuple(invariants), max_iterations, differentiates_jacobian,
-    )  # fmt: skip
-    find_fixed_point = functools.partial(_find_fixed_point_of_iterate, newton_configuration)
-    compiled_program = None
-    if isinstance(function, ReturnMap):
-        compiled_program = get_compiled_program(
-            _find_fixed_point_of_iterate,
-            newton_configuration,
-            start,
-            tolerance,
-            max_residual,
-            units,
-        )
-    return (compiled_program or find_fixed_point)(start, tolerance, max_residual, units)
 
 
 def _find_fixed_point_of_iterate(

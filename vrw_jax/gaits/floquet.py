@@ -203,6 +203,17 @@ def _sort_eigenvalues_by_modulus(eigenvalues: Array) -> Array:
     return jnp.take_along_axis(eigenvalues, descending_order, -1)
 
 
+def compute_multipliers(jacobians: np.ndarray) -> np.ndarray:
+    """Return the multipliers of NumPy matrices in the order of decreasing modulus, by LAPACK.
+
+    They are NaN if a matrix is not finite.
+    """
+    is_finite = np.isfinite(jacobians).all((-1, -2))[..., None]
+    multipliers = np.linalg.eigvals(np.where(is_finite[..., None], jacobians, 0.0))
+    order = np.argsort(-np.abs(multipliers), -1, kind="stable")
+    return np.where(is_finite, np.take_along_axis(multipliers, order, -1), np.nan)
+
+
 @jax.jit
 def compute_spectral_radius(matrix: RealSquareMatrix) -> Float[Array, "..."]:
     """Return the largest modulus of the eigenvalues of `matrix`.

@@ -15,7 +15,6 @@ import numpy as np
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_finder import CollocationFinder
-from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.cycle import RETRY_OUTCOMES
 from vrw_jax.gaits.gait_walks import (
     MAX_NEWTON_START_DEFECT,
@@ -26,6 +25,7 @@ from vrw_jax.gaits.gait_walks import (
     walk_to_gaits,
 )
 from vrw_jax.gaits.limit_cycle_result import transfer_solution_to_mesh
+from vrw_jax.gaits.phase_sequence import CollocationState
 from vrw_jax.lanes.batching import concatenate_tree_rows, map_in_batches, select_tree_rows
 from vrw_jax.models.step_batch import SolverIndex, select_cheapest_solver
 from vrw_jax.wheel.params import WheelParams

@@ -31,11 +31,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
 from vrw_jax.gaits.collocation_finder import CollocationFinder
-from vrw_jax.gaits.collocation_search import (
-    CollocationState,
-    CollocationSystem,
-    CycleSearchResult,
-)
+from vrw_jax.gaits.collocation_search import CycleSearchResult
 from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES, replace_by_nan
 from vrw_jax.gaits.finder_selection import (
     UserCycleGuess,
@@ -52,6 +48,7 @@ from vrw_jax.gaits.gait_walks import find_attracting_gaits, find_slowest_gait_in
 from vrw_jax.gaits.last_gait import describe_last_gait
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
 from vrw_jax.lanes.batching import (

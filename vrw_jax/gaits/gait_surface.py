@@ -12,7 +12,6 @@ import functools
 import importlib.resources
 import itertools
 import operator
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,26 +28,16 @@ GAIT_SURFACE_DEGREE = 3
 """Degree of the polynomials whose coefficients are stored."""
 
 
-class GaitSurface(NamedTuple):
-    """Polynomial coefficients of the gait surface, and the ranges of its coordinates.
-
-    The coefficients have the shape (monomials, unknowns). The polynomials are functions of the
-    centered coordinates.
-    """
-
-    centre: np.ndarray
-    spread: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    coefficients: np.ndarray
-
-
 @functools.cache
-def load_gait_surface() -> GaitSurface:
-    """Load the gait surface from the file `surface.npz` in this package."""
+def load_gait_surface() -> dict[str, np.ndarray]:
+    """Load the gait surface from the file `surface.npz` in this package.
+
+    The arrays are the center, half range and limits of each coordinate, and the coefficients of
+    the polynomials of the centered coordinates, of shape (monomials, unknowns).
+    """
     surface_file = importlib.resources.files(__package__) / "surface.npz"
     with surface_file.open("rb") as surface_stream, np.load(surface_stream) as stored_arrays:
-        return GaitSurface(**{name: stored_arrays[name] for name in GaitSurface._fields})
+        return dict(stored_arrays)
 
 
 def compute_time_unit(params: WheelParams) -> Elementwise:
@@ -92,7 +81,9 @@ def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> Co
     """
     gait_surface = load_gait_surface()
     # Python floats do not change the dtype of the parameters.
-    coordinate_ranges = (surface_coordinate.tolist() for surface_coordinate in gait_surface[:4])
+    coordinate_ranges = (
+        gait_surface[name].tolist() for name in ("centre", "spread", "lower", "upper")
+    )
     centered_surface_coordinates = tuple(
         (jnp.clip(surface_coordinate, lower_bound, upper_bound) - coordinate_center) / half_range
         for surface_coordinate, coordinate_center, half_range, lower_bound, upper_bound in zip(
@@ -101,7 +92,7 @@ def predict_gait(params: WheelParams, phase_meshes: tuple[PhaseMesh, ...]) -> Co
     )
     monomials = jnp.stack(evaluate_monomials(centered_surface_coordinates))
     predicted_surface_values = jnp.tensordot(
-        jnp.asarray(gait_surface.coefficients.T, monomials.dtype), monomials, 1
+        jnp.asarray(gait_surface["coefficients"].T, monomials.dtype), monomials, 1
     )
     time_unit = compute_time_unit(params)
     section_state = jnp.stack(

@@ -169,6 +169,7 @@ MAX_NEWTON_START_DEFECT = 0.1
 
 StartFunction = Callable[[WheelParams], np.ndarray]
 """Function that maps wheels to section states, shape (starts, wheels, 3)."""
+START_FUNCTIONS: tuple[StartFunction, ...] = compute_walk_starts, compute_fallback_walk_starts
 
 
 def walk_to_gaits(
@@ -297,10 +298,7 @@ treated as equal.
 def find_attracting_gaits(
     gait_finder: Any,
     parameter_values: Any,
-    start_functions: tuple[StartFunction, ...] = (
-        compute_walk_starts,
-        compute_fallback_walk_starts,
-    ),
+    start_functions: tuple[StartFunction, ...] = START_FUNCTIONS,
 ) -> tuple[np.ndarray, Any]:
     """Find the attracting gaits of each wheel, in the order of increasing speed.
 
@@ -393,17 +391,12 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
     If the walk reaches no gait, the slowest attracting gait is returned. The two gaits are equal
     for each of 1,200 random wheels.
     """
-    values = np.asarray(parameter_values)
     slow_start = lambda params: compute_walk_starts(params)[:1]
-    _, slow_gaits = _find_gaits_from_starts(gait_finder, values, slow_start)
-    missing = np.flatnonzero(np.asarray(slow_gaits.outcome) != Outcome.STEPPED)
-    if not len(missing):
-        return slow_gaits
-    # A wheel without a gait has the failure of the walks from all starts.
-    wheels, gaits = find_attracting_gaits(gait_finder, values[missing])
-    rows = np.arange(len(values))
-    rows[missing] = len(values) + find_slowest_gait_indices(wheels, len(missing))
-    return select_rows_on_device(concatenate_tree_rows(slow_gaits, gaits), rows)
+    wheels, gaits = find_attracting_gaits(
+        gait_finder, parameter_values, (slow_start, *START_FUNCTIONS)
+    )
+    slowest = find_slowest_gait_indices(wheels, len(parameter_values))
+    return select_rows_on_device(gaits, slowest)
 
 
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:

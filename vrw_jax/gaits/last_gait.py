@@ -15,6 +15,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_finder import CollocationFinder
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.floquet import compute_multipliers
 from vrw_jax.gaits.further_search import MESH_DOUBLINGS
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
@@ -118,7 +119,7 @@ def _describe_failing_quantity(
     If no quantity does so, the sentence states the largest multiplier. Gaits merge and vanish where
     a multiplier is 1.
     """
-    multiplier = max(np.linalg.eigvals(last_gait.monodromy_value), key=abs)
+    multiplier = compute_multipliers(np.asarray(last_gait.monodromy_value))[0]
     multiplier_text = f"The largest multiplier of this gait is {multiplier:.4g}."
     check_index = int(missing_gait.collocation_state.failed_check) - 1
     quantities, first_quantities = map(_collect_lowest_quantities, (last_gait, first_gait))

@@ -7,7 +7,7 @@ cycles, in forward and reverse mode, and to any order.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -22,12 +22,8 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import LabelAndText, format_numbers
 from vrw_jax.base.types import Scalar
 from vrw_jax.gaits import floquet
-from vrw_jax.gaits.collocation_search import (
-    FAILED_MESH_CHECK_CODE,
-    CollocationState,
-    CollocationSystem,
-)
-from vrw_jax.gaits.cycle import AbstractCycle, average_own_measure
+from vrw_jax.gaits.collocation_search import FAILED_MESH_CHECK_CODE
+from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import (
     SearchMissingCycles,
     attach_monodromy_derivatives,
@@ -35,7 +31,7 @@ from vrw_jax.gaits.derivatives import (
 )
 from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
-from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS
+from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS, CollocationState, CollocationSystem
 from vrw_jax.gaits.slope_response import (
     COLLOCATION_RESPONSE_MEASURES,
     SlopeResponse,
@@ -202,16 +198,15 @@ class LimitCycle(AbstractCycle):
         )
 
     def _evaluate_own_measure(self, measure: Measure) -> Array:
-        if measure.phases and measure.reduction in ("min", "max"):
-            average = functools.partial(average_own_measure, measure, StepOptions())
-            return self.map_over_batch_axes(average)(*self._wheel_and_start, self.step_ends)
+        if not measure.phases or measure.reduction in ("min", "max"):
+            return super()._evaluate_own_measure(measure)
 
         def make_evaluate(system: CollocationSystem) -> Callable:
-            return lambda parameters, state, section_state: evaluate_own_measure(
-                measure, system, self.model, parameters, state.solution, section_state
+            return lambda parameters, state: integrate_own_measure(
+                measure, system, parameters, state.solution
             )
 
-        return self._evaluate_on_mesh(make_evaluate, self.section_state)
+        return self._evaluate_on_mesh(make_evaluate)
 
     @property
     def margins(self) -> Margins:
@@ -268,27 +263,17 @@ class LimitCycle(AbstractCycle):
 
 
 @eqx.filter_jit
-def evaluate_own_measure(
+def integrate_own_measure(
     measure: Measure,
     system: CollocationSystem,
-    model: ViscoelasticWheel,
     parameters: Array,
     solution: CollocationSolution,
-    section_state: Array,
 ) -> Array:
-    """Return a measure of the user, as the mean over the gait steps.
+    """Return an integral or a mean over phases, as the mean over the gait steps.
 
     The Gauss nodes of a phase integrate a function of its motion as accurately as the collocation
     integrates the motion: both have order 8.
     """
-    params = system.make_wheel(parameters)
-    if not measure.phases:
-        if system.period_n > 1:
-            raise ValueError(
-                f"{measure.name} is a function of a step, but the cycle has {system.period_n}: "
-                "give it a phase, or compute the steps by vrw.walk."
-            )
-        return jnp.asarray(measure(step(params, section_state, model=model), params))
     phase_names = [phase.phase_name for phase in PAPER_PHASES]
     for name in measure.phases:
         require_known_name(name, phase_names, "phase")
@@ -407,17 +392,6 @@ def _solve_limit_cycle(
 _solve_limit_cycle_compiled = eqx.filter_jit(_solve_limit_cycle)
 
 
-class WalkSamples(NamedTuple):
-    """Samples in time of an event-driven walk, from which a guess of a cycle is computed on any
-    mesh.
-    """
-
-    post_impact: Float[Array, "2"]  # (theta, dtheta) after the first landing
-    landing_distances: Float[Array, " n"]  # distance between the feet at each landing, m
-    phase_durations: Float[Array, "n 3"]
-    sampled_states: Float[Array, "n 3 n_samples 6"]  # theta, L1, L2 and their rates in each phase
-
-
 def land_foot(wheel_symbols: Any, section_state: SectionState) -> Array:
     """Return (theta, dtheta) after the landing that follows a section state."""
     landing_result = transitions.resolve_landing(wheel_symbols, *section_state)
@@ -431,8 +405,12 @@ def sample_walk_in_time(
     section_state: SectionState,
     n_steps: int,
     n_samples: int = 1025,
-) -> WalkSamples:
+) -> tuple[Array, Array, Array, Array]:
     """Sample `n_steps` event-driven gait steps in time, starting from a section state.
+
+    Return (theta, dtheta) after the first landing, the distance between the feet at each landing,
+    the durations of phases (n, 3), and theta, L1, L2 and their rates in each phase, shape
+    (n, 3, n_samples, 6). A guess of a cycle on any mesh follows from them.
 
     - `n_samples`: number of samples per phase. The value is chosen because few samples miss the
       fast start of a gait step without double support. Newton's method then fails, for example with
@@ -453,12 +431,12 @@ def sample_walk_in_time(
         return step_trajectory.section_state, step_samples
 
     _, step_samples = lax.scan(sample_next_step, section_state, jnp.arange(n_steps))
-    return WalkSamples(post_impact_state, *step_samples)
+    return post_impact_state, *step_samples
 
 
 @eqx.filter_jit
 def guess_cycle_from_walk(
-    collocation_system: CollocationSystem, params: WheelParams, walk_samples: WalkSamples
+    collocation_system: CollocationSystem, params: WheelParams, walk_samples: tuple[Array, ...]
 ) -> CollocationState:
     """Compute the guess of a cycle from the samples of a walk with `period_n` gait steps."""
 
@@ -489,17 +467,12 @@ def guess_cycle_from_walk(
             )
         return tuple(accelerations_by_phase)
 
-    is_phase_active = (walk_samples.phase_durations > 0.0).astype(
-        walk_samples.phase_durations.dtype
-    )
+    post_impact, landing_distances, durations, sampled_states = walk_samples
+    is_phase_active = (durations > 0.0).astype(durations.dtype)
     phase_accelerations = jax.vmap(sample_node_accelerations)(
-        walk_samples.landing_distances,
-        walk_samples.sampled_states,
-        jnp.arange(collocation_system.period_n),
+        landing_distances, sampled_states, jnp.arange(collocation_system.period_n)
     )
-    guessed_solution = CollocationSolution(
-        walk_samples.post_impact, walk_samples.phase_durations, phase_accelerations
-    )
+    guessed_solution = CollocationSolution(post_impact, durations, phase_accelerations)
     return lax.stop_gradient(CollocationState.make_start(guessed_solution, is_phase_active))
 
 

@@ -684,17 +684,15 @@ class _LinearizationContext(NamedTuple):
 
 
 def linearize_steps(
-    phase_sequence: PhaseSequence,
-    phase_meshes: tuple[PhaseMesh, ...],
-    compute_phase_constants: Callable[..., PhaseConstants],
+    system: Any,
     parameters: LaneArray,
     trial_solution: CollocationSolution,
-    is_phase_active: Bool[Array, "n n_phases lanes"],
+    is_phase_active: LaneArray,
     parameter_indices: tuple[int, ...],
 ) -> tuple[tuple, tuple]:
-    """Linearize the equations of gait steps at `trial_solution`.
+    """Linearize the equations of gait steps of a `CollocationSystem` at `trial_solution`.
 
-    A phase is inactive if `is_phase_active` is False. Its duration is 0 s, and only its reset is
+    A phase is inactive if `is_phase_active` is 0. Its duration is 0 s, and only its reset is
     applied. `parameter_indices` selects the parameters to which the parameter tangents belong.
 
     Return the section state at the end and its tangents. The states at the ends of the steps
@@ -706,7 +704,7 @@ def linearize_steps(
     if parameter_indices:
         unit_tangents = np.eye(len(parameters), dtype=float_dtype)[list(parameter_indices)]
         phase_constants, phase_constants_tangents = evaluate_with_jvps(
-            compute_phase_constants,
+            system.phase_constants_function,
             tuple(parameters),
             tuple(
                 jnp.broadcast_to(x[:, None], (len(parameter_indices), *parameters.shape[1:]))
@@ -714,13 +712,13 @@ def linearize_steps(
             ),
         )
     else:
-        phase_constants = compute_phase_constants(*parameters)
+        phase_constants = system.phase_constants_function(*parameters)
     context = _LinearizationContext(
-        phase_sequence,
-        phase_meshes,
+        system.phase_sequence,
+        system.phase_meshes,
         parameter_indices,
         parameters,
-        compute_phase_constants,
+        system.phase_constants_function,
         phase_constants,
         phase_constants_tangents,
         make_fusion_barrier(parameters),
@@ -731,8 +729,8 @@ def linearize_steps(
     step_inputs = (
         trial_solution.durations,
         trial_solution.accelerations,
-        is_phase_active,
-        *phase_sequence.list_parities(len(trial_solution.durations), float_dtype),
+        is_phase_active > 0.5,
+        *system.phase_sequence.list_parities(len(trial_solution.durations), float_dtype),
     )
     if len(trial_solution.durations) > 1:
         return lax.scan(context.linearize_gait_step, start, step_inputs)
@@ -801,8 +799,7 @@ class PhasePoints(NamedTuple):
 
 
 def reconstruct_gait_step(
-    phase_sequence: PhaseSequence,
-    phase_meshes: tuple[PhaseMesh, ...],
+    system: Any,
     phase_constants: PhaseConstants,
     section_state: Vector,
     phase_durations: Array,
@@ -813,12 +810,12 @@ def reconstruct_gait_step(
     Return the section state at the end of the gait step, and the points of each phase. No equation
     is solved. Arrays may have additional trailing axes.
     """
-    phase_start_point = phase_sequence.step_start_map(phase_constants, section_state)
+    phase_start_point = system.phase_sequence.step_start_map(phase_constants, section_state)
     phase_points = []
-    for i, collocation_phase in enumerate(phase_sequence.phases):
+    for i, collocation_phase in enumerate(system.phase_sequence.phases):
         node_times, rate_integration_matrix, position_integration_matrix = (
             float64_weights.astype(phase_durations.dtype)
-            for float64_weights in build_phase_integration_matrices(phase_meshes[i])
+            for float64_weights in build_phase_integration_matrices(system.phase_meshes[i])
         )
         phase_accelerations = accelerations_by_phase[i]
         phase_accelerations = phase_accelerations.reshape(-1, *phase_accelerations.shape[2:])
@@ -845,8 +842,7 @@ def reconstruct_gait_step(
 
 
 def estimate_mesh_error(
-    phase_sequence: PhaseSequence,
-    phase_meshes: tuple[PhaseMesh, ...],
+    system: Any,
     collocation_solution: CollocationSolution,
     error_per_acceleration_jump: float = 0.05,
 ) -> LaneArray:
@@ -871,8 +867,8 @@ def estimate_mesh_error(
         lagrange_weights = compute_lagrange_weights(location_in_interval)
         return jnp.tensordot(jnp.asarray(lagrange_weights, float_dtype), accelerations, (0, 2))
 
-    for i, phase_mesh in enumerate(phase_meshes):
-        if phase_mesh.n_intervals == 1 or not phase_sequence.phases[i].is_motion_smooth:
+    for i, phase_mesh in enumerate(system.phase_meshes):
+        if phase_mesh.n_intervals == 1 or not system.phase_sequence.phases[i].is_motion_smooth:
             continue
         accelerations = collocation_solution.accelerations[i]
         acceleration_jump = interpolate_accelerations(

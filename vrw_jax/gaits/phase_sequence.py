@@ -1,4 +1,4 @@
-"""Describe the phases of the paper's model for the collocation: dynamics, end events and resets.
+"""Describe the phases of the paper's model for the collocation, and the system of a limit cycle.
 
 `make_post_impact_sequence` uses the plane section (theta+, dtheta+) just after an impact that ends
 with both feet on the ground. If double support is absent, the rear foot lifts immediately (case B3
@@ -8,20 +8,32 @@ The search therefore does not find such gaits.
 
 import functools
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jax import lax
+from jaxtyping import Array, Float
 
+from vrw_jax.base.batch_algebra import LaneArray
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.gaits.gauss import PhaseMesh
+from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration
+from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_collocation import (
     CollocationPhase,
+    CollocationSolution,
+    CycleLinearization,
     PhaseConstants,
     PhasePoint,
     PhasePoints,
     PhaseSequence,
+    close_cycle,
+    estimate_mesh_error,
+    linearize_steps,
+    reconstruct_gait_step,
 )
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.dynamics import rotate_to_rear_leg
@@ -31,7 +43,9 @@ from vrw_jax.wheel.params import (
     PARAMETER_NAMES,
     Symbols,
     WheelLaws,
+    WheelParams,
     compute_symbols,
+    make_wheel_from_parameters,
 )
 from vrw_jax.wheel.phases import PAPER_PHASES, TRANSITION_ASSUMPTIONS, Assumption, PhaseInstant
 
@@ -243,3 +257,271 @@ def make_post_impact_sequence(
         if has_alternating_legs(law_structure)
         else None,
     )
+
+
+REAR_FORCE_CHECK_CODES = tuple(
+    check_code
+    for check_code, assumption in enumerate(ADMISSIBILITY_CHECKS, 1)
+    if assumption.symbol.startswith("λ4")
+)
+EARLY_TOUCHDOWN_CHECK_CODE = 10
+"""Values of `CollocationState.failed_check` that `CollocationSystem.is_beyond_border` reads."""
+
+LaneParameters = Float[Array, "n_parameters lanes"]
+"""Parameters of each wheel (lane) as floats, in the order of `stack_parameters`."""
+
+
+def pad_with_zeros(array: Array, shape: tuple[int, ...]) -> Array:
+    """Return an array of a larger shape, with zeros after the entries of each axis."""
+    widths = [(0, m - n, 0) for m, n in zip(shape, array.shape, strict=True)]
+    return lax.pad(array, jnp.zeros((), array.dtype), widths)
+
+
+class CollocationSystem(NamedTuple):
+    """Collocation system of a limit cycle: phases, number of gait steps, and meshes.
+
+    Inside `jit`, where the mesh that a gait needs is unknown, each wheel may have one of two
+    meshes. Arrays then have the size of the fine mesh. A solution on the mesh of `coarse_options`
+    fills the first mesh intervals, and the others contain zeros.
+    """
+
+    n_legs: int
+    period_n: int
+    cycle_options: CycleOptions
+    stop_at_lift_off: bool = True  # whether the normal force must be positive in an admissible gait
+    law_structure: Any = NO_LAWS
+    coarse_options: CycleOptions | None = None
+
+    @property
+    def coarse_system(self) -> "CollocationSystem":
+        """Return the system on the coarse mesh, or this system if it has one mesh."""
+        return self._replace(
+            cycle_options=self.coarse_options or self.cycle_options, coarse_options=None
+        )
+
+    def select_coarse_state(self, state: "CollocationState") -> "CollocationState":
+        """Return the state on the coarse mesh, of use for the wheels whose gaits are there."""
+        accelerations = tuple(
+            x[:, : mesh.n_intervals]
+            for x, mesh in zip(
+                state.solution.accelerations, self.coarse_system.phase_meshes, strict=True
+            )
+        )
+        return state._replace(solution=state.solution._replace(accelerations=accelerations))
+
+    def is_on_coarse_mesh(self, state: "CollocationState") -> Any:
+        """Return for each wheel whether its solution is on the coarse mesh."""
+        if self.coarse_options is None:
+            return jnp.asarray(False)
+        return jnp.all(state.solution.accelerations[1][:, -1] == 0.0, (0, 1, 2))
+
+    def on_each_mesh(self, make_function: Callable) -> Callable:
+        """Return `make_function(system)`, a function of parameters and a state of one wheel.
+
+        With two meshes the result is that on the mesh of the wheel, padded with zeros to the size
+        of the fine mesh.
+        """
+        if self.coarse_options is None:
+            return make_function(self)
+        fine_system = self._replace(coarse_options=None)
+        on_coarse, on_fine = make_function(self.coarse_system), make_function(fine_system)
+
+        def evaluate(parameters: Array, state: CollocationState, *arguments: Any) -> Any:
+            is_coarse = self.is_on_coarse_mesh(state)
+            mask = lambda state, flag: state._replace(
+                has_cycle=jnp.where(flag, state.has_cycle, 0.0)
+            )
+            coarse_state = mask(self.select_coarse_state(state), is_coarse)
+            coarse = on_coarse(parameters, coarse_state, *arguments)
+            fine = on_fine(parameters, mask(state, ~is_coarse), *arguments)
+            return jax.tree.map(
+                lambda x, y: jnp.where(is_coarse, pad_with_zeros(x, y.shape), y), coarse, fine
+            )
+
+        return evaluate
+
+    @property
+    def phase_sequence(self) -> PhaseSequence:
+        """Return the phases of one gait step and the functions that describe them."""
+        return make_post_impact_sequence(self.n_legs, self.stop_at_lift_off, self.law_structure)
+
+    @property
+    def phase_meshes(self) -> tuple[PhaseMesh, ...]:
+        """Return the meshes of the phases DLS, SLS-I and SLS-II."""
+        n_dls_intervals, n_sls1_intervals, n_sls2_intervals = self.cycle_options.mesh_intervals
+        return (
+            PhaseMesh(n_dls_intervals, 1.0),
+            PhaseMesh(n_sls1_intervals, self.cycle_options.mesh_grading),
+            PhaseMesh(n_sls2_intervals, 1.0),
+        )
+
+    @property
+    def phase_constants_function(self) -> Callable:
+        """Return the function that maps the parameters to the constants of the
+        equations of motion.
+        """
+        return functools.partial(compute_phase_constants, self.n_legs, self.law_structure)
+
+    def complete_parameters(self, parameters: Array, *scales: Array) -> Array:
+        """Return the parameters with the values that `scale_laws` takes after those of laws.
+
+        The scales are those of the units of length and time, by default 1.
+        """
+        if self.law_structure == NO_LAWS:
+            return parameters
+        share = jnp.ones_like(parameters[0])
+        return jnp.stack([*parameters, share, *(scales or (share, share))])
+
+    def make_wheel(self, parameters: Array, step_index: Array | int = 0) -> WheelParams:
+        """Return the wheel in a gait step, with the parameters on the first axis, in SI units."""
+        params = make_wheel_from_parameters(
+            parameters, self.n_legs, law_structure=self.law_structure
+        )
+        if params.laws is None:
+            return params
+        return params.attach_laws(params.laws.exchange_legs(step_index % 2))
+
+    def is_beyond_border(self, failed_check: Any, has_dls: Any) -> Any:
+        """Return for each wheel whether its root shows that it is just beyond the border of its
+        gaits.
+
+        The force on the rear foot then has the wrong sign, or the next foot meets the ground too
+        early after double support. Neither a homotopy nor walks lead to a gait of such a wheel:
+        none of 1,900 such wheels with 8 legs had one. With 6 or 16 legs, 9 of 600 had one, so
+        that the result is false for all wheels with another number of legs than 8. It is false
+        with a user's law of the legs too, for which no such numbers are known.
+
+        - `failed_check`: `CollocationState.failed_check` of the root;
+        - `has_dls`: whether the root has double support.
+        """
+        is_paper_wheel = self.n_legs == WheelParams().n_legs and self.law_structure == NO_LAWS
+        return is_paper_wheel & (
+            (failed_check == REAR_FORCE_CHECK_CODES[0])
+            | (failed_check == REAR_FORCE_CHECK_CODES[1])
+            | ((failed_check == EARLY_TOUCHDOWN_CHECK_CODE) & has_dls)
+        )
+
+    def linearize_at(
+        self,
+        parameters: LaneParameters,
+        collocation_solution: CollocationSolution,
+        is_phase_active: LaneArray,
+        parameter_indices: tuple[int, ...] = (),
+    ) -> CycleLinearization:
+        """Linearize the collocation equations at a collocation solution.
+
+        The result contains tangents with respect to the parameters in `parameter_indices`.
+        """
+        return close_cycle(
+            parameters,
+            collocation_solution.section_state,
+            *linearize_steps(
+                self, parameters, collocation_solution, is_phase_active, parameter_indices
+            ),
+        )
+
+    def evaluate_phase_points(
+        self, parameters: Array, collocation_solution: CollocationSolution
+    ) -> list[tuple[PhasePoints, ...]]:
+        """Return the points of all phases in each gait step.
+
+        The arguments belong to one wheel, or to several wheels on the last axis.
+        """
+        phase_constants = self.phase_constants_function(*parameters)
+        section_state = tuple(collocation_solution.section_state)
+        phase_points_of_steps = []
+        for step_index in range(self.period_n):
+            section_state, phase_points = reconstruct_gait_step(
+                self,
+                self.phase_sequence.select_constants(phase_constants, (step_index % 2,)),
+                section_state,
+                collocation_solution.durations[step_index],
+                tuple(x[step_index] for x in collocation_solution.accelerations),
+            )
+            phase_points_of_steps.append(phase_points)
+        return phase_points_of_steps
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def estimate_mesh_error(self, collocation_solution: CollocationSolution) -> Array:
+        """Return the estimated mesh error of a solution for one wheel."""
+        solution_with_lane = jax.tree.map(lambda x: x[..., None], collocation_solution)
+        return estimate_mesh_error(self, solution_with_lane)[0]
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def trace_checks(
+        self, parameters: Array, collocation_solution: CollocationSolution, is_phase_active: Array
+    ) -> list[Array]:
+        """Return the quantity of each of the ADMISSIBILITY_CHECKS except that of the mesh, for the
+        first gait step of one wheel.
+
+        A guard has one value at the start of its phase, at each node and at the end.
+        """
+        phase_constants = self.phase_constants_function(*parameters)
+        phase_points = self.evaluate_phase_points(parameters, collocation_solution)[0]
+        quantities = []
+        for phase, points, duration in zip(
+            self.phase_sequence.phases, phase_points, collocation_solution.durations[0], strict=True
+        ):
+            guards_by_instant = zip(
+                *(
+                    phase.guards_function(phase_constants, point)
+                    for point in (
+                        points.phase_start_point, points.node_points, points.phase_end_point
+                    )
+                ),
+                strict=True,
+            )  # fmt: skip
+            quantities += [duration, *(jnp.hstack(guards) for guards in guards_by_instant)]
+        return quantities + list(
+            self.phase_sequence.margins_function(
+                phase_constants, phase_points, is_phase_active[0] > 0.5
+            )
+        )
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def measure_takeoff_acceleration(
+        self, parameters: Array, collocation_solution: CollocationSolution
+    ) -> Array:
+        """Return the lowest acceleration of the rear foot at take-off over the gait steps of one
+        wheel, m/s^2.
+        """
+        points_by_step = self.evaluate_phase_points(parameters, collocation_solution)
+        return jnp.min(
+            jnp.stack(
+                [
+                    compute_takeoff_acceleration(self.make_wheel(parameters, k).symbols(), points)
+                    for k, (_, points, _) in enumerate(points_by_step)
+                ]
+            )
+        )
+
+
+class CollocationState(NamedTuple):
+    """Solution of the collocation system, its active phases, and the result of its admissibility
+    checks.
+
+    All fields are floats with the wheels (lanes) on the last axis.
+    """
+
+    solution: CollocationSolution
+    is_phase_active: LaneArray  # (n, n_phases, lanes): 1 if the phase occurs, else 0
+    # (lanes,): 1 for a limit cycle, 0 for a replacement of a missing cycle
+    has_cycle: LaneArray
+    # (lanes,): 1 + index in ADMISSIBILITY_CHECKS of the check that a root fails;
+    # plus HOMOTOPY_FAILURE_CODE_OFFSET for a root of a wheel on the homotopy; a HomotopyFailure;
+    # else 0
+    failed_check: LaneArray
+    # (n, 4, lanes): theta, L1 and their rates at the end of each step
+    gait_step_end_states: LaneArray
+
+    @classmethod
+    def make_start(
+        cls, collocation_solution: CollocationSolution, is_phase_active: LaneArray
+    ) -> "CollocationState":
+        """Return a start of the search, with zeros in the fields that the search computes."""
+        zeros_of_lanes = jnp.zeros_like(collocation_solution.section_state[0])
+        durations = collocation_solution.durations
+        zero_end_states = jnp.zeros((len(durations), 4, *durations.shape[2:]), durations.dtype)
+        return cls(
+            collocation_solution, is_phase_active, zeros_of_lanes, zeros_of_lanes, zero_end_states
+        )

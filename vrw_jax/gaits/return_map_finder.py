@@ -4,7 +4,6 @@ Only the interface of models is used. For the paper's model, `collocation_finder
 method.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -13,11 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Scalar
-from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle, average_own_measure
+from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
     ParameterValues,
@@ -25,7 +23,6 @@ from vrw_jax.gaits.finder import (
 from vrw_jax.gaits.fixed_points import (
     FixedPointResult,
     solve_fixed_point,
-    solve_fixed_point_implicit,
 )
 from vrw_jax.models.measures import (
     DIFFERENTIABLE_STEP_NAMES,
@@ -113,10 +110,6 @@ class ReturnMapCycle(AbstractCycle):
     def _wheel_and_start(self) -> tuple[Any, WheelParams, Array]:
         return self.model, self.params, self.section_state
 
-    def _evaluate_own_measure(self, measure: Measure) -> Array:
-        average = functools.partial(average_own_measure, measure, StepOptions())
-        return self.map_over_batch_axes(average)(*self._wheel_and_start, self.step_ends, self.steps)
-
 
 @eqx.filter_jit
 def find_return_map_cycle(
@@ -125,19 +118,14 @@ def find_return_map_cycle(
     model: Any,
     options: StepOptions,
     period_n: int,
-    uses_implicit_jvp: bool,
+    differentiates_jacobian: bool,
 ) -> ReturnMapCycle:
     """Find the cycle of a wheel by Newton's method on the model's return map.
 
-    If `uses_implicit_jvp` is true, `solve_fixed_point_implicit` is used, because second derivatives
-    of a gait step with unilateral contact are expensive. The search then uses the same step
-    function as the result, so that only one program is compiled.
+    If `differentiates_jacobian` is false, the search uses the same step function as the result, so
+    that only one program is compiled.
     """
-    evaluate_step, find_fixed_point = (
-        (model.take_step, solve_fixed_point_implicit)
-        if uses_implicit_jvp
-        else (model.advance, solve_fixed_point)
-    )
+    evaluate_step = model.advance if differentiates_jacobian else model.take_step
     section_units = jnp.stack(
         model.collect_section_units(compute_wheel_units(params.symbols()), params.n_legs)
     )
@@ -154,12 +142,13 @@ def find_return_map_cycle(
         steps = take_steps(evaluate_step, section_state * section_units, model.leg_period)
         return steps[-1].section_state / section_units
 
-    fixed_point = find_fixed_point(
+    fixed_point = solve_fixed_point(
         return_map,
         section_state / section_units,
         period_n=period_n // model.leg_period,
         tolerance=compute_newton_tolerance(options),
         units=1.0,
+        differentiates_jacobian=differentiates_jacobian,
     )
     fixed_point = fixed_point._replace(
         x=fixed_point.x * section_units,
@@ -203,8 +192,8 @@ def make_return_map_cycle(
     )
 
 
-class AbstractReturnMapFinder(AbstractGaitFinder):
-    """Finder of gaits as fixed points of the return map over `period_n` gait steps."""
+class ReturnMapFinder(AbstractGaitFinder):
+    """Finder of the gaits of any model, as fixed points of its return map over `period_n` steps."""
 
     model: Any
     n_legs: int = eqx.field(static=True)
@@ -213,32 +202,8 @@ class AbstractReturnMapFinder(AbstractGaitFinder):
 
     options_type: ClassVar[type] = StepOptions
     supports_cold_start: ClassVar[bool] = False
-
-    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
-        return find_return_map_cycle(
-            *self.prepare_search(params, cycle_guess), self.period_n, uses_implicit_jvp=False
-        )
-
-    def prepare_search(
-        self, params: WheelParams, cycle_guess: Any
-    ) -> tuple[WheelParams, Array, Any, StepOptions]:
-        """Return the wheel, the section state, the model and the options for a search near
-        `cycle_guess`.
-        """
-        section_state = getattr(cycle_guess, "section_state", cycle_guess)
-        if section_state is None:
-            section_state = self.model.compute_default_start(params)
-        return convert_step_arguments(params, section_state, self.model, self.step_options)
-
-    def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
-        """Return the last section state of a walk that begins at the model's default start."""
-        model, params = self.model.from_parameter_values(parameter_values, self.n_legs)
-        return start_walk_toward_gait(model, params, self.step_options).steps.section_state[-1]
-
-
-class ReturnMapFinder(AbstractReturnMapFinder):
-    """Finder of the gaits of any model, which obtains derivatives from Newton's method."""
-
+    differentiates_jacobian: ClassVar[bool] = True
+    """Whether derivatives of the multipliers are available, which need those of second order."""
     cycle_measures: ClassVar[tuple[str, ...]] = tuple(
         measure_name
         for measure_name in CYCLE_MEASURE_FUNCTIONS
@@ -261,3 +226,24 @@ class ReturnMapFinder(AbstractReturnMapFinder):
         measure_name for measure_name in cycle_measures if measure_name != "spectral_margin"
     )
     readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
+
+    def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
+        return find_return_map_cycle(
+            *self.prepare_search(params, cycle_guess), self.period_n, self.differentiates_jacobian
+        )
+
+    def prepare_search(
+        self, params: WheelParams, cycle_guess: Any
+    ) -> tuple[WheelParams, Array, Any, StepOptions]:
+        """Return the wheel, the section state, the model and the options for a search near
+        `cycle_guess`.
+        """
+        section_state = getattr(cycle_guess, "section_state", cycle_guess)
+        if section_state is None:
+            section_state = self.model.compute_default_start(params)
+        return convert_step_arguments(params, section_state, self.model, self.step_options)
+
+    def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
+        """Return the last section state of a walk that begins at the model's default start."""
+        model, params = self.model.from_parameter_values(parameter_values, self.n_legs)
+        return start_walk_toward_gait(model, params, self.step_options).steps.section_state[-1]

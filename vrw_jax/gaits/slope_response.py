@@ -18,16 +18,15 @@ from jaxtyping import Array, Float
 from vrw_jax.base.batch_algebra import evaluate_with_jvps
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits import floquet
-from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem, LaneParameters
 from vrw_jax.gaits.derivatives import make_derivative_compiler, make_tangent_function
+from vrw_jax.gaits.phase_collocation import linearize_steps
+from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem, LaneParameters
 from vrw_jax.lanes.autodiff import compute_square_root, with_implicit_derivative
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
-N_CHORD_ITERATIONS = 3
-"""Number of Newton iterations that use the same Jacobian.
-
-Each iteration makes the derivatives of one more order exact. The value is chosen because a gradient
-of the norm needs derivatives of second order.
+N_DOUBLINGS = 45
+"""Number of times that the number of later steps in a sum doubles. The value is chosen because the
+sum is then complete, unless a multiplier differs from 1 by little more than round-off.
 """
 
 
@@ -99,19 +98,16 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     Lyapunov equation `P = A P A^T + b b^T`. The norm is infinite if the gait is not stable.
     """
     A, B1, B0, C, D1, D0 = slope_response
-    n = len(A)
     is_gait_stable = floquet.compute_spectral_radius(lax.stop_gradient(A)) < 1.0
     A = jnp.where(is_gait_stable, A, 0.0)
     b = A @ B0 + B1
-    lyapunov_matrix = jnp.eye(n * n, dtype=A.dtype) - jnp.kron(A, A)
-    approximate_inverse = invert_by_elimination(lax.stop_gradient(lyapunov_matrix))
-    forcing_vector = jnp.outer(b, b).ravel()
-    response_covariance = approximate_inverse @ forcing_vector
-    for _ in range(N_CHORD_ITERATIONS):
-        response_covariance = response_covariance - approximate_inverse @ (
-            lyapunov_matrix @ response_covariance - forcing_vector
-        )
-    P = response_covariance.reshape(n, n)
+
+    def double(_: Any, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        """Return A^2m and the sum of A^j b b^T A^Tj below j = 2m, from those of m."""
+        power, covariance = state
+        return power @ power, covariance + power @ covariance @ power.T
+
+    _, P = lax.fori_loop(0, N_DOUBLINGS, double, (A, jnp.outer(b, b)))
     later_steps_squared = jnp.einsum("mi,ij,mj->m", C, P, C)
     beginning_step_response = C @ B0 + D1
     sensitivity_norm = compute_square_root(D0**2 + beginning_step_response**2 + later_steps_squared)
@@ -126,36 +122,7 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     )
 
 
-def invert_by_elimination(square_matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Invert a matrix by Gauss-Jordan elimination with row exchanges.
-
-    LAPACK's batched solver uses threads of the pool on which XLA runs the program. If two such
-    programs run at a time, as in a scan on two cores, they block each other (jaxlib 0.10).
-    """
-    matrix_size = len(square_matrix)
-    augmented_matrix = jnp.concatenate(
-        [square_matrix, jnp.eye(matrix_size, dtype=square_matrix.dtype)], axis=1
-    )
-
-    def eliminate_column(column_index: Array, augmented_matrix: Array) -> Array:
-        pivot_candidates = jnp.where(
-            jnp.arange(matrix_size) >= column_index,
-            jnp.abs(augmented_matrix[:, column_index]),
-            -1.0,
-        )
-        pivot_row_index = jnp.argmax(pivot_candidates)
-        pivot_row, row_at_pivot_position = (
-            augmented_matrix[pivot_row_index],
-            augmented_matrix[column_index],
-        )
-        augmented_matrix = augmented_matrix.at[pivot_row_index].set(row_at_pivot_position)
-        pivot_row = pivot_row / pivot_row[column_index]
-        eliminated_matrix = augmented_matrix - augmented_matrix[:, column_index, None] * pivot_row
-        return eliminated_matrix.at[column_index].set(pivot_row)
-
-    return lax.fori_loop(0, matrix_size, eliminate_column, augmented_matrix)[:, matrix_size:]
-
-
+@eqx.filter_jit
 def compute_step_slope_response(
     model: Any,
     params: WheelParams,
@@ -241,7 +208,8 @@ def _compute_step_jacobian(
     parameters = jnp.concatenate(
         [collocation_system.complete_parameters(parameters), jnp.zeros_like(parameters[:1])]
     )
-    (_, end_tangents), (_, _, duration_tangents, _) = collocation_system.linearize_steps(
+    (_, end_tangents), (_, _, duration_tangents, _) = linearize_steps(
+        collocation_system,
         parameters,
         solution,
         collocation_state.is_phase_active,

@@ -28,10 +28,9 @@ from vrw_jax.gaits.finder import (
 from vrw_jax.gaits.fixed_points import FixedPointResult
 from vrw_jax.gaits.gait_walks import find_slow_gaits, stack_section_units
 from vrw_jax.gaits.return_map_finder import (
-    AbstractReturnMapFinder,
     ReturnMapCycle,
+    ReturnMapFinder,
     compute_newton_tolerance,
-    find_return_map_cycle,
     make_return_map_cycle,
 )
 from vrw_jax.lanes.batching import (
@@ -47,7 +46,7 @@ from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.wheel.params import WheelParams
 
 
-class UnilateralFinder(AbstractReturnMapFinder):
+class UnilateralFinder(ReturnMapFinder):
     """Finder of gaits with unilateral contact and their first derivatives.
 
     The derivatives are with respect to all parameters, including friction.
@@ -70,6 +69,7 @@ class UnilateralFinder(AbstractReturnMapFinder):
     default_measures: ClassVar[tuple[str, ...]] = UNILATERAL_DIFFERENTIABLE_NAMES
     readable_measures: ClassVar[tuple[str, ...]] = differentiable_measures
     is_multistable: ClassVar[bool] = True
+    differentiates_jacobian: ClassVar[bool] = False
 
     def find_cycle(self, params: WheelParams, cycle_guess: Any = None) -> ReturnMapCycle:
         """Find the cycle of one wheel.
@@ -78,11 +78,9 @@ class UnilateralFinder(AbstractReturnMapFinder):
         traced, the cycle has derivatives by the implicit function theorem, computed from a single
         gait step.
         """
-        params, section_state, model, options = self.prepare_search(params, cycle_guess)
+        params, section_state, model, _ = self.prepare_search(params, cycle_guess)
         if has_traced_leaf(params, section_state, model):
-            return find_return_map_cycle(
-                params, section_state, model, options, self.period_n, uses_implicit_jvp=True
-            )
+            return super().find_cycle(params, cycle_guess)
         return jax.tree.map(
             lambda section_state: section_state[0],
             self.find_cycles_near(

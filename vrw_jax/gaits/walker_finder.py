@@ -49,7 +49,7 @@ from vrw_jax.gaits.fixed_points import (
     MAX_NEWTON_ITERATIONS,
     MAX_RESIDUAL,
     FixedPointResult,
-    solve_fixed_point_implicit,
+    solve_fixed_point,
 )
 from vrw_jax.gaits.gait_walks import walk_until_periodic
 from vrw_jax.gaits.slope_response import SlopeResponse
@@ -402,13 +402,14 @@ def _search_from_guess(
         return_map = make_return_map(walker, params, jax.lax.stop_gradient(options))
         return return_map(jnp.where(False, some_parameter, x))
 
-    fixed_point = solve_fixed_point_implicit(
+    fixed_point = solve_fixed_point(
         map_section_state,
         guess,
         period_n=period_n,
         invariants=[lambda x: walker.evaluate_invariants(params, x)] if walker.invariants else (),
         # Steps conserve their invariants as accurately as they are computed.
         max_residual=jnp.maximum(MAX_RESIDUAL, 100.0 * options.rtol),
+        differentiates_jacobian=False,
     )
     x, period, values = fixed_point.x, jnp.zeros((), fixed_point.x.dtype), []
     numbers = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves((params, guess))])

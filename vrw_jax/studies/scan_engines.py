@@ -34,7 +34,6 @@ from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_finder import KinkedGaitFinder
-from vrw_jax.gaits.collocation_search import CollocationState
 from vrw_jax.gaits.finder import MeasureReader, confirm_outcome_by_step, evaluate_on_gaits
 from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.further_search import (
@@ -44,6 +43,7 @@ from vrw_jax.gaits.further_search import (
 )
 from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.phase_sequence import CollocationState
 from vrw_jax.gaits.walker_finder import find_gaits_with_walks, make_walker_finder
 from vrw_jax.lanes.batching import (
     choose_batch_size,
