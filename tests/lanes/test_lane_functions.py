@@ -36,6 +36,10 @@ def sum_by_scan(x, k):
     return total, i, partial_sums[::-1]
 
 
+def add_tangents_of_which_lanes_share_one(x, k):
+    return jax.jvp(lambda y, c: y * c, (x[0], 2.0), (1.0, x[1]))
+
+
 def choose(x, k):
     branches = [lambda y: y, lambda y: -2.0 * y, lambda y: jnp.cumsum(y)]
     return lax.switch(k, branches, x), lax.cond(x[0] > x[1], lambda: x[2], lambda: 0.0)
@@ -100,6 +104,7 @@ FUNCTIONS = (
     index_by_arrays,
     halve_until_small,
     sum_by_scan,
+    add_tangents_of_which_lanes_share_one,
     choose,
     index_by_lane,
     move_entries,
