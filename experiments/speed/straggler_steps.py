@@ -38,7 +38,7 @@ def count_tried_steps(
     walk_result = run_batch_phases(
         make_wheel_from_parameters(rows.T, N_LEGS), tuple(states.T), options, tableau, True, False
     )
-    return jnp.stack([end.n_solver_steps for end in walk_result.phase_end_results])
+    return jnp.stack([end.solver_steps for end in walk_result.phase_end_results])
 
 
 def draw_cases(n: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -6,6 +6,7 @@ work elementwise, for one wheel or for a batch.
 """
 
 import functools
+import itertools
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
+from vrw_jax.flow.integrate import PhaseEnd
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
     DoubleSupportIndicators,
@@ -62,25 +64,12 @@ step. This state is never integrated.
 """
 
 
-class PhaseResult(NamedTuple):
-    """State and data at the end of a phase. The state equals the start if the phase was not
-    active.
-    """
-
-    q: Vector
-    v: Vector
-    duration: Elementwise  # s
-    end_guard_index: Int[Array, "..."]  # index of the guard that ended the phase; -1 if none did
-    is_timed_out: Bool[Array, "..."]
-    n_solver_steps: Int[Array, "..."]  # attempted, accepted or not
-    margin_minima: Array | None  # one minimum per margin on the leading axis, if recorded
-    next_phase_inputs: Any = None  # data that the engine passes to the next phase
-    kink_log: Any = None  # a `KinkLog` of the kinks of the legs' forces, if requested
-
-
-PhaseRunner = Callable[[AbstractPhase, Vector, Vector, Array, PhaseResult | None], PhaseResult]
+PhaseRunner = Callable[
+    [AbstractPhase, Vector, Vector, Array, tuple[PhaseEnd, Array] | None], PhaseEnd
+]
 """Function that integrates one phase. Its arguments are the phase, its start (q, v), the mask of
-active elements, and the end of the previous phase; it returns the end of the phase.
+active elements, and the end of the previous phase with its mask. It returns the end of the phase,
+whose `state` begins with q and v. It equals the start if the phase was not active.
 """
 
 
@@ -91,7 +80,7 @@ class PhaseSequenceResult(NamedTuple):
     step_start_landing: Landing
     phases: tuple[AbstractPhase, ...]
     phase_start_states: tuple[tuple[Vector, Vector], ...]
-    phase_end_results: tuple[PhaseResult, ...]
+    phase_end_results: tuple[PhaseEnd, ...]
     has_phase_occurred: tuple[Bool[Array, "..."], ...]
     outcome: Int[Array, "..."]  # an Outcome
     ground_ahead: GroundAhead | None = None  # None on flat ground
@@ -147,7 +136,7 @@ def _run_remaining_phases(
     is_valid_step: Array,
     is_phase_active: Array,
     options: StepOptions,
-) -> tuple[tuple[tuple[Vector, Vector], ...], tuple[PhaseResult, ...], tuple[Array, ...], Array]:
+) -> tuple[tuple[tuple[Vector, Vector], ...], tuple[PhaseEnd, ...], tuple[Array, ...], Array]:
     """Integrate the remaining phases of a step, starting from a motion in the first remaining
     phase.
 
@@ -161,7 +150,8 @@ def _run_remaining_phases(
         is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
     )
     phase_start_states, has_phase_occurred = [], []
-    phase_end_results: list[PhaseResult] = []
+    phase_end_results: list[PhaseEnd] = []
+    previous_end = None
     fallback_theta, *fallback_lengths_and_rates = (
         jnp.asarray(state_component, jnp.result_type(wheel_angle))
         for state_component in FALLBACK_SINGLE_SUPPORT_STATE
@@ -172,10 +162,8 @@ def _run_remaining_phases(
     )
     for previous_phase, phase in zip((None, *remaining_phases), remaining_phases, strict=False):
         if previous_phase is not None:
-            end_state = (
-                phase_end_results[-1].q[0],
-                previous_phase.compute_motion(phase_end_results[-1].q, phase_end_results[-1].v),
-            )
+            q, v, *_ = phase_end_results[-1].state
+            end_state = q[0], previous_phase.compute_motion(q, v)
             wheel_angle, wheel_motion = select_trees_by_condition(
                 is_phase_active, end_state, (wheel_angle, wheel_motion)
             )
@@ -185,17 +173,14 @@ def _run_remaining_phases(
             )
             wheel_motion = previous_phase.reset_motion(wheel_motion)
         start_state = phase.select_phase_coordinates(wheel_angle, wheel_motion)
-        phase_end = phase_runner(
-            phase,
-            *start_state,
-            is_phase_active,
-            phase_end_results[-1] if phase_end_results else None,
-        )
+        phase_end = phase_runner(phase, *start_state, is_phase_active, previous_end)
+        previous_end = phase_end, is_phase_active
         phase_outcome = phase.select_guard_outcome(
             phase_end.end_guard_index, phase_end.is_timed_out
         )
         if phase.can_come_to_rest:
-            is_at_rest = phase.is_at_rest(phase_end.q, phase_end.v, options.atol)
+            q, v, *_ = phase_end.state
+            is_at_rest = phase.is_at_rest(q, v, options.atol)
             phase_outcome = replace_rest_outcome(phase_outcome, is_at_rest)
         step_outcome = jnp.where(is_phase_active, phase_outcome, step_outcome)
         phase_start_states.append(start_state)
@@ -247,8 +232,8 @@ def finish_gait_step(
         is_valid_state,
         options,
     )
-    section_state = phase_end_results[-1].q[0], *phase_end_results[-1].v
-    return _collect_advance_result(section_state, phase_end_results, step_outcome, engine)
+    q, v, *_ = phase_end_results[-1].state
+    return _collect_advance_result((q[0], *v), phase_end_results, step_outcome, engine)
 
 
 def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> AdvanceResult:
@@ -258,11 +243,10 @@ def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> Adv
     of the line of the ground at the next landing. The result reports the name `engine`.
     """
     phase_end_results = phase_sequence.phase_end_results
-    touchdown_angle, touchdown_rates = phase_end_results[2].q[0], phase_end_results[2].v
+    q, touchdown_rates, *_ = phase_end_results[2].state
+    touchdown_angle = q[0]
     if phase_sequence.ground_ahead is not None:
-        foot_distance = compute_foot_distance_for_length(
-            phase_sequence.s, phase_end_results[2].q[1]
-        )
+        foot_distance = compute_foot_distance_for_length(phase_sequence.s, q[1])
         touchdown_angle = touchdown_angle - phase_sequence.ground_ahead.compute_next_line_tilt(
             foot_distance
         )
@@ -272,7 +256,7 @@ def make_advance_result(phase_sequence: PhaseSequenceResult, engine: str) -> Adv
 
 def _collect_advance_result(
     section_state: Vector,
-    phase_end_results: Sequence[PhaseResult],
+    phase_end_results: Sequence[PhaseEnd],
     step_outcome: Array,
     engine: str,
 ) -> AdvanceResult:
@@ -283,7 +267,7 @@ def _collect_advance_result(
     n_omitted_phases = len(PAPER_PHASES) - len(phase_end_results)
     has_stepped = step_outcome == Outcome.STEPPED
     durations = [phase_end.duration for phase_end in phase_end_results]
-    solver_steps = [phase_end.n_solver_steps for phase_end in phase_end_results]
+    solver_steps = [phase_end.solver_steps for phase_end in phase_end_results]
     return AdvanceResult(
         section_state=jnp.stack([jnp.where(has_stepped, x, 0.0) for x in section_state]),
         durations=jnp.stack([jnp.zeros_like(durations[0])] * n_omitted_phases + durations),
@@ -313,11 +297,11 @@ def make_step_result(
     dls_phase, sls1_phase, sls2_phase = make_paper_phases(
         s, landing_result.foot_distance, stop_at_lift_off=True
     )
-    liftoff_motion = dls_phase.compute_motion(phase_end_results[0].q, phase_end_results[0].v)
+    liftoff_motion = dls_phase.compute_motion(*phase_end_results[0].state[:2])
     state_before_stopper = tuple(
         jnp.where(has_stopper_collision, x, jnp.asarray(fallback_value, x.dtype))
         for x, fallback_value in zip(
-            (*phase_end_results[1].q, *phase_end_results[1].v),
+            itertools.chain(*phase_end_results[1].state[:2]),
             FALLBACK_SINGLE_SUPPORT_STATE,
             strict=True,
         )
@@ -325,14 +309,14 @@ def make_step_result(
     stopper_collision = transitions.resolve_stopper_collision(
         s, sls1_phase.compute_motion(state_before_stopper[:3], state_before_stopper[3:])
     )
-    motion_at_step_end = sls2_phase.compute_motion(phase_end_results[2].q, phase_end_results[2].v)
+    motion_at_step_end = sls2_phase.compute_motion(*phase_end_results[2].state[:2])
     initial_energy, final_energy = (
         dynamics.compute_mechanical_energy(s, m).total_energy
         for m in (landing_result.motion_after, motion_at_step_end)
     )
     damping_loss = initial_energy - final_energy - stopper_collision.energy_loss
     if s.hub_torque is not None:
-        turned_angle = phase_end_results[2].q[0] - landing_result.theta_after_landing
+        turned_angle = phase_end_results[2].state[0][0] - landing_result.theta_after_landing
         damping_loss = damping_loss + compute_motor_work(s, turned_angle)
     fore_force, rear_force = transitions.compute_landing_forces(s, landing_result)
     advance_result = make_advance_result(phase_sequence, engine)

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
@@ -29,7 +29,12 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.flow.integrate import divide_equally, integrate_batch_phase, sample_batch_phase
+from vrw_jax.flow.integrate import (
+    PhaseEnd,
+    divide_equally,
+    integrate_batch_phase,
+    sample_batch_phase,
+)
 from vrw_jax.flow.kinks import find_sides
 from vrw_jax.flow.phase_integration import (
     GuardsAndMargins,
@@ -50,7 +55,6 @@ from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_measures import evaluate_own_measure, measure_forces
 from vrw_jax.models.phase_sequence import (
-    PhaseResult,
     PhaseRunner,
     PhaseSequenceResult,
     finish_gait_step,
@@ -348,7 +352,8 @@ def take_steps_of_lanes(
     if friction is None:
         return make_advance_result(phase_sequence, "lanes")
     phase_end_results = tuple(
-        phase_end._replace(next_phase_inputs=None) for phase_end in phase_sequence.phase_end_results
+        phase_end._replace(state=phase_end.state[:2], next_solver_dt=None)  # type: ignore[arg-type]
+        for phase_end in phase_sequence.phase_end_results
     )
     float_phase_sequence = phase_sequence._replace(
         phases=(), phase_start_states=(), phase_end_results=phase_end_results
@@ -459,7 +464,7 @@ def _sample_parts_of_phase(
     options: StepOptions,
     phase: AbstractPhase,
     start: tuple[Vector, Vector],
-    phase_end: PhaseResult,
+    phase_end: PhaseEnd,
 ) -> SmoothParts:
     options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
     duration, n_dof, log = phase_end.duration, phase.n_dof, phase_end.kink_log
@@ -494,14 +499,6 @@ def _sample_parts_of_phase(
 
     samples = lax.map(sample, (sides, states, durations))
     return SmoothParts(n_kinks, sides, durations, samples)
-
-
-class _NextPhaseInputs(NamedTuple):
-    """Data that the integration of a phase passes to the integration of the next phase."""
-
-    next_solver_dt: Array  # step size that the controller proposes next, s
-    has_phase_occurred: Bool[Array, " lanes"]  # whether the phase took place
-    is_unfinished: Bool[Array, " lanes"]
 
 
 def make_batch_phase(
@@ -589,7 +586,7 @@ def advance_gait_step(
         straggler_count=straggler_count,
     )
     is_phase_unfinished = [
-        phase_end.next_phase_inputs.is_unfinished for phase_end in phase_sequence.phase_end_results
+        phase_end.is_unfinished for phase_end in phase_sequence.phase_end_results
     ]
     return make_advance_result(phase_sequence, "lanes"), functools.reduce(
         operator.or_, is_phase_unfinished
@@ -652,13 +649,13 @@ def _make_phase_runner(
         q: Vector,
         v: Vector,
         is_active_lane: Array,
-        previous_phase_end: PhaseResult | None,
-    ) -> PhaseResult:
+        previous_end: tuple[PhaseEnd, Array] | None,
+    ) -> PhaseEnd:
         scaled_options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
         dt0 = scaled_options.dt0 + jnp.zeros_like(q[0])
-        if previous_phase_end is not None:
-            next_phase_inputs = previous_phase_end.next_phase_inputs
-            dt0 = next_phase_inputs.next_solver_dt
+        if previous_end is not None:
+            phase_end, has_occurred = previous_end
+            dt0 = phase_end.next_solver_dt
             if phase.has_stiff_start:
                 tolerance_root = approximate_power(
                     options.rtol.astype(jnp.float32), 1.0 / tableau.convergence_order
@@ -667,7 +664,7 @@ def _make_phase_runner(
                     MAX_FIRST_STEP_IN_TRANSIENT_TIMES * tolerance_root * phase.s.m / phase.s.c
                 )
                 stiff_dt0 = jnp.minimum(MAX_FIRST_STEP_RATIO * dt0, max_transient_dt)
-                dt0 = jnp.where(next_phase_inputs.has_phase_occurred, stiff_dt0, dt0)
+                dt0 = jnp.where(has_occurred, stiff_dt0, dt0)
         float_leaves, nonarray_leaves = eqx.partition((phase.s, phase.ground_ahead), eqx.is_array)
 
         def make_phase(float_leaves: Any, phase_constants: Vector) -> BatchPhase:
@@ -679,7 +676,7 @@ def _make_phase_runner(
                 phase_with_traced_inputs, records_margins, is_compiled_separately
             )._replace(n_logged_kinks=n_logged_kinks)
 
-        phase_end = integrate_batch_phase(
+        return integrate_batch_phase(
             make_phase,
             float_leaves,
             phase.phase_constants,
@@ -690,19 +687,6 @@ def _make_phase_runner(
             dt0,
             scaled_options,
             straggler_count,
-        )
-        return PhaseResult(
-            q=phase_end.state.q,
-            v=phase_end.state.v,
-            duration=phase_end.duration,
-            end_guard_index=phase_end.end_guard_index,
-            is_timed_out=phase_end.is_timed_out,
-            n_solver_steps=phase_end.solver_steps,
-            margin_minima=phase_end.margin_minima,
-            next_phase_inputs=_NextPhaseInputs(
-                phase_end.next_solver_dt, is_active_lane, phase_end.is_unfinished
-            ),
-            kink_log=phase_end.kink_log,
         )
 
     return run_phase
@@ -797,8 +781,8 @@ def _make_element_phase_runner(options: StepOptions, records_margins: bool) -> P
     """
 
     def run_phase(
-        phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: PhaseResult | None
-    ) -> PhaseResult:
+        phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: Any
+    ) -> PhaseEnd:
         element_phase = make_element_phase(phase, records_margins)
         phase_end = integrate_phase(
             element_phase.vector_field,
@@ -809,15 +793,10 @@ def _make_element_phase_runner(options: StepOptions, records_margins: bool) -> P
             jnp.stack(phase.coordinate_units),
             element_phase.kinks,
         )
-        end_state = tuple(phase_end.state)
-        return PhaseResult(
-            end_state[: phase.n_dof],
-            end_state[phase.n_dof :],
-            phase_end.duration,
-            phase_end.end_guard_index,
-            phase_end.is_timed_out,
-            phase_end.solver_steps,
-            phase_end.margin_minima if records_margins else None,
+        y = tuple(phase_end.state)
+        return phase_end._replace(
+            state=(y[: phase.n_dof], y[phase.n_dof :]),
+            margin_minima=phase_end.margin_minima if records_margins else None,
         )
 
     return run_phase
