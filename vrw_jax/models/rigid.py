@@ -268,7 +268,12 @@ class RigidWheel(AbstractWheel):
         lands_at_once = rolling_motion.end_angle < rolling_motion.first_angle
         outcome = jnp.where(lands_at_once, jnp.int32(Outcome.TOUCHDOWN_BEFORE_STOPPER), outcome)
         outcome = jnp.where(is_valid, outcome, jnp.int32(Outcome.BAD_INPUT))
-        rate, duration = rolling_motion.compute_rate_and_time_at_end(reaches_end)
+        # A fast wheel keeps the masked results finite.
+        fast_motion = dataclasses.replace(
+            rolling_motion, initial_rate=jnp.where(reaches_end, rolling_motion.initial_rate, 10.0)
+        )
+        rate = jnp.sqrt(fast_motion.compute_squared_rate(fast_motion.end_angle))
+        duration = fast_motion.compute_time_to_angle(fast_motion.end_angle)
         zero = jnp.zeros_like(rolling_motion.initial_rate)
         section_state, durations = _zero_unless(
             outcome == Outcome.STEPPED,
@@ -492,7 +497,8 @@ class RollingMotion(eqx.Module):
         # This is the squared rate at the vertical.
         min_rate_squared = self.initial_rate**2 + kappa * (jnp.cos(2.0 * first_half_angle) - 1.0)
         has_passed_vertical = first_half_angle * last_half_angle < 0.0
-        # The sides are told apart without squares, whose roots have no derivative at the vertical.
+        # The sign selects the side, because squares would have roots without a derivative at the
+        # vertical.
         side = jnp.where(first_half_angle < 0.0, -1.0, 1.0)
         first_distance, last_distance = side * first_half_angle, side * last_half_angle
         zero_angle = jnp.zeros_like(last_half_angle)
@@ -511,19 +517,6 @@ class RollingMotion(eqx.Module):
             kappa,
         )
         return time_to_end + time_to_vertical
-
-    def compute_rate_and_time_at_end(self, reaches_end: Array) -> tuple[Elementwise, Elementwise]:
-        """Return the angular rate at the end angle, rad/s, and the time until then, s.
-
-        The results are those of a fast wheel if `reaches_end` is False, so that they are finite.
-        """
-        rolling_motion = dataclasses.replace(
-            self, initial_rate=jnp.where(reaches_end, self.initial_rate, 10.0)
-        )
-        return (
-            jnp.sqrt(rolling_motion.compute_squared_rate(self.end_angle)),
-            rolling_motion.compute_time_to_angle(self.end_angle),
-        )
 
     def compute_motion_at_angle(self, theta: Elementwise) -> Motion:
         """Return the motion at the angle theta. Its angular rate is 0 if the wheel does not reach

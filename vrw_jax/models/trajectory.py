@@ -154,15 +154,14 @@ def simulate(
     specify_trajectory = (
         specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
     )
-    trajectory_spec = specify_trajectory(models_and_wheels, options, n_samples)
+    sample_step, variable_names, slope_position_names, coordinates, dataset_attributes = (
+        specify_trajectory(models_and_wheels, options, n_samples)
+    )
     sampled_columns, walked_slopes, n_stepped, walk_outcome = sample_walk_steps(
-        trajectory_spec, x, n_steps, ground, float(s.Mt * s.g)
+        sample_step, slope_position_names, x, n_steps, ground, float(s.Mt * s.g)
     )
     dataset_variables = make_labeled_variables(
-        {
-            variable_name: sampled_columns[variable_name]
-            for variable_name in trajectory_spec.variable_names
-        },
+        {name: sampled_columns[name] for name in variable_names},
         "time",
     )
     for variable_name in filter(sampled_columns.__contains__, SELECTION_VARIABLE_ATTRIBUTES):
@@ -176,7 +175,7 @@ def simulate(
         "outcome_meaning": walk_outcome.meaning,
         "start": np.asarray(x).tolist(),
     }
-    provenance_attributes = trajectory_spec.dataset_attributes | collect_provenance_attributes(
+    provenance_attributes = dataset_attributes | collect_provenance_attributes(
         params, model, options
     )
     if heights is not None:
@@ -190,7 +189,7 @@ def simulate(
         del provenance_attributes["parameter_slope"]
     dataset = xr.Dataset(
         dataset_variables,
-        trajectory_spec.extra_coordinates,
+        coordinates,
         walk_attributes | provenance_attributes,
     )
     return dataset.set_coords(dataset_variables.keys() & {"step", "phase"})
@@ -216,29 +215,14 @@ def _simulate_own_walker(
     return sample_walk_of_system(walker, params_of_steps, x, options, n_samples)
 
 
-class SampledStep(NamedTuple):
-    """Samples of one step in each interval between two events.
+SampledStep = tuple[dict[str, np.ndarray], np.ndarray, Outcome, Array]
+"""Samples of one step in each interval between two events, by name, (interval, sample, ...),
+durations of the intervals, s, outcome, and section state at the end of the step.
 
-    Besides the variables of the trajectory, `sampled_columns` contains `landing_foot_x` and
-    `landing_foot_z`. Their last values are the position (m) at which the next foot lands.
-    """
-
-    sampled_columns: dict[str, np.ndarray]  # (interval, sample, ...), time in s since the landing
-    durations: np.ndarray  # duration of each interval, s; 0 if it did not occur
-    outcome: Outcome
-    next_section_state: Array  # section state at the end of the step
-
-
-class TrajectorySpecification(NamedTuple):
-    """Function that samples a step of a model, and the names and attributes of trajectory
-    variables.
-    """
-
-    step_sampler: Callable[[Array, int], SampledStep]  # arguments: section state, step index
-    variable_names: tuple[str, ...]  # names of the measures over time
-    slope_position_names: tuple[str, ...]  # names of the positions along the slope
-    extra_coordinates: dict[str, Any]  # additional coordinates of the dataset
-    dataset_attributes: dict[str, object]
+Times are in s since the landing. The duration of an interval that did not occur is 0. Besides the
+variables of the trajectory, the samples contain `landing_foot_x` and `landing_foot_z`. Their last
+values are the position (m) at which the next foot lands.
+"""
 
 
 HEIGHT_DEPENDENT_ENERGIES = ("gravitational_energy", "total_energy")
@@ -276,7 +260,8 @@ class TrajectoryGround(NamedTuple):
 
 
 def sample_walk_steps(
-    trajectory_spec: TrajectorySpecification,
+    sample_step: Callable[[Array, int], SampledStep],
+    slope_position_names: tuple[str, ...],
     x: Array,
     n_steps: int,
     ground: TrajectoryGround,
@@ -291,6 +276,7 @@ def sample_walk_steps(
     The samples of a step are in the frame of the line of the ground under both feet in double
     support. Positions (m) and energies (J) are converted to the frame of the ground.
 
+    - `sample_step`, `slope_position_names`: see `specify_phase_trajectory`;
     - `wheel_weight`: weight of the wheel, N.
     """
     columns_by_step = []
@@ -298,18 +284,18 @@ def sample_walk_steps(
     foothold_x, foothold_z = 0.0, ground.first_height
     line_slopes = [ground.find_line_slope(0, x)]
     while walk_outcome == Outcome.STEPPED and k < n_steps:
-        sampled_step = trajectory_spec.step_sampler(x, k)
-        has_occurred = sampled_step.durations > 0.0
+        samples_by_name, durations, walk_outcome, next_x = sample_step(x, k)
+        has_occurred = durations > 0.0
         occurred_intervals = (
             slice(None) if has_occurred.all() else has_occurred
         )  # slices copy nothing
         columns = {
             name: samples[occurred_intervals].reshape(-1, *samples.shape[2:])
-            for name, samples in sampled_step.sampled_columns.items()
+            for name, samples in samples_by_name.items()
         }
         landing_foot_x = columns.pop("landing_foot_x")
         landing_foot_z = columns.pop("landing_foot_z")
-        for name in trajectory_spec.slope_position_names:
+        for name in slope_position_names:
             normal_name = f"{name[:-1]}z"
             position_x, position_z = ground.rotate_to_frame(
                 line_slopes[k], columns[name], columns[normal_name]
@@ -323,7 +309,6 @@ def sample_walk_steps(
         columns["time"] = columns["time"] + step_start_time
         columns["step"] = np.full(len(columns["time"]), k)
         columns_by_step.append(columns)
-        walk_outcome = sampled_step.outcome
         if walk_outcome == Outcome.STEPPED:
             # On even ground, the height of a foot that lands is a numerical error.
             displacement_x, displacement_z = ground.rotate_to_frame(
@@ -333,8 +318,8 @@ def sample_walk_steps(
             )
             foothold_x, foothold_z = foothold_x + displacement_x, foothold_z + displacement_z
             k += 1
-            step_start_time += float(sampled_step.durations.sum())
-            x = sampled_step.next_section_state
+            step_start_time += float(durations.sum())
+            x = next_x
             line_slopes.append(ground.find_line_slope(k, x))
     walk_columns = {
         name: np.concatenate([columns[name] for columns in columns_by_step])
@@ -352,8 +337,13 @@ StepwiseModelsAndWheels = list[tuple[Any, WheelParams]]
 
 def specify_phase_trajectory(
     models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
-) -> TrajectorySpecification:
-    """Return the trajectory specification for a model whose steps have the paper's phases."""
+) -> tuple:
+    """Return how to sample the steps of a model that has the paper's phases.
+
+    The result is (function that samples the step from a section state with an index, names of the
+    measures over time, names of the positions along the slope, additional coordinates of the
+    dataset, its attributes).
+    """
 
     def sample_phase_step(x: Array, k: int) -> SampledStep:
         step_model, step_params = models_and_wheels[k]
@@ -387,14 +377,10 @@ def specify_phase_trajectory(
             "landing_foot_z": hub_z - s.L0 * landing_leg_direction.cos,
             "phase": np.tile(np.arange(len(phase_durations))[:, None], (1, n_samples)),
         }
-        return SampledStep(
-            step_columns,
-            phase_durations,
-            Outcome(int(trajectory.outcome)),
-            trajectory.section_state,
-        )
+        outcome = Outcome(int(trajectory.outcome))
+        return step_columns, phase_durations, outcome, trajectory.section_state
 
-    return TrajectorySpecification(
+    return (
         sample_phase_step,
         tuple(TRAJECTORY_MEASURES),
         ("x", "foot_1_x", "foot_2_x", "hub_x"),
@@ -451,8 +437,9 @@ def _compute_contact_columns(
 
 def specify_contact_trajectory(
     models_and_wheels: StepwiseModelsAndWheels, options: StepOptions, n_samples: int
-) -> TrajectorySpecification:
-    """Return the trajectory specification for a model with unilateral contact.
+) -> tuple:
+    """Return how to sample the steps of a model with unilateral contact, as
+    `specify_phase_trajectory` does.
 
     Its variables are over time and leg. Leg labels are those of the current step. Each interval
     between two events has `n_samples` times, including both ends. For a `LadderWheel`, the
@@ -481,14 +468,10 @@ def specify_contact_trajectory(
             variable_name: np.full(sample_shape, int(model_selection_code))
             for variable_name, model_selection_code in trajectory.model_selection.items()
         }
-        return SampledStep(
-            step_columns,
-            trajectory.duration,
-            Outcome(int(trajectory.outcome)),
-            jnp.asarray(trajectory.section_state),
-        )
+        outcome = Outcome(int(trajectory.outcome))
+        return step_columns, trajectory.duration, outcome, jnp.asarray(trajectory.section_state)
 
-    return TrajectorySpecification(
+    return (
         sample_contact_step,
         (*CONTACT_MOTION_NAMES, *ENERGY_NAMES, *CONTACT_MEASURES),
         ("hub_x", "foot_x"),
