@@ -350,7 +350,7 @@ def test_a_single_leg_bounces_as_a_damped_oscillator():
     motion = make_resting_motion(0.0, vz=jnp.asarray(-speed))._replace(
         dL=jnp.zeros(8).at[0].set(-speed)
     )
-    lift = make_guard_layout(8, False).first_liftoff_guard
+    lift = make_guard_layout(8, False).liftoff.start
 
     @lanes.jit
     def integrate_until_lift(start):

@@ -4,7 +4,7 @@ All functions work elementwise, for one wheel or a batch.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -65,15 +65,13 @@ from vrw_jax.wheel.params import Symbols
 
 
 class ContactEvent(NamedTuple):
-    """Kind of an event, as flags for legs and contact slots.
+    """Kind of an event, as flags for legs and contact slots, in the order of `GuardLayout`.
 
     One flag of one leg or contact slot is True. `_merge_touching_contacts` may set further flags.
     """
 
     is_foot_landing: Bool[Array, "n_legs ..."]  # whether the foot meets the ground
     is_leg_meeting_stopper: Bool[Array, "n_legs ..."]  # whether the leg meets its stopper
-    # whether the stopper force of a leg in the air vanishes
-    is_leg_leaving_stopper: Bool[Array, "n_legs ..."]
     is_foot_lifting_off: Bool[Array, "2 ..."]  # whether the normal force on the foot vanishes
     # whether the foot in the slot begins to slide uphill
     is_starting_to_slide_up: Bool[Array, "2 ..."]
@@ -81,6 +79,8 @@ class ContactEvent(NamedTuple):
     is_stopping_to_slide: Bool[Array, "2 ..."]  # whether the foot in the slot stops sliding
     # whether the stopper force of the slot's leg vanishes
     is_releasing_stopper: Bool[Array, "2 ..."]
+    # whether the stopper force of a leg in the air vanishes
+    is_leg_leaving_stopper: Bool[Array, "n_legs ..."]
     # whether the function of each kink changes sign, for all legs
     is_kink_crossed: tuple[Bool[Array, "n_legs ..."], ...]
 
@@ -92,26 +92,15 @@ class ContactEvent(NamedTuple):
 
 def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> ContactEvent:
     """Return the kind of the event at which the guard with the index `guard_index` is zero."""
-    n_legs = guard_layout.n_legs
-    select_flags = lambda first_guard_index, n_guards: (
-        guard_index == first_guard_index + align_with_batch(np.arange(n_guards), guard_index)
-    )
-    return ContactEvent(
-        is_foot_landing=select_flags(guard_layout.first_landing_guard, n_legs),
-        is_leg_meeting_stopper=select_flags(guard_layout.first_stopper_guard, n_legs),
-        is_leg_leaving_stopper=select_flags(guard_layout.first_airborne_release_guard, n_legs),
-        is_foot_lifting_off=select_flags(guard_layout.first_liftoff_guard, 2),
-        is_starting_to_slide_up=select_flags(guard_layout.first_slip_up_guard, 2),
-        is_starting_to_slide_down=select_flags(guard_layout.first_slip_down_guard, 2),
-        is_stopping_to_slide=select_flags(guard_layout.first_slip_end_guard, 2),
-        is_releasing_stopper=select_flags(guard_layout.first_stopper_release_guard, 2),
-        is_kink_crossed=tuple(
-            select_flags(first_guard, n_legs)
-            for first_guard in range(
-                guard_layout.first_kink_guard, guard_layout.first_force_rate_guard, n_legs
-            )
-        ),
-    )
+    select_flags = lambda guards: guard_index == align_with_batch(np.array(guards), guard_index)
+    n_legs, first_release = len(guard_layout.landing), guard_layout.airborne_release.start
+    kinks = guard_layout.kinks[::n_legs]
+    flags: list[Any] = [
+        *map(select_flags, guard_layout[:7]),
+        select_flags(range(first_release, first_release + n_legs)),
+        tuple(select_flags(range(first, first + n_legs)) for first in kinks),
+    ]
+    return ContactEvent(*flags)
 
 
 class ContactLaw(NamedTuple):
@@ -125,7 +114,7 @@ class ContactLaw(NamedTuple):
     rest_speed: Elementwise  # speed below which a contact is at rest after an impact, m/s
     restitution: Elementwise | None = None  # Newton's coefficient of the feet
     ground_ahead: GroundAhead | None = None  # None on flat ground
-    # number of events beyond `BounceRestOptions.n_events_before_rest_speed_ramp`
+    # number of events beyond `contact_kernel.N_EVENTS_BEFORE_REST_SPEED_RAMP`
     n_late_events: Int[Array, "..."] | int = 0
 
     @property
@@ -433,11 +422,11 @@ def _solve_velocity_level(
             )
         contact_configuration = ContactConfiguration(
             s,
-            motion,
             friction,
             contact_slots,
             *chosen_combination[:2],
             is_airborne_leg_locked,
+            motion,
         )
         force_solution = (
             solve_impact(contact_configuration)
@@ -607,11 +596,11 @@ def _solve_acceleration_level(
             )
         contact_configuration = ContactConfiguration(
             s,
-            motion,
             friction,
             contact_slots,
             *chosen_combination[:2],
             is_airborne_leg_locked,
+            motion,
         )
         force_solution = solve_contact_configuration(
             contact_configuration, inverse_inertia, free_motion
@@ -762,7 +751,7 @@ def _replace_liftoff_by_slip(
     """
     contact_law, motion = stop_gradients((contact_law, motion))
     contact_configuration = ContactConfiguration(
-        contact_law.s, motion, *find_slot_contacts(contact_law.friction, *contact_state[:2])
+        contact_law.s, *find_slot_contacts(contact_law.friction, *contact_state[:2]), motion
     )
     is_starting_to_slide = (
         contact_event.is_foot_lifting_off
@@ -949,7 +938,7 @@ def project_motion(
     )
     motion = motion._replace(L=jnp.where(is_leg_locked, s.L0, L))
     contact_configuration = ContactConfiguration(
-        s, motion, *find_slot_contacts(0.0, contact_modes, is_leg_locked)
+        s, *find_slot_contacts(0.0, contact_modes, is_leg_locked), motion
     )
     is_sticking = contact_configuration.slot_modes == ContactMode.STICK
     is_first_held, is_second_held = contact_configuration.is_stopper_holding

@@ -123,7 +123,16 @@ def begin_interval(
     )
     time_unit = compute_wheel_units(dynamics.s).time_unit
     min_initiating_guard_rate = -guard_roundoff / (MAX_ROUNDOFF_FALL_DURATION * time_unit)
-    is_initiating = _find_initiating_guards(dynamics) | (
+    layout, contact_state = dynamics.guard_layout, dynamics.contact_state
+    make_false_flags = lambda n: jnp.zeros((n, *guard_values.shape[1:]), bool)
+    was_zero_at_event = [
+        contact_state.has_just_lifted,
+        contact_state.has_just_unlocked,
+        make_false_flags(layout.slip_end.start - layout.liftoff.start),
+        dynamics.contact_slots.gather_flags_from_legs(contact_state.has_just_slid),
+        make_false_flags(layout.force_rates.stop - layout.slip_end.stop),
+    ]
+    is_initiating = jnp.concatenate(was_zero_at_event) | (
         (guard_values <= guard_roundoff) & (guard_rates > min_initiating_guard_rate)
     )
     is_met = ~is_initiating & has_guard_crossed(guard_values, guard_rates)
@@ -132,24 +141,6 @@ def begin_interval(
         jnp.where(is_initiating, guard_values - 2.0 * guard_roundoff, 0.0),
         jnp.concatenate([is_initiating, jnp.zeros_like(is_initiating[:1])]),
         jnp.concatenate([is_met, jnp.abs(determinant) <= compute_painleve_tolerance(options)]),
-    )
-
-
-def _find_initiating_guards(contact_mode_dynamics: ContactModeDynamics) -> Array:
-    """Return whether each guard was zero at the event that started the contact state."""
-    contact_state = contact_mode_dynamics.contact_state
-    guard_layout = contact_mode_dynamics.guard_layout
-    make_false_flags = lambda n_guards: jnp.zeros(
-        (n_guards, *contact_state.contact_modes.shape[1:]), bool
-    )
-    return jnp.concatenate(
-        [
-            contact_state.has_just_lifted,
-            contact_state.has_just_unlocked,
-            make_false_flags(guard_layout.first_slip_end_guard - guard_layout.first_liftoff_guard),
-            contact_mode_dynamics.contact_slots.gather_flags_from_legs(contact_state.has_just_slid),
-            make_false_flags(guard_layout.n_guards - guard_layout.first_stopper_release_guard),
-        ]
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -29,7 +30,13 @@ from vrw_jax.flow.integrate import (
 )
 from vrw_jax.flow.tableaus import ButcherTableau
 from vrw_jax.lanes.batching import make_zeros_like_output
-from vrw_jax.models.contact_impacts import ContactEventResult, ContactLaw
+from vrw_jax.models.contact_impacts import (
+    ContactEventResult,
+    ContactLaw,
+    classify_event,
+    project_motion,
+    resolve_event,
+)
 from vrw_jax.models.contact_integrator import (
     IntervalGuards,
     begin_interval,
@@ -39,23 +46,19 @@ from vrw_jax.models.contact_integrator import (
 from vrw_jax.models.contact_mechanics import (
     Friction,
     WheelMotion,
+    align_with_batch,
     compute_landing_position,
     pack_motion,
     stop_gradients,
     unpack_motion,
 )
 from vrw_jax.models.contact_record import (
-    GaitStepCounters,
     GaitStepSummary,
-    UnilateralStepDetails,
+    StepRecord,
+    UnilateralStep,
     apply_friction_rule,
     compute_rest_speed,
-    count_contact_interval,
-    determine_interval_outcome,
-    init_step_counters,
-    init_step_details,
-    make_unilateral_step,
-    process_event,
+    init_step_record,
     record_contact_interval,
     record_event,
     record_force_extremum,
@@ -67,23 +70,23 @@ from vrw_jax.models.contact_section import (
     unpack_section_state,
 )
 from vrw_jax.models.contact_state import (
+    N_FORCE_RATES,
     N_LOSSES,
     ContactModeDynamics,
     ContactState,
     GuardLayout,
-    NormalForceRates,
     choose_stopping_guard,
     compute_contact_quantities,
-    flag_zero_force_rates,
+    compute_force_rates,
     is_wheel_at_rest,
     make_contact_mode_dynamics,
     make_guard_layout,
     unpack_state,
-    update_force_rate_signs,
 )
 from vrw_jax.models.phase_sequence import find_stance_slope
 from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.laws import count_kinks
+from vrw_jax.wheel.outcomes import ContactMode, replace_rest_outcome
 from vrw_jax.wheel.params import (
     NO_LAWS,
     PARAMETER_NAMES,
@@ -107,6 +110,11 @@ input, its column is last.
 """
 MAX_ITERATIONS_WITH_WAITING_LANE = 4
 """Number of solver steps after which an element at an event ends the loop for the batch."""
+# Number of events in a step after which each event raises the rest speed by its initial value. If a
+# quarter of the allowed events is more, that number is used instead. The value is chosen because
+# walking steps have 4 to 60 events, and chains of ever smaller bounces have hundreds. After 400
+# events, the smallest resolved bounce is as large as with a tolerance of 1e-6 at the first event.
+N_EVENTS_BEFORE_REST_SPEED_RAMP = 100
 STATUS_UNFINISHED = -1
 """Value that replaces the outcome code as long as a walk is unfinished."""
 
@@ -137,9 +145,7 @@ class LaneState(NamedTuple):
     q: Array  # hub x, hub z, theta and leg lengths, (3 + n, batch)
     v: Array  # their rates and, if details are requested, the losses in the last interval
     interval_duration: Array  # s
-    step_losses: Array | None  # losses and slip in this step, (N_LOSSES, batch), if requested
-    step_counters: GaitStepCounters  # counters of this step; solver steps are counted over the walk
-    step_details: UnilateralStepDetails | None  # details of this step, if requested
+    step_record: StepRecord
     contact_state: ContactState  # contact state in the last interval
     guard_index: Array  # index of the guard of the event
     is_resting: Array  # whether the wheel is at rest
@@ -257,18 +263,15 @@ class BatchWalkSettings(NamedTuple):
             self.unpack_input_columns(input_columns)[0], section_state
         )
         if self.measures_force_peaks:
-            unit_signs = jnp.stack([jnp.ones_like(motion.x)] * len(NormalForceRates._fields))
+            unit_signs = jnp.stack([jnp.ones_like(motion.x)] * N_FORCE_RATES)
             contact_state = contact_state._replace(force_rate_signs=unit_signs)
         zeros = jnp.zeros(motion.x.shape, jnp.int32)
         q, v = self._pack_start(motion)
-        losses, counters, details = self._init_step_records(motion.x)
         return LaneState(
             q,
             v,
             jnp.zeros_like(motion.x),
-            losses,
-            counters,
-            details,
+            init_step_record(motion.x, self.is_detailed, self.measures_force_peaks),
             contact_state,
             guard_index=zeros,
             is_resting=zeros > 0,
@@ -282,16 +285,6 @@ class BatchWalkSettings(NamedTuple):
         """Return coordinates and rates at the start of an interval, before any loss."""
         q, v = pack_motion(motion)
         return q, jnp.concatenate([v, jnp.zeros_like(q[: N_LOSSES * self.is_detailed])])
-
-    def _init_step_records(
-        self, lane_template: Array
-    ) -> tuple[Array | None, GaitStepCounters, UnilateralStepDetails | None]:
-        """Return losses, counters and details at the start of a step."""
-        counters = init_step_counters(lane_template)
-        if not self.is_detailed:
-            return None, counters, None
-        losses = jnp.zeros((N_LOSSES, *lane_template.shape), lane_template.dtype)
-        return losses, counters, init_step_details(lane_template, self.measures_force_peaks)
 
     def process_events(self, input_columns: Array, lane_state: LaneState) -> LaneState:
         """Return the state of all batch elements after their events are resolved.
@@ -329,44 +322,39 @@ class BatchWalkSettings(NamedTuple):
     def _has_landed(self, lane_state: LaneState) -> Array:
         """Return whether the foremost foot lands at the event."""
         return (lane_state.interval_outcome == Outcome.STEPPED) & (
-            lane_state.guard_index == self.guard_layout.foremost_landing_guard
+            lane_state.guard_index == self.guard_layout.landing[-1]
         )
 
     def _end_interval(self, input_columns: Array, lane_state: LaneState) -> LaneState:
         """Return the state with the last interval recorded, and the outcomes of ended walks."""
-        step_counters = count_contact_interval(
-            lane_state.step_counters,
-            lane_state.contact_state,
-            lane_state.interval_duration,
-            lane_state.n_solver_steps,
+        record, duration = lane_state.step_record, lane_state.interval_duration
+        n_loaded_feet = jnp.sum(lane_state.contact_state.contact_modes != ContactMode.OFF, axis=0)
+        has_foot_count = jnp.stack([n_loaded_feet == n_feet for n_feet in (2, 1, 0)])
+        record = record._replace(
+            durations=record.durations + jnp.where(has_foot_count, duration, 0.0),
+            solver_steps=record.solver_steps + lane_state.n_solver_steps,
         )
-        step_details: Any = lane_state.step_details
-        step_losses: Any = lane_state.step_losses
-        n_events = step_counters.n_events
+        n_events = record.events
         if self.is_detailed:
             dynamics = self.make_lane_contact_dynamics(input_columns, lane_state.contact_state)
-            step_details = record_contact_interval(
-                step_details, dynamics, lane_state.motion, lane_state.interval_duration
-            )
-            step_losses = step_losses + lane_state.v[len(lane_state.q) :]
+            record = record_contact_interval(record, dynamics, lane_state.motion, duration)
+            record = record._replace(losses=record.losses + lane_state.v[len(lane_state.q) :])
         if self.measures_force_peaks:
-            n_events = n_events + step_details.force_peaks.n_force_extrema
-        has_landed = self._has_landed(lane_state)
-        outcome = determine_interval_outcome(
-            n_events,
-            self.guard_layout,
-            lane_state.guard_index,
-            has_landed,
-            lane_state.interval_outcome,
-            lane_state.is_resting,
-            self.max_events,
-        ).astype(jnp.int32)
+            n_events = n_events + record.force_peaks.n_force_extrema
+        has_landed, interval_outcome = self._has_landed(lane_state), lane_state.interval_outcome
+        outcome = jnp.where(n_events >= self.max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
+        for guard, guard_outcome in (
+            (self.guard_layout.rolling_rate.start, Outcome.FELL_BACK),
+            (self.guard_layout.collapse.start, Outcome.COLLAPSED),
+        ):
+            outcome = jnp.where(lane_state.guard_index == guard, guard_outcome, outcome)
+        outcome = jnp.where(has_landed, Outcome.STEPPED, outcome)
+        outcome = jnp.where(interval_outcome == Outcome.STEPPED, outcome, interval_outcome)
+        outcome = replace_rest_outcome(outcome, lane_state.is_resting).astype(jnp.int32)
         n_stepped = lane_state.n_stepped + has_landed
         has_ended = (outcome != Outcome.STEPPED) | (has_landed & (n_stepped >= self.n_steps))
         return lane_state._replace(
-            step_counters=step_counters,
-            step_details=step_details,
-            step_losses=step_losses,
+            step_record=record,
             n_stepped=n_stepped,
             walk_outcome=jnp.where(has_ended, outcome, lane_state.walk_outcome),
         )
@@ -378,19 +366,15 @@ class BatchWalkSettings(NamedTuple):
             s, pack_section_state(s, lane_state.motion, contact_state)
         )
         q, v = self._pack_start(motion)
-        losses, counters, details = self._init_step_records(motion.x)
+        record = init_step_record(motion.x, self.is_detailed, self.measures_force_peaks)
         begun = lane_state._replace(
             q=q,
             v=v,
-            step_losses=losses,
-            step_counters=counters._replace(n_solver_steps=lane_state.step_counters.n_solver_steps),
-            step_details=details,
+            step_record=record._replace(solver_steps=lane_state.step_record.solver_steps),
             contact_state=start_contact_state._replace(
                 force_rate_signs=contact_state.force_rate_signs
             ),
-            guard_index=jnp.full_like(
-                lane_state.guard_index, self.guard_layout.first_landing_guard
-            ),
+            guard_index=jnp.full_like(lane_state.guard_index, self.guard_layout.landing.start),
         )
         return select_trees_by_condition(self._has_landed(lane_state), begun, lane_state)
 
@@ -398,8 +382,8 @@ class BatchWalkSettings(NamedTuple):
         """Return the state at the start of the next interval."""
         s, friction = self.unpack_input_columns(input_columns)
         motion, contact_state = lane_state.motion, lane_state.contact_state
-        guard_index, step_counters = lane_state.guard_index, lane_state.step_counters
-        step_details: Any = lane_state.step_details
+        guard_index, record = lane_state.guard_index, lane_state.step_record
+        first_ramp_event = max(N_EVENTS_BEFORE_REST_SPEED_RAMP, self.max_events // 4)
         contact_law = ContactLaw(
             s,
             friction,
@@ -408,30 +392,29 @@ class BatchWalkSettings(NamedTuple):
             compute_rest_speed(s, self.step_options),
             input_columns[-1] if self.has_restitution else None,
             self.extract_ground_ahead(input_columns),
+            jnp.maximum(record.events - first_ramp_event, 0),
         )
-        event_result, contact_event, event_outcome = process_event(
-            contact_law,
-            self.guard_layout,
-            motion,
-            contact_state,
-            guard_index,
-            step_counters.n_events,
-            self.max_events,
-        )
+        # Integration errors move feet off the ground. The height of a foot that lifts off grows
+        # with the third power of time, so without the projection it would land again immediately.
+        projected_motion = project_motion(s, motion, *contact_state[:2])
+        contact_event = classify_event(self.guard_layout, guard_index)
+        event_result = resolve_event(contact_law, projected_motion, contact_state, contact_event)
+        is_solved = event_result.n_solutions > 0
+        outcome = jnp.where(is_solved, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT)
+        outcome = jnp.where(event_result.is_painleve_paradox, Outcome.PAINLEVE_PARADOX, outcome)
+        outcome = jnp.where(event_result.has_third_foot, Outcome.THREE_FEET_LOADED, outcome)
         n_contact_events: Any = 1
         if self.measures_force_peaks:
-            is_contact_event = guard_index < self.guard_layout.first_force_rate_guard
+            is_contact_event = guard_index < self.guard_layout.force_rates.start
             n_contact_events = is_contact_event.astype(jnp.int32)
-            event_outcome = jnp.where(is_contact_event, event_outcome, Outcome.STEPPED)
-            step_details, event_result = self._record_force_extrema(
+            outcome = jnp.where(is_contact_event, outcome, Outcome.STEPPED)
+            record, event_result = self._record_force_extrema(
                 input_columns, lane_state, event_result, is_contact_event
             )
         if self.is_detailed:
-            step_details = record_event(
-                step_details, step_counters.n_events == 0, event_result, contact_event
-            )
-            step_details = record_contact_interval(
-                step_details,
+            record = record_event(record, event_result, contact_event)
+            record = record_contact_interval(
+                record,
                 self.make_lane_contact_dynamics(input_columns, event_result.contact_state),
                 event_result.motion,
                 jnp.zeros_like(motion.x),
@@ -441,13 +424,10 @@ class BatchWalkSettings(NamedTuple):
             q=q,
             v=v,
             interval_duration=jnp.zeros_like(motion.x),
-            step_counters=step_counters._replace(
-                n_events=step_counters.n_events + n_contact_events
-            ),
-            step_details=step_details,
+            step_record=record._replace(events=record.events + n_contact_events),
             contact_state=event_result.contact_state,
             n_solver_steps=jnp.zeros_like(guard_index),
-            interval_outcome=event_outcome,
+            interval_outcome=outcome.astype(jnp.int32),
         )
 
     def _record_force_extrema(
@@ -456,17 +436,18 @@ class BatchWalkSettings(NamedTuple):
         lane_state: LaneState,
         event_result: ContactEventResult,
         is_contact_event: Array,
-    ) -> tuple[UnilateralStepDetails, ContactEventResult]:
-        """Return details with the extrema of forces, and an event that continues through them.
+    ) -> tuple[StepRecord, ContactEventResult]:
+        """Return the record with the extrema of forces, and an event that continues through them.
 
         At the extremum of a force, motion and contacts continue without change.
         """
-        step_details: Any = lane_state.step_details
+        record, guard_index = lane_state.step_record, lane_state.guard_index
         motion, contact_state = lane_state.motion, lane_state.contact_state
         assert contact_state.force_rate_signs is not None
-        is_rate_zero = flag_zero_force_rates(self.guard_layout, lane_state.guard_index)
+        rate_guards = align_with_batch(np.array(self.guard_layout.force_rates), guard_index)
+        is_rate_zero = guard_index == rate_guards
         force_peaks = record_force_extremum(
-            step_details.force_peaks,
+            record.force_peaks,
             is_rate_zero,
             self.make_lane_contact_dynamics(input_columns, contact_state),
             motion,
@@ -481,13 +462,15 @@ class BatchWalkSettings(NamedTuple):
                 ),
             ),
         )
-        force_rate_signs = update_force_rate_signs(
-            self.make_lane_contact_dynamics(input_columns, next_contact_state),
-            motion,
-            contact_state.force_rate_signs,
+        next_dynamics = self.make_lane_contact_dynamics(input_columns, next_contact_state)
+        force_rates = compute_force_rates(*stop_gradients((next_dynamics, motion)))
+        # A rate that is zero at the event changes its sign.
+        force_rate_signs = jnp.where(
             is_rate_zero,
+            -contact_state.force_rate_signs,
+            jnp.where(force_rates < 0.0, -1.0, 1.0),
         )
-        return step_details._replace(force_peaks=force_peaks), event_result._replace(
+        return record._replace(force_peaks=force_peaks), event_result._replace(
             motion=motion,
             contact_state=next_contact_state._replace(force_rate_signs=force_rate_signs),
         )
@@ -547,7 +530,7 @@ class BatchWalkSettings(NamedTuple):
         )
         outcome = jnp.where((guard_index >= 0) | phase_end.is_unfinished, Outcome.STEPPED, outcome)
         outcome = jnp.where(
-            guard_index == self.guard_layout.n_guards, Outcome.PAINLEVE_PARADOX, outcome
+            guard_index == self.guard_layout.force_rates.stop, Outcome.PAINLEVE_PARADOX, outcome
         )
         lane_state = lane_state._replace(
             q=q,
@@ -566,15 +549,23 @@ class BatchWalkSettings(NamedTuple):
     def compute_step_result(self, lane_state: LaneState, input_columns: Array) -> Any:
         """Return the results of the last step of all batch elements, whose walks have ended."""
         step_summary = self.summarize_step(lane_state, input_columns)
-        if lane_state.step_details is None or lane_state.step_losses is None:
+        if not self.is_detailed:
             return step_summary
-        return make_unilateral_step(
-            step_summary,
-            lane_state.step_losses,
-            lane_state.step_counters,
-            lane_state.step_details,
-            lane_state.walk_outcome,
-            self.engine_name,
+        results = lane_state.step_record._asdict() | step_summary._asdict()
+        damping_loss, friction_loss, slip = results.pop("losses")
+        results["margins"] = jax.tree.map(
+            lambda margin: jnp.where(jnp.isfinite(margin), margin, 0.0), results["margins"]
+        )
+        results["fewest_solutions"] = jnp.where(
+            results["events"] > 0, results["fewest_solutions"], 0
+        )
+        return UnilateralStep(
+            **results,
+            energy_damping=damping_loss,
+            energy_friction=friction_loss,
+            slip=slip,
+            outcome=lane_state.walk_outcome,
+            engine=self.engine_name,
         )
 
     def summarize_step(self, lane_state: LaneState, input_columns: Array) -> GaitStepSummary:
@@ -594,7 +585,7 @@ class BatchWalkSettings(NamedTuple):
         )
         return GaitStepSummary(
             zero_unless_stepped(section_state),
-            lane_state.step_counters.durations,
+            lane_state.step_record.durations,
             zero_unless_stepped(compute_landing_position(motion)),
         )
 
@@ -673,7 +664,7 @@ def run_walks(
         1
     ]
     should_continue = lambda lane_state: jnp.any(
-        make_opaque_loop_condition(lane_state.is_unfinished, lane_state.step_counters.n_events)
+        make_opaque_loop_condition(lane_state.is_unfinished, lane_state.step_record.events)
     )
     lane_state = lax.while_loop(should_continue, run_iteration, lane_state)
     return make_walk_result(
@@ -687,5 +678,5 @@ def make_walk_result(step_result: Any, lane_state: LaneState) -> BatchWalkResult
         step_result,
         lane_state.walk_outcome,
         lane_state.n_stepped,
-        lane_state.step_counters.n_solver_steps,
+        lane_state.step_record.solver_steps,
     )

@@ -96,65 +96,52 @@ def replace_infinite_friction(friction: Elementwise) -> Array:
     return jnp.where(jnp.isfinite(friction), friction, 0.0)
 
 
-class _FootEquations(NamedTuple):
-    """Coefficients of the equations for the feet in contact, for one combination of modes.
+REFERENCE_MASS_RATIO = 18.0
+"""Ratio of total mass to leg mass that scales the determinant of the contact equations.
+
+At this ratio, resting and sliding feet have the same scale in the determinant. The value is that of
+the wheel in Table 1 of the paper, chosen because `painleve_atol` was measured for this wheel.
+"""
+
+
+def _solve_slot_forces(
+    s: Symbols,
+    inverse_inertia: ContactInverseInertia,
+    free_motion: FreeMotion,
+    slot_modes: Array,
+    is_stopper_holding: Array,
+    friction: SlotArray,
+    opaque_one: Array,
+) -> tuple[SlotArray, SlotArray, SlotArray, Array]:
+    """Return the forces in the contact slots, and the determinant of the foot equations.
+
+    The result is (stopper forces, foot forces transverse to the legs, foot forces along the legs,
+    determinant).
 
     The unknown c is the transverse force on a sticking foot. For a sliding foot, c is the normal
     force. In the limit of infinite friction, c is the friction force instead. For an unloaded foot,
-    c = 0.
+    c = 0. The stopper forces s are eliminated first: they solve N s = p + P c. For an open stopper,
+    the corresponding equation is s = 0, so the system is always regular. In matrices, the first
+    index is that of the equation.
     """
-
-    is_foot_sticking: Bool[Array, "2 ..."]
-    is_foot_loaded: Bool[Array, "2 ..."]
-    unit_force_transverse: SlotArray  # transverse force for c = 1
-    unit_force_radial: SlotArray  # force along the leg for c = 1; 0 for a sticking foot
-    # weight of the foot's transverse motion in the condition
-    condition_weight_transverse: SlotArray
-    condition_weight_radial: SlotArray  # weight of the force on the leg's mass in the condition
-
-
-def _make_foot_equations(
-    s: Symbols, inverse_inertia: ContactInverseInertia, slot_modes: Array, friction: SlotArray
-) -> _FootEquations:
-    """Return the coefficients of the contact equations for the feet in both contact slots."""
-    sin, cos = inverse_inertia.sin, inverse_inertia.cos
+    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
     sliding_coefficient = jnp.where(friction == jnp.inf, 1.0, replace_infinite_friction(friction))
     normal_force_factor = jnp.where(friction == jnp.inf, 0.0, 1.0)
     is_sticking = slot_modes == ContactMode.STICK
     slides_down = slot_modes == ContactMode.SLIP_DOWN
     is_sliding = slides_down | (slot_modes == ContactMode.SLIP_UP)
+    is_loaded = is_sticking | is_sliding
     friction_factor = jnp.where(slides_down, -sliding_coefficient, sliding_coefficient)
     select_by_mode = lambda sticking_value, sliding_value: jnp.where(
         is_sticking, sticking_value, jnp.where(is_sliding, sliding_value, 0.0)
     )
-    return _FootEquations(
-        is_foot_sticking=is_sticking,
-        is_foot_loaded=is_sticking | is_sliding,
-        unit_force_transverse=select_by_mode(
-            1.0, friction_factor * cos - normal_force_factor * sin
-        ),
-        unit_force_radial=select_by_mode(0.0, friction_factor * sin + normal_force_factor * cos),
-        condition_weight_transverse=select_by_mode(1.0, -sin),
-        condition_weight_radial=select_by_mode(0.0, cos * (1.0 / s.m)),
-    )
+    # These are the force on a foot for c = 1, and the weights of the foot's transverse motion and
+    # of the force on the leg's mass in the foot's condition.
+    force_transverse = select_by_mode(1.0, friction_factor * cos - normal_force_factor * sin)
+    force_radial = select_by_mode(0.0, friction_factor * sin + normal_force_factor * cos)
+    weight_transverse = select_by_mode(1.0, -sin)
+    weight_radial = select_by_mode(0.0, cos * inverse_leg_mass)
 
-
-def _eliminate_stoppers(
-    s: Symbols,
-    inverse_inertia: ContactInverseInertia,
-    free_motion: FreeMotion,
-    is_stopper_holding: Array,
-    foot_equations: _FootEquations,
-    opaque_one: Array,
-) -> tuple[SlotArray, Array]:
-    """Return the stopper forces without foot forces, and their change due to c = 1 at each foot.
-
-    The unknown c is defined in `_FootEquations`. The second result has the indices [stopper, foot].
-    The stopper forces s solve N s = p + P c. For an open stopper, the corresponding equation is s =
-    0, so the system is always regular.
-    """
-    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
-    is_sticking = foot_equations.is_foot_sticking
     leg_compliance = jnp.where(is_sticking, 0.0, inverse_leg_mass)
     N = jnp.where(
         is_stopper_holding[:, None],
@@ -172,51 +159,21 @@ def _eliminate_stoppers(
     p = jnp.where(is_stopper_holding, free_length_motion, 0.0)
     P = jnp.where(
         is_stopper_holding[:, None],
-        inverse_inertia.H * foot_equations.unit_force_transverse
-        - _make_diagonal_matrix(foot_equations.unit_force_radial * inverse_leg_mass),
+        inverse_inertia.H * force_transverse
+        - _make_diagonal_matrix(force_radial * inverse_leg_mass),
         0.0,
     )
     p, P, N = prevent_fusion((p, P, N), opaque_one)
-    return prevent_fusion((_solve_2x2_system(N, p), _solve_2x2_system(N, P)), opaque_one)
+    stopper_without_feet, stopper_response = prevent_fusion(
+        (_solve_2x2_system(N, p), _solve_2x2_system(N, P)), opaque_one
+    )
 
-
-REFERENCE_MASS_RATIO = 18.0
-"""Ratio of total mass to leg mass that scales the determinant of the contact equations.
-
-At this ratio, resting and sliding feet have the same scale in the determinant. The value is that of
-the wheel in Table 1 of the paper, chosen because `painleve_atol` was measured for this wheel.
-"""
-
-
-def _solve_foot_forces(
-    s: Symbols,
-    inverse_inertia: ContactInverseInertia,
-    free_motion: FreeMotion,
-    foot_equations: _FootEquations,
-    stopper_without_feet: SlotArray,
-    stopper_response: Array,
-    opaque_one: Array,
-) -> tuple[SlotArray, SlotArray, SlotArray, Array]:
-    """Return the stopper forces, the foot forces and the determinant of the foot equations.
-
-    The result is (stopper forces, foot forces transverse to the legs, foot forces along the legs,
-    determinant). The arguments `stopper_without_feet` and `stopper_response` are the results of
-    `_eliminate_stoppers`.
-    """
-    (
-        is_sticking,
-        is_loaded,
-        unit_force_transverse,
-        unit_force_radial,
-        weight_transverse,
-        weight_radial,
-    ) = foot_equations
     R = _make_diagonal_matrix(weight_radial) - weight_transverse[:, None] * jnp.swapaxes(
         inverse_inertia.H, 0, 1
     )
     C = (
-        weight_transverse[:, None] * inverse_inertia.G * unit_force_transverse
-        + _make_diagonal_matrix(weight_radial * unit_force_radial)
+        weight_transverse[:, None] * inverse_inertia.G * force_transverse
+        + _make_diagonal_matrix(weight_radial * force_radial)
         + R[:, :1] * stopper_response[0]
         + R[:, 1:] * stopper_response[1]
         + _make_diagonal_matrix(jnp.where(is_loaded, 0.0, 1.0))
@@ -233,16 +190,13 @@ def _solve_foot_forces(
         stopper_without_feet + stopper_response[:, 0] * c[0] + stopper_response[:, 1] * c[1]
     )
     foot_force_radial = jnp.where(
-        is_sticking,
-        -s.m * free_motion.foot_radial_motion - stopper_force,
-        unit_force_radial * c,
+        is_sticking, -s.m * free_motion.foot_radial_motion - stopper_force, force_radial * c
     )
     scale_masses = jnp.where(is_sticking, s.Mt / REFERENCE_MASS_RATIO, s.m)
     scale_masses = jnp.where(is_loaded, scale_masses, 1.0)
     painleve_determinant = scale_masses[0] * scale_masses[1] * _compute_determinant(C)
     return prevent_fusion(
-        (stopper_force, unit_force_transverse * c, foot_force_radial, painleve_determinant),
-        opaque_one,
+        (stopper_force, force_transverse * c, foot_force_radial, painleve_determinant), opaque_one
     )
 
 
@@ -262,17 +216,13 @@ def solve_combination(
     - `friction`: friction coefficient of the foot in each contact slot, shape (2, ...).
 
     A sticking foot stays at rest. A sliding foot stays on the ground, with friction against the
-    slip. A leg on its stopper has a constant length. The stopper forces are eliminated first.
+    slip. A leg on its stopper has a constant length.
     """
     sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
     opaque_one = make_opaque_one(free_motion.hub_motion[2])
-    foot_equations = _make_foot_equations(s, inverse_inertia, slot_modes, friction)
-    stopper_system = _eliminate_stoppers(
-        s, inverse_inertia, free_motion, is_stopper_holding, foot_equations, opaque_one
-    )
     stopper_force, foot_force_transverse, foot_force_radial, painleve_determinant = (
-        _solve_foot_forces(
-            s, inverse_inertia, free_motion, foot_equations, *stopper_system, opaque_one
+        _solve_slot_forces(
+            s, inverse_inertia, free_motion, slot_modes, is_stopper_holding, friction, opaque_one
         )
     )
     leg_pull_forces = foot_force_radial + stopper_force
@@ -360,32 +310,23 @@ CombinationMask = Int[Array, "2 ..."]
 """Set of combinations, with one bit per combination in two 32-bit integers."""
 
 
-class _ModeCombinationTable(NamedTuple):
-    """Bit masks that mark the combinations with a given contact mode or closed stopper.
+def _mask_combinations(indices: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
+    """Return bit masks that mark the combinations with a given contact mode or closed stopper.
 
-    Bit i of a mask belongs to combination i, in the order of `from_indices`. The last of the listed
-    axes is that of the two integers of a `CombinationMask`.
+    Bit i of a mask belongs to combination `indices[i]`. The masks for modes are indexed by slot and
+    mode, (2, 4, 2), and those for stoppers by slot, (2, 2). The last axis is that of the two
+    integers of a `CombinationMask`.
     """
+    is_mode = CONTACT_MODE_TABLE[indices].T[:, None] == np.array(ContactMode)[:, None]
 
-    masks_by_slot_mode: Any  # indexed by slot and mode, (2, 4, 2, ...)
-    masks_by_held_stopper: Any  # indexed by slot, (2, 2, ...)
+    def pack_bits(is_member: np.ndarray) -> np.ndarray:
+        padded_flags = np.concatenate([is_member, np.zeros_like(is_member[..., :1])], -1)
+        return np.packbits(padded_flags, axis=-1, bitorder="little").copy().view("<i4")
 
-    @classmethod
-    def from_indices(cls, indices: np.ndarray) -> "_ModeCombinationTable":
-        """Return the bit masks for the combinations in the order `indices`."""
-        is_mode = CONTACT_MODE_TABLE[indices].T[:, None] == np.array(ContactMode)[:, None]
-
-        def pack_bits(is_member: np.ndarray) -> np.ndarray:
-            padded_flags = np.concatenate([is_member, np.zeros_like(is_member[..., :1])], -1)
-            return np.packbits(padded_flags, axis=-1, bitorder="little").copy().view("<i4")
-
-        return cls(pack_bits(is_mode), pack_bits(HELD_STOPPER_TABLE[indices].T))
+    return pack_bits(is_mode), pack_bits(HELD_STOPPER_TABLE[indices].T)
 
 
-_COMBINATION_TABLES = (
-    _ModeCombinationTable.from_indices(PAPER_RULE_ORDER),
-    _ModeCombinationTable.from_indices(np.arange(len(CONTACT_MODE_TABLE))),
-)
+_COMBINATION_TABLES = _mask_combinations(PAPER_RULE_ORDER), _mask_combinations(slice(None))
 
 
 class AllowedContactModes(NamedTuple):
@@ -401,17 +342,13 @@ class AllowedContactModes(NamedTuple):
     is_open_stopper_untested: Bool[Array, "2 ..."]  # whether an open stopper needs no test
 
     def mask_allowed_combinations(
-        self, mode_combination_table: _ModeCombinationTable
+        self, masks_by_slot_mode: Array, masks_by_held_stopper: Array
     ) -> CombinationMask:
-        """Return the bit mask of the combinations in `mode_combination_table` that are allowed."""
+        """Return the bit mask of the combinations that are allowed; see `_mask_combinations`."""
         modes = align_with_batch(np.array(ContactMode), self.allowed_slot_modes[0])
         is_mode_allowed = is_mode_in_set(self.allowed_slot_modes[:, None], modes)
-        mode_masks = jnp.where(
-            is_mode_allowed[:, :, None], mode_combination_table.masks_by_slot_mode, 0
-        )
-        stopper_masks = jnp.where(
-            self.can_hold_stopper[:, None], -1, ~mode_combination_table.masks_by_held_stopper
-        )
+        mode_masks = jnp.where(is_mode_allowed[:, :, None], masks_by_slot_mode, 0)
+        stopper_masks = jnp.where(self.can_hold_stopper[:, None], -1, ~masks_by_held_stopper)
         slot_masks = jnp.sum(mode_masks, axis=1, dtype=jnp.int32) & stopper_masks
         return slot_masks[0] & slot_masks[1]
 
@@ -579,7 +516,7 @@ def choose_combination(
         lax.stop_gradient(tolerances),
     )
     uses_paper_rule = jnp.all(friction == PAPER_RULE_SENTINEL, axis=0)
-    mode_combination_table = jax.tree.map(
+    masks_by_slot_mode, masks_by_held_stopper = mode_combination_table = jax.tree.map(
         lambda *masks: jnp.where(
             uses_paper_rule, *(align_with_batch(mask, uses_paper_rule) for mask in masks)
         ),
@@ -588,7 +525,6 @@ def choose_combination(
     modes = align_with_batch(np.array(ContactMode), uses_paper_rule)
 
     def decode_mode_combination(combination: CombinationMask) -> tuple[Array, Array]:
-        masks_by_slot_mode, masks_by_held_stopper = mode_combination_table
         has_mode = jnp.any(masks_by_slot_mode & combination != 0, axis=2)
         slot_modes = jnp.sum(jnp.where(has_mode, modes, 0), axis=1, dtype=jnp.int32)
         return slot_modes, jnp.any(masks_by_held_stopper & combination != 0, axis=1)
@@ -635,7 +571,7 @@ def choose_combination(
             mode_enumeration_state,
         )
 
-    untested_mask = allowed_modes.mask_allowed_combinations(mode_combination_table)
+    untested_mask = allowed_modes.mask_allowed_combinations(*mode_combination_table)
     infinite_sign_violation = jnp.full_like(lax.stop_gradient(free_motion.hub_motion[2]), jnp.inf)
     initial_state = _ModeEnumerationState(
         untested_mask,

@@ -6,38 +6,27 @@ lands.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise
-from vrw_jax.models.contact_impacts import (
-    ContactEvent,
-    ContactEventResult,
-    ContactLaw,
-    classify_event,
-    project_motion,
-    resolve_event,
-)
+from vrw_jax.models.contact_impacts import ContactEvent, ContactEventResult
 from vrw_jax.models.contact_mechanics import WheelMotion, align_with_batch
 from vrw_jax.models.contact_modes import PAPER_RULE_SENTINEL
-from vrw_jax.models.contact_section import FullState
 from vrw_jax.models.contact_state import (
+    N_LOSSES,
     ContactModeDynamics,
-    ContactState,
-    GuardLayout,
     compute_forces,
     compute_normal_force_rates,
     split_normal_forces,
 )
 from vrw_jax.models.step_results import AbstractContactStep
-from vrw_jax.wheel.outcomes import ContactMode, replace_rest_outcome
+from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols
 
 # Smallest height of a resolved bounce, divided by absolute tolerance and leg length.
@@ -76,47 +65,6 @@ def compute_rest_speed(s: Symbols, options: StepOptions) -> Elementwise:
     return jnp.sqrt(2.0 * s.g * compute_min_bounce_height(s.L0, options))
 
 
-# Number of events in a step after which each event raises the rest speed by its initial value. If a
-# quarter of the allowed events is more, that number is used instead. The value is chosen because
-# walking steps have 4 to 60 events, and chains of ever smaller bounces have hundreds. After 400
-# events, the smallest resolved bounce is as large as with a tolerance of 1e-6 at the first event.
-N_EVENTS_BEFORE_REST_SPEED_RAMP = 100
-
-
-def process_event(
-    contact_law: ContactLaw,
-    guard_layout: GuardLayout,
-    motion: WheelMotion,
-    contact_state: ContactState,
-    guard_index: Int[Array, "..."],
-    n_events: Int[Array, "..."],
-    max_events: int,
-) -> tuple[ContactEventResult, ContactEvent, Int[Array, "..."]]:
-    """Return the result of an event, its kind, and its outcome (STEPPED if the event is resolved).
-
-    - `guard_index`: index of the guard that is zero at the event;
-    - `n_events`: number of earlier events in this walking step;
-    - `max_events`: largest number of events in a walking step.
-
-    The motion is first projected onto its contact constraints, because integration errors move feet
-    off the ground. The height of a foot that lifts off grows with the third power of time. Without
-    the projection, the foot would land again immediately.
-    """
-    first_ramp_event = max(N_EVENTS_BEFORE_REST_SPEED_RAMP, max_events // 4)
-    contact_law = contact_law._replace(n_late_events=jnp.maximum(n_events - first_ramp_event, 0))
-    motion = project_motion(
-        contact_law.s, motion, contact_state.contact_modes, contact_state.is_leg_locked
-    )
-    contact_event = classify_event(guard_layout, guard_index)
-    event_result = resolve_event(contact_law, motion, contact_state, contact_event)
-    outcome = jnp.where(
-        event_result.n_solutions > 0, Outcome.STEPPED, Outcome.NO_ADMISSIBLE_CONTACT
-    )
-    outcome = jnp.where(event_result.is_painleve_paradox, Outcome.PAINLEVE_PARADOX, outcome)
-    outcome = jnp.where(event_result.has_third_foot, Outcome.THREE_FEET_LOADED, outcome)
-    return event_result, contact_event, outcome.astype(jnp.int32)
-
-
 class UnilateralMargins(eqx.Module):
     """Margins for bilateral stoppers during one walking step.
 
@@ -125,65 +73,6 @@ class UnilateralMargins(eqx.Module):
 
     stopper_force: Elementwise  # minimum over locked legs in the air, N
     stopper_impulse: Elementwise  # minimum over locked legs in the air, N s
-
-
-class GaitStepCounters(NamedTuple):
-    """Numbers of events and solver steps in a walking step, and durations by loaded feet."""
-
-    n_events: Int[Array, "..."]  # number of changes of contacts and stoppers, and of kinks
-    durations: Float[Array, "3 ..."]  # durations with two, one and no loaded feet, s
-    n_solver_steps: Int[Array, "..."]  # number of attempted solver steps
-
-
-def init_step_counters(lane_template: Array) -> GaitStepCounters:
-    """Return step counters with the value 0, with the batch shape and dtype of `lane_template`."""
-    int_zeros = jnp.zeros(lane_template.shape, jnp.int32)
-    return GaitStepCounters(
-        int_zeros, jnp.zeros((3, *lane_template.shape), lane_template.dtype), int_zeros
-    )
-
-
-def count_contact_interval(
-    step_counters: GaitStepCounters,
-    contact_state: ContactState,
-    duration: Elementwise,
-    n_solver_steps: Array,
-) -> GaitStepCounters:
-    """Return the step counters after one more interval in the contact state `contact_state`.
-
-    - `duration`: length of the interval, s;
-    - `n_solver_steps`: number of solver steps in the interval.
-    """
-    n_loaded_feet = jnp.sum(contact_state.contact_modes != ContactMode.OFF, axis=0)
-    has_foot_count = jnp.stack([n_loaded_feet == n_feet for n_feet in (2, 1, 0)])
-    durations = step_counters.durations + jnp.where(has_foot_count, duration, 0.0)
-    return step_counters._replace(
-        durations=durations, n_solver_steps=step_counters.n_solver_steps + n_solver_steps
-    )
-
-
-def determine_interval_outcome(
-    n_events: Int[Array, "..."],
-    guard_layout: GuardLayout,
-    guard_index: Array,
-    has_landed: Array,
-    interval_outcome: Array,
-    is_resting: Array,
-    max_events: int,
-) -> Int[Array, "..."]:
-    """Return the outcome after an interval of a walk.
-
-    The result is STEPPED if the walk continues or the foremost foot has landed.
-
-    If the interval did not end at an event, the result is `interval_outcome`. If the wheel is at
-    rest, the result is CAME_TO_REST.
-    """
-    outcome = jnp.where(n_events >= max_events, Outcome.TOO_MANY_EVENTS, Outcome.STEPPED)
-    outcome = jnp.where(guard_index == guard_layout.rolling_rate_guard, Outcome.FELL_BACK, outcome)
-    outcome = jnp.where(guard_index == guard_layout.collapse_guard, Outcome.COLLAPSED, outcome)
-    outcome = jnp.where(has_landed, Outcome.STEPPED, outcome)
-    outcome = jnp.where(interval_outcome == Outcome.STEPPED, outcome, interval_outcome)
-    return replace_rest_outcome(outcome, is_resting)
 
 
 class ForcePeakRecord(NamedTuple):
@@ -218,23 +107,6 @@ class ForcePeakRecord(NamedTuple):
         }
 
 
-def init_force_peak_record(lane_template: Array) -> ForcePeakRecord:
-    """Return the record before the first extremum, with the batch shape of `lane_template`."""
-    float_zero, int_zero = jnp.zeros_like(lane_template), jnp.zeros_like(lane_template, jnp.int32)
-    return ForcePeakRecord(
-        n_force_peaks=int_zero,
-        smooth_peak_force=float_zero - jnp.inf,
-        lowest_force_after_peak=float_zero + jnp.inf,
-        trough_depth=float_zero,
-        second_peak_rate=float_zero - jnp.inf,
-        n_total_force_peaks=int_zero,
-        smooth_peak_total_force=float_zero - jnp.inf,
-        n_force_extrema=int_zero,
-        peak_force=float_zero,
-        peak_total_force=float_zero,
-    )
-
-
 def record_force_extremum(
     force_peak_record: ForcePeakRecord,
     is_rate_zero: Bool[Array, "3 ..."],
@@ -243,7 +115,7 @@ def record_force_extremum(
 ) -> ForcePeakRecord:
     """Return the record after an extremum of a force or of its rate.
 
-    - `is_rate_zero`: which of the `NormalForceRates` is zero; if none is, the record is unchanged;
+    - `is_rate_zero`: which force rate is zero; if none is, the record is unchanged;
     - `contact_mode_dynamics`, `motion`: dynamics before the extremum, and motion at the extremum.
     """
     (
@@ -310,85 +182,102 @@ class GaitStepSummary(NamedTuple):
     step_length: Array
 
 
-class UnilateralStepDetails(NamedTuple):
-    """Detailed results of a walking step; the fields are described in `UnilateralStep`."""
+class StepRecord(NamedTuple):
+    """Results of the present walking step so far, as in `UnilateralStep`.
 
-    post_impact: Float[Array, "2 ..."]
-    mode_durations: Float[Array, "4 4 ..."]
-    landing_normal: Float[Array, "2 ..."]
-    landing_tangential: Float[Array, "2 ..."]
-    energy_impacts: Elementwise
-    margins: UnilateralMargins
-    impacts: Int[Array, "..."]
-    fewest_solutions: Int[Array, "..."]
-    most_solutions: Int[Array, "..."]
-    force_peaks: ForcePeakRecord | None
+    Without details, the fields other than the first three are None.
+    """
+
+    events: Int[Array, "..."]
+    durations: Float[Array, "3 ..."]
+    solver_steps: Int[Array, "..."]  # counted over the walk
+    losses: Any = None  # losses in dampers and by sliding, J, and slip, m, (N_LOSSES, ...)
+    post_impact: Any = None
+    mode_durations: Any = None
+    landing_normal: Any = None
+    landing_tangential: Any = None
+    energy_impacts: Any = None
+    margins: Any = None
+    impacts: Any = None
+    fewest_solutions: Any = None
+    most_solutions: Any = None
+    force_peaks: Any = None
 
 
-def init_step_details(lane_template: Array, measures_force_peaks: bool) -> UnilateralStepDetails:
-    """Return the step details at the start of a walking step.
+def init_step_record(
+    lane_template: Array, is_detailed: bool, measures_force_peaks: bool
+) -> StepRecord:
+    """Return the record at the start of a walking step.
 
     The batch shape and the dtype are those of `lane_template`.
     """
-    float_zero, int_zero = jnp.zeros_like(lane_template), jnp.zeros_like(lane_template, jnp.int32)
-    zero_pair = jnp.stack([float_zero, float_zero])
-    return UnilateralStepDetails(
-        post_impact=zero_pair,
-        mode_durations=jnp.zeros((4, 4, *lane_template.shape), lane_template.dtype),
-        landing_normal=zero_pair,
-        landing_tangential=zero_pair,
-        energy_impacts=float_zero,
-        margins=UnilateralMargins(float_zero + jnp.inf, float_zero + jnp.inf),
-        impacts=int_zero,
-        fewest_solutions=int_zero + jnp.iinfo(jnp.int32).max,
-        most_solutions=int_zero,
-        force_peaks=init_force_peak_record(lane_template) if measures_force_peaks else None,
+    zero, zero_count = jnp.zeros_like(lane_template), jnp.zeros_like(lane_template, jnp.int32)
+    make_zeros = lambda *shape: jnp.zeros((*shape, *zero.shape), zero.dtype)
+    step_record = StepRecord(zero_count, make_zeros(3), zero_count)
+    if not is_detailed:
+        return step_record
+    force_peaks = ForcePeakRecord(
+        n_force_peaks=zero_count,
+        smooth_peak_force=zero - jnp.inf,
+        lowest_force_after_peak=zero + jnp.inf,
+        trough_depth=zero,
+        second_peak_rate=zero - jnp.inf,
+        n_total_force_peaks=zero_count,
+        smooth_peak_total_force=zero - jnp.inf,
+        n_force_extrema=zero_count,
+        peak_force=zero,
+        peak_total_force=zero,
+    )
+    return step_record._replace(
+        losses=make_zeros(N_LOSSES),
+        post_impact=make_zeros(2),
+        mode_durations=make_zeros(4, 4),
+        landing_normal=make_zeros(2),
+        landing_tangential=make_zeros(2),
+        energy_impacts=zero,
+        margins=UnilateralMargins(zero + jnp.inf, zero + jnp.inf),
+        impacts=zero_count,
+        fewest_solutions=zero_count + jnp.iinfo(jnp.int32).max,
+        most_solutions=zero_count,
+        force_peaks=force_peaks if measures_force_peaks else None,
     )
 
 
 def record_event(
-    step_details: UnilateralStepDetails,
-    is_first_event: Array,
-    event_result: ContactEventResult,
-    contact_event: ContactEvent,
-) -> UnilateralStepDetails:
-    """Return the step details after one more event.
-
-    - `is_first_event`: whether the event is the first in the walking step.
-    """
-    keep_first = lambda first, previous: jnp.where(is_first_event, first, previous)
+    step_record: StepRecord, event_result: ContactEventResult, contact_event: ContactEvent
+) -> StepRecord:
+    """Return the record after one more event, which the caller counts."""
+    keep_first = lambda first, later: jnp.where(step_record.events == 0, first, later)
     post_impact = jnp.stack([event_result.motion.theta, event_result.motion.dtheta])
-    stopper_impulse = jnp.minimum(
-        step_details.margins.stopper_impulse, event_result.stopper_impulse
-    )
-    force_peaks = step_details.force_peaks
+    stopper_impulse = jnp.minimum(step_record.margins.stopper_impulse, event_result.stopper_impulse)
+    force_peaks = step_record.force_peaks
     if force_peaks is not None:  # The force before the first event belongs to the previous step.
         force_peaks = force_peaks._replace(
             peak_force=keep_first(0.0, force_peaks.peak_force),
             peak_total_force=keep_first(0.0, force_peaks.peak_total_force),
         )
-    return step_details._replace(
+    return step_record._replace(
         force_peaks=force_peaks,
-        post_impact=keep_first(post_impact, step_details.post_impact),
-        landing_normal=keep_first(event_result.normal_impulse, step_details.landing_normal),
+        post_impact=keep_first(post_impact, step_record.post_impact),
+        landing_normal=keep_first(event_result.normal_impulse, step_record.landing_normal),
         landing_tangential=keep_first(
-            event_result.tangential_impulse, step_details.landing_tangential
+            event_result.tangential_impulse, step_record.landing_tangential
         ),
-        energy_impacts=step_details.energy_impacts + event_result.impact_energy_loss,
-        margins=UnilateralMargins(step_details.margins.stopper_force, stopper_impulse),
-        impacts=step_details.impacts + contact_event.is_impact,
-        fewest_solutions=jnp.minimum(step_details.fewest_solutions, event_result.n_solutions),
-        most_solutions=jnp.maximum(step_details.most_solutions, event_result.max_n_solutions),
+        energy_impacts=step_record.energy_impacts + event_result.impact_energy_loss,
+        margins=UnilateralMargins(step_record.margins.stopper_force, stopper_impulse),
+        impacts=step_record.impacts + contact_event.is_impact,
+        fewest_solutions=jnp.minimum(step_record.fewest_solutions, event_result.n_solutions),
+        most_solutions=jnp.maximum(step_record.most_solutions, event_result.max_n_solutions),
     )
 
 
 def record_contact_interval(
-    step_details: UnilateralStepDetails,
+    step_record: StepRecord,
     contact_mode_dynamics: ContactModeDynamics,
     motion: WheelMotion,
     duration: Elementwise,
-) -> UnilateralStepDetails:
-    """Return the step details updated at the start or at the end of an interval.
+) -> StepRecord:
+    """Return the record updated at the start or at the end of an interval.
 
     The minimum of the stopper force on legs in the air is updated. The duration is added to the
     entry of `mode_durations` for the present contact modes. If force peaks are measured, the
@@ -408,8 +297,8 @@ def record_contact_interval(
     is_first_slot_mode, is_second_slot_mode = (
         (mode_codes == slot_modes[i]).astype(jnp.result_type(stopper_force)) for i in range(2)
     )
-    stopper_force = jnp.minimum(step_details.margins.stopper_force, stopper_force)
-    force_peaks = step_details.force_peaks
+    stopper_force = jnp.minimum(step_record.margins.stopper_force, stopper_force)
+    force_peaks = step_record.force_peaks
     if force_peaks is not None:
         fore_force, total_force = split_normal_forces(
             contact_mode_dynamics, contact_forces.force_solution.normal_forces
@@ -420,11 +309,11 @@ def record_contact_interval(
             peak_force=select_larger(fore_force, force_peaks.peak_force),
             peak_total_force=select_larger(total_force, force_peaks.peak_total_force),
         )
-    return step_details._replace(
+    return step_record._replace(
         force_peaks=force_peaks,
-        mode_durations=step_details.mode_durations
+        mode_durations=step_record.mode_durations
         + is_first_slot_mode[:, None] * is_second_slot_mode[None, :] * duration,
-        margins=UnilateralMargins(stopper_force, step_details.margins.stopper_impulse),
+        margins=UnilateralMargins(stopper_force, step_record.margins.stopper_impulse),
     )
 
 
@@ -464,24 +353,14 @@ class UnilateralStep(AbstractContactStep):
         1.3 J lost by sliding
     """
 
-    section_state: FullState
-    post_impact: Float[Array, "2 ..."]
-    durations: Float[Array, "3 ..."]
     mode_durations: Float[Array, "4 4 ..."]
-    step_length: Elementwise
     landing_normal: Float[Array, "2 ..."]
     landing_tangential: Float[Array, "2 ..."]
-    energy_impacts: Elementwise
-    energy_damping: Elementwise
-    energy_friction: Elementwise
-    slip: Elementwise
     margins: UnilateralMargins
     events: Int[Array, "..."]
     impacts: Int[Array, "..."]
     fewest_solutions: Int[Array, "..."]
     most_solutions: Int[Array, "..."]
-    outcome: Int[Array, "..."]
-    solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
     force_peaks: ForcePeakRecord | None = None
 
@@ -491,37 +370,3 @@ class UnilateralStep(AbstractContactStep):
             margin_field.name: getattr(self.margins, margin_field.name)
             for margin_field in dataclasses.fields(self.margins)
         }
-
-
-def make_unilateral_step(
-    step_summary: GaitStepSummary,
-    loss_accumulators: Array,
-    step_counters: GaitStepCounters,
-    step_details: UnilateralStepDetails,
-    outcome: Array,
-    engine_name: str,
-) -> UnilateralStep:
-    """Return the results of a walking step from its records.
-
-    - `loss_accumulators`: losses in dampers and by sliding, J, and slip length, m, (3, ...);
-    - `engine_name`: name of the engine that computed the step.
-    """
-    damping_loss, friction_loss, slip_length = loss_accumulators
-    replace_nonfinite = lambda detail_value: jnp.where(
-        jnp.isfinite(detail_value), detail_value, 0.0
-    )
-    step_details = step_details._replace(
-        margins=jax.tree.map(replace_nonfinite, step_details.margins),
-        fewest_solutions=jnp.where(step_counters.n_events > 0, step_details.fewest_solutions, 0),
-    )
-    return UnilateralStep(
-        **step_summary._asdict(),
-        energy_damping=damping_loss,
-        energy_friction=friction_loss,
-        slip=slip_length,
-        events=step_counters.n_events,
-        outcome=outcome,
-        solver_steps=step_counters.n_solver_steps,
-        engine=engine_name,
-        **step_details._asdict(),
-    )

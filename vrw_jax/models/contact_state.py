@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -32,7 +31,6 @@ from vrw_jax.models.contact_mechanics import (
     PlaneVelocities,
     SlotArray,
     WheelMotion,
-    align_with_batch,
     compute_contact_foot_velocities,
     compute_foot_heights,
     compute_free_leg_acceleration,
@@ -102,7 +100,7 @@ class ContactState(NamedTuple):
     has_just_lifted: Bool[Array, " n_legs"]  # whether a foot has left the ground at the last event
     has_just_unlocked: Bool[Array, " n_legs"]  # whether a leg has left its stopper then
     has_just_slid: Bool[Array, " n_legs"]  # whether a foot at rest has begun to slide then
-    # sign of each of the `NormalForceRates` in this state; None if force peaks are not measured
+    # sign of each force rate (see `N_FORCE_RATES`); None if force peaks are not measured
     force_rate_signs: Array | None = None
     # whether the function of each kink is positive, for all legs
     is_kink_positive: tuple[Bool[Array, " n_legs"], ...] = ()
@@ -146,7 +144,10 @@ def select_kink_sides(s: Symbols, is_kink_positive: tuple[Array, ...]) -> Symbol
 
 
 class ContactModeDynamics(NamedTuple):
-    """Parameters and contact state that determine the dynamics of the wheel between two events."""
+    """Parameters and contact state that determine the dynamics of the wheel between two events.
+
+    The first fields are those of `ContactConfiguration` before the motion.
+    """
 
     s: Symbols
     friction: SlotArray  # friction coefficient of the feet in the contact slots
@@ -177,16 +178,7 @@ class ContactModeDynamics(NamedTuple):
 
     def configure_contacts(self, motion: WheelMotion) -> ContactConfiguration:
         """Return the contact configuration for this motion, from which the forces are computed."""
-        return ContactConfiguration(
-            self.s,
-            motion,
-            self.friction,
-            self.contact_slots,
-            self.slot_modes,
-            self.is_stopper_holding,
-            self.is_airborne_leg_locked,
-            self.known_solution,
-        )
+        return ContactConfiguration(*self[:6], motion, self.known_solution)
 
 
 def make_contact_mode_dynamics(
@@ -302,35 +294,20 @@ def evaluate_vector_field(
 
 
 class GuardLayout(NamedTuple):
-    """Index of the first guard of each kind in the result of `compute_guard_values`."""
+    """Indices of the guards of each kind in the result of `evaluate_guards`."""
 
-    first_landing_guard: int  # height of a foot in the air, one per leg: zero at a landing
-    first_stopper_guard: int  # distance to the stopper, one per leg
-    first_liftoff_guard: int  # normal force, one per contact slot
-    first_slip_up_guard: int  # friction margin before the foot slides uphill, one per contact slot
-    # friction margin before the foot slides downhill, one per contact slot
-    first_slip_down_guard: int
-    first_slip_end_guard: int  # speed of a sliding foot, one per contact slot
-    first_stopper_release_guard: int  # stopper force of a loaded leg, one per contact slot
-    rolling_rate_guard: int  # rate of rolling, dtheta
-    collapse_guard: int  # length of the shortest leg minus a
-    first_airborne_release_guard: int  # stopper force in the air, one per leg, if one-sided
-    first_kink_guard: int  # function of each kink on its present side, one per leg
-    first_force_rate_guard: int  # absolute value of each of the `NormalForceRates`, if requested
-    n_guards: int
-
-    @property
-    def n_legs(self) -> int:
-        """Return the number of legs of the wheel."""
-        return self.first_stopper_guard - self.first_landing_guard
-
-    @property
-    def foremost_landing_guard(self) -> int:
-        """Return the index of the guard that detects the landing of the foremost foot.
-
-        This landing ends a step.
-        """
-        return self.first_stopper_guard - 1
+    landing: range  # height of a foot in the air, one per leg: zero at a landing
+    stopper: range  # distance to the stopper, one per leg
+    liftoff: range  # normal force, one per contact slot
+    slip_up: range  # friction margin before the foot slides uphill, one per contact slot
+    slip_down: range  # friction margin before the foot slides downhill, one per contact slot
+    slip_end: range  # speed of a sliding foot, one per contact slot
+    stopper_release: range  # stopper force of a loaded leg, one per contact slot
+    rolling_rate: range  # rate of rolling, dtheta
+    collapse: range  # length of the shortest leg minus a
+    airborne_release: range  # stopper force in the air, one per leg, if one-sided
+    kinks: range  # function of each kink on its present side, one per leg
+    force_rates: range  # absolute value of each force rate, if requested
 
 
 def make_guard_layout(
@@ -345,40 +322,28 @@ def make_guard_layout(
     - `measures_force_peaks`: whether guards detect the extrema of normal forces;
     - `n_kinks`: number of kinks that the law of a leg declares.
     """
-    guard_group_sizes = (
-        n_legs,
-        n_legs,
-        2,
-        2,
-        2,
-        2,
-        2,
-        1,
-        1,
-        n_legs if has_one_sided_stoppers else 0,
+    n_guards = (
+        *[n_legs] * 2,
+        *[2] * 5,
+        *[1] * 2,
+        n_legs * has_one_sided_stoppers,
         n_kinks * n_legs,
-        len(NormalForceRates._fields) if measures_force_peaks else 0,
+        N_FORCE_RATES * measures_force_peaks,
     )
-    guard_group_offsets = np.concatenate([[0], np.cumsum(guard_group_sizes)])
-    return GuardLayout(*(int(guard_offset) for guard_offset in guard_group_offsets))
+    ends = itertools.accumulate(n_guards)
+    return GuardLayout(*(range(end - n, end) for n, end in zip(n_guards, ends, strict=True)))
 
 
-class NormalForceRates(NamedTuple):
-    """Rates of normal forces on the feet.
+N_FORCE_RATES = 3
+"""Number of rates of normal forces whose zeros are extrema.
 
-    A rate is zero at an extremum of a force, and the second rate at an extremum of the first rate.
-    """
-
-    fore_force_rate: Elementwise  # rate of the force on the foot of Leg 1, N/s
-    total_force_rate: Elementwise  # rate of the sum of the forces on all feet, N/s
-    fore_force_second_rate: Elementwise  # second rate of the force on the foot of Leg 1, N/s^2
+They are those of the force on the foot of Leg 1, N/s, and of the sum of the forces on all feet,
+N/s, and the second rate of the first force, N/s^2, which is zero at an extremum of its rate.
+"""
 
 
-class NormalForces(NamedTuple):
-    """Normal forces of the ground on the feet, or the rates of these forces."""
-
-    fore_force: Elementwise  # force on the foot of Leg 1, N
-    total_force: Elementwise  # sum of the forces on all feet, N
+NormalForces = tuple[Elementwise, Elementwise]
+"""Normal forces of the ground on the foot of Leg 1 and on all feet together, or their rates."""
 
 
 def compute_normal_forces(
@@ -398,7 +363,7 @@ def split_normal_forces(
     first_force, second_force = slot_normal_forces
     # A loaded fore foot is in the first contact slot.
     is_fore_loaded = contact_mode_dynamics.contact_state.contact_modes[0] != ContactMode.OFF
-    return NormalForces(jnp.where(is_fore_loaded, first_force, 0.0), first_force + second_force)
+    return jnp.where(is_fore_loaded, first_force, 0.0), first_force + second_force
 
 
 def compute_normal_force_rates(
@@ -409,13 +374,11 @@ def compute_normal_force_rates(
 
 
 def compute_force_rates(contact_mode_dynamics: ContactModeDynamics, motion: WheelMotion) -> Array:
-    """Return the `NormalForceRates` in the motion between two events, as one array (3, ...)."""
-    (_, force_rates), (_, second_rates) = _differentiate_in_time(
+    """Return the rates that `N_FORCE_RATES` counts, in the motion between two events, (3, ...)."""
+    (_, force_rates), (_, (second_fore_rate, _)) = _differentiate_in_time(
         compute_normal_force_rates, contact_mode_dynamics, motion
     )
-    return jnp.stack(
-        NormalForceRates(force_rates.fore_force, force_rates.total_force, second_rates.fore_force)
-    )
+    return jnp.stack([*force_rates, second_fore_rate])
 
 
 def _differentiate_in_time(
@@ -432,29 +395,6 @@ def _differentiate_in_time(
     return jax.jvp(partial(function, contact_mode_dynamics), (motion,), (motion_rate,))
 
 
-def flag_zero_force_rates(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) -> Array:
-    """Return which of the `NormalForceRates` is zero at the event of a guard, (3, ...)."""
-    rate_indices = align_with_batch(np.arange(len(NormalForceRates._fields)), guard_index)
-    return guard_index == guard_layout.first_force_rate_guard + rate_indices
-
-
-def update_force_rate_signs(
-    contact_mode_dynamics: ContactModeDynamics,
-    motion: WheelMotion,
-    previous_signs: Array,
-    is_rate_zero: Bool[Array, "3 ..."],
-) -> Array:
-    """Return the sign of each of the `NormalForceRates` after an event, 1.0 or -1.0, (3, ...).
-
-    The result has no derivatives.
-
-    - `previous_signs`: signs before the event;
-    - `is_rate_zero`: which rates are zero at the event, and change their sign.
-    """
-    force_rates = compute_force_rates(*stop_gradients((contact_mode_dynamics, motion)))
-    return jnp.where(is_rate_zero, -previous_signs, jnp.where(force_rates < 0.0, -1.0, 1.0))
-
-
 class ContactQuantities(NamedTuple):
     """Accelerations, loss rates and contact forces; the first axis of each array contains rows."""
 
@@ -467,7 +407,7 @@ class ContactQuantities(NamedTuple):
     slip_speeds: SlotArray  # tangential speeds of the feet in the contact slots, m/s
     # stopper force of legs in the air, if stoppers are one-sided
     airborne_stopper_forces: LegArray | None
-    force_rates: Array | None  # `NormalForceRates`, if peaks are measured
+    force_rates: Array | None  # see `N_FORCE_RATES`, if peaks are measured
 
     def pack_rows(self) -> Array:
         """Return all quantities as one array (rows, ...)."""
@@ -485,7 +425,7 @@ class ContactQuantities(NamedTuple):
             1,
             *[2] * 4,
             n_legs * contact_mode_dynamics.has_one_sided_stoppers,
-            len(NormalForceRates._fields) * contact_mode_dynamics.measures_force_peaks,
+            N_FORCE_RATES * contact_mode_dynamics.measures_force_peaks,
         )
         ends = itertools.accumulate(row_counts)
         blocks: Any = (
@@ -691,7 +631,7 @@ def choose_stopping_guard(
     has_just_slid = contact_mode_dynamics.contact_slots.gather_flags_from_legs(
         contact_mode_dynamics.contact_state.has_just_slid
     )
-    has_slid_to_rest = guard_index == guard_layout.rolling_rate_guard
+    has_slid_to_rest = guard_index == guard_layout.rolling_rate.start
     has_slid_to_rest &= are_rates_negligible(
         coordinate_rates, compute_state_units(contact_mode_dynamics.s)[1], atol
     )
@@ -699,9 +639,7 @@ def choose_stopping_guard(
         has_slide_ended = (
             has_slid_to_rest & (slip_signs[stopped_slot] != 0.0) & ~has_just_slid[stopped_slot]
         )
-        guard_index = jnp.where(
-            has_slide_ended, guard_layout.first_slip_end_guard + stopped_slot, guard_index
-        )
+        guard_index = jnp.where(has_slide_ended, guard_layout.slip_end[stopped_slot], guard_index)
     return guard_index
 
 

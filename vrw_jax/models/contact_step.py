@@ -182,9 +182,7 @@ class ContactIntervalLog(NamedTuple):
 
     q: Array  # coordinates at the start of each interval, (intervals, 3 + n)
     v: Array  # rates and losses in the step so far, (intervals, 3 + n + N_LOSSES)
-    contact_modes: Array  # contact mode of every foot, (intervals, legs)
-    is_leg_locked: Array
-    is_kink_positive: tuple[Array, ...]
+    contact_state: ContactState
     durations: Array  # s
 
 
@@ -281,22 +279,18 @@ def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[.
             walk_settings, walk_settings.replace_invalid_lanes(input_columns, x)[0], lane_state
         )
         n = len(start.q)
-        assert start.step_losses is not None
         return lane_state, ContactIntervalLog(
             start.q,
-            jnp.concatenate([start.v[:n], start.step_losses]),
-            start.contact_state.contact_modes,
-            start.contact_state.is_leg_locked,
-            start.contact_state.is_kink_positive,
+            jnp.concatenate([start.v[:n], start.step_record.losses]),
+            start.contact_state,
             lane_state.interval_duration,
         )
 
     def sample_logged_interval(arguments: tuple, interval_log: ContactIntervalLog) -> Array:
         walk_settings, input_columns, x = prepare_resolved(arguments)
-        q, v, contact_modes, is_leg_locked, is_kink_positive, durations = interval_log
+        q, v, contact_state, durations = interval_log
         dynamics = walk_settings.make_lane_contact_dynamics(
-            walk_settings.replace_invalid_lanes(input_columns, x)[0],
-            ContactState.without_recent_changes(contact_modes, is_leg_locked, is_kink_positive),
+            walk_settings.replace_invalid_lanes(input_columns, x)[0], contact_state
         )
         arguments = dynamics, q, v, durations, n_samples, walk_settings.step_options
         if walk_settings.tableau is None:
@@ -313,9 +307,9 @@ def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[.
         def record_interval_end(loop_state: tuple) -> tuple:
             previous_state, contact_interval_log = loop_state
             lane_state, interval_entry = advance_compiled_walk(arguments, previous_state)
-            entry_index = previous_state.step_counters.n_events
+            entry_index = previous_state.step_record.events
             entry_index = jnp.where(
-                lane_state.step_counters.n_events > entry_index, entry_index, max_events
+                lane_state.step_record.events > entry_index, entry_index, max_events
             )
             write_log_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
                 entry_leaf, mode="drop"
@@ -323,7 +317,7 @@ def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[.
             return lane_state, jax.tree.map(write_log_entry, contact_interval_log, interval_entry)
 
         should_continue = lambda state: make_opaque_loop_condition(
-            state[0].is_unfinished, state[0].step_counters.n_events
+            state[0].is_unfinished, state[0].step_record.events
         )
         lane_state, contact_interval_log = lax.while_loop(
             should_continue,
@@ -357,28 +351,15 @@ def _unpack_sample_rows(
     The axes are (intervals, samples, entries). `sample_rows` contains results of
     `sample_contact_interval`.
     """
-    n_samples, n_coordinates = sample_rows.shape[1], 3 + n_legs
+    n, n_samples = 3 + n_legs, sample_rows.shape[1]
+    q, v, losses, normal_forces, tangential_forces = jnp.split(
+        jnp.moveaxis(sample_rows, -1, 0), (n, 2 * n, 2 * n + N_LOSSES, 2 * n + N_LOSSES + 2)
+    )
     time_since_event = jnp.linspace(0.0, 1.0, n_samples) * contact_interval_log.durations[:, None]
-    q, v, losses, slot_forces = jnp.split(
-        sample_rows, (n_coordinates, 2 * n_coordinates, 2 * n_coordinates + N_LOSSES), -1
+    packed_states = pack_state(
+        unpack_motion(q, v), EnergyLossAccumulators(time_since_event, *losses)
     )
-    contact_interval_quantities = [
-        q[..., :3],
-        v[..., :3],
-        q[..., 3:],
-        v[..., 3:],
-        time_since_event[..., None],
-        losses,
-    ]
-    contact_slots = jax.vmap(
-        lambda contact_modes: find_contact_slots(contact_modes != ContactMode.OFF)
-    )(contact_interval_log.contact_modes)
-    scatter_to_legs = jax.vmap(
-        jax.vmap(
-            lambda contact_slots, slot_pair: contact_slots.scatter_to_legs(slot_pair), (None, 0)
-        )
-    )
-    normal_forces, tangential_forces = (
-        scatter_to_legs(contact_slots, slot_forces[..., i : i + 2]) for i in (0, 2)
-    )
-    return jnp.concatenate(contact_interval_quantities, -1), tangential_forces, normal_forces
+    contact_modes = contact_interval_log.contact_state.contact_modes.T[..., None]
+    scatter_to_legs = find_contact_slots(contact_modes != ContactMode.OFF).scatter_to_legs
+    legs_first = packed_states, scatter_to_legs(tangential_forces), scatter_to_legs(normal_forces)
+    return tuple(jnp.moveaxis(x, 0, -1) for x in legs_first)  # type: ignore[return-value]

@@ -117,10 +117,6 @@ class IntervalTangents(NamedTuple):
         """Return the tangent of constants that do not vary."""
         return jax.tree.map(jnp.zeros_like, self.phase_constants)
 
-    def get_constants_tangent(self, k: Array) -> Any:
-        """Return the tangent of the constants with index `k`."""
-        return self.push_to_constants(self.tangents.get_input_tangent(k))
-
     def linearize(
         self, function: Callable[[BatchPhase, StageState], Array], q: Any, v: Any, rows: Array
     ) -> Any:
@@ -176,7 +172,9 @@ class IntervalTangents(NamedTuple):
                 )
                 return run_if_any_element_active(
                     has_input_tangent,
-                    lambda _: push(self.get_constants_tangent(k), *coordinate_tangents),
+                    lambda _: push(
+                        self.push_to_constants(tangents.get_input_tangent(k)), *coordinate_tangents
+                    ),
                     rate_tangent,
                 )
 
@@ -213,7 +211,8 @@ class IntervalTangents(NamedTuple):
 
         def push_direction(k: Array, _: Array) -> Array:
             direction = lax.dynamic_index_in_dim(directions, k, 0, False)
-            return push(self.get_constants_tangent(k), direction[: len(q)], direction[len(q) :])
+            constants_tangent = self.push_to_constants(self.tangents.get_input_tangent(k))
+            return push(constants_tangent, direction[: len(q)], direction[len(q) :])
 
         tangents = self.tangents.map_tangents_sequentially(
             push_direction, self.tangents.allocate_tangent_rows(1)

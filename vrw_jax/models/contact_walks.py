@@ -1,4 +1,4 @@
-"""Walks with unilateral contact for a batch of wheels, and one step with its Jacobian."""
+"""Walks of batches with unilateral contact, and steps with their Jacobians, by machine code."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -27,13 +27,97 @@ from vrw_jax.models.contact_section import (
 )
 from vrw_jax.models.contact_tangents import walk_with_tangents
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
+from vrw_jax.models.walk_batch import (
+    StepBatchResult,
+    StepInput,
+    WalkBatch,
+    make_step_input,
+)
 from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import (
+    FRICTION_NAME,
     PARAMETER_NAMES,
     Symbols,
     compute_symbols,
     compute_wheel_units_of_rows,
 )
+
+
+def step_batch_with_contact(
+    model: Any,
+    inputs: list[StepInput],
+    next_line: list[StepInput],
+    section_states: np.ndarray,
+    n_steps: int,
+    options: StepOptions,
+    requested_engine: str,
+    n_legs: int,
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
+    """Return the result of `step_batch` for a model with unilateral contact.
+
+    Without derivatives on flat ground, one call of the kernel computes all gait steps. On uneven
+    ground, further inputs are the friction of the feet that landed earlier, and the increase of the
+    slope to the next line of the ground, rad, or two rises (see `models.select_stance_line`), m.
+
+    - `next_line`: slope of the next line, or two rises; empty if all lines have one slope.
+    """
+    if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
+        raise ValueError(
+            f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
+            "need 'lanes' and an explicit Runge-Kutta solver: map vrw.walk over the wheels."
+        )
+    if np.ndim(model.restitution):
+        raise ValueError(
+            f"restitution has shape {np.shape(model.restitution)}, but a batch needs one number "
+            "for all elements: call vrw.step_batch for each restitution."
+        )
+    first_values = np.stack([x.select_values(0) for x in inputs])
+    section_states = embed_section_states(first_values, section_states, n_legs)
+    friction = np.asarray(model.friction, section_states.dtype)
+    is_ground_uneven = bool(next_line) or friction.ndim == 2
+    if not (derivative_names or is_ground_uneven or model.leg_period > 1):
+        x, durations, outcome, n_stepped, solver_steps, _ = map(
+            np.asarray, walk_batch(first_values, section_states, n_steps, model, options, n_legs)
+        )
+        solver_index = np.zeros_like(n_stepped)
+        return StepBatchResult(
+            x, durations, outcome, n_stepped, solver_steps, solver_index, "lanes", (options.solver,)
+        )
+    if is_ground_uneven:
+        slope = inputs[PARAMETER_NAMES.index("slope")]
+        if len(next_line) == 1:
+            next_slope = next_line[0]
+            tilt = next_slope._replace(
+                values=next_slope.values - slope.values,
+                list_terms=lambda k: [(k, -1.0), *next_slope.list_terms(k)],
+            )
+            next_line = [tilt]
+        inputs = [
+            *inputs,
+            make_step_input(FRICTION_NAME, friction, n_steps, len(section_states), -1),
+            *(next_line or [StepInput("", np.zeros_like(slope.values))]),
+        ]
+    batch = WalkBatch(section_states.T.copy(), inputs, derivative_names)
+    input_indices = list(batch.input_indices)
+
+    def step_lanes(_: Any, inputs: np.ndarray, x: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
+        if not derivative_names:
+            x, durations, outcome, _, solver_steps, _ = walk_batch(
+                inputs, x.T, 1, model, options, n_legs
+            )
+            outputs: tuple[Any, ...] = x, durations, outcome, solver_steps
+        else:
+            step, jacobian = step_batch_with_jacobian(
+                inputs, x.T, model, options, n_legs, input_indices
+            )
+            columns = np.concatenate([jacobian.section_state, jacobian.durations], 1)
+            outputs = step.section_state, step.durations, step.outcome, step.solver_steps
+            outputs += (columns[:, :, input_indices],)
+        return tuple(np.asarray(x).T for x in outputs)
+
+    batch.take_steps(n_steps, step_lanes, model)
+    return batch.make_batch_result("lanes", (options.solver,))
 
 
 def walk_batch(
@@ -54,14 +138,8 @@ def walk_batch(
       uneven ground, the walk has one step, and more columns follow: see `N_HEIGHT_COLUMNS`;
     - `section_states`: full section states, shape (wheels, 4 + 3 n).
     """
-    static_walk_settings = _make_static_walk_settings(
-        model, options, n_legs, False, len(input_columns)
-    )
     (section_state, durations, step_length), *outcome_and_counts = _run_walk(
-        static_walk_settings,
-        [_append_restitution(input_columns, model), section_states.T],
-        n_steps,
-        options,
+        model, options, n_legs, n_steps, input_columns, section_states.T
     )
     return section_state, durations, *outcome_and_counts, step_length
 
@@ -84,9 +162,6 @@ def step_batch_with_jacobian(
     that cannot vary. These are contact codes, and lengths of legs on their stoppers or with loaded
     feet. Tangents are computed only for independent rates (see `_IndependentStartRates`).
     """
-    static_walk_settings = _make_static_walk_settings(
-        model, options, n_legs, True, len(input_columns)
-    )
     contact_codes = np.round(section_states[:, 4 + 2 * n_legs :]).astype(int)
     step_inputs = np.concatenate([input_columns.T, section_states], 1)
     is_tangent_needed = np.ones(step_inputs.shape, bool)
@@ -116,13 +191,14 @@ def step_batch_with_jacobian(
     lane_index, tangent_index_in_wheel, lane_wheels = _pack_tangents(is_tangent_needed.sum(1))
     tangent_input_indices = np.full((MAX_TANGENTS_PER_LANE, len(lane_wheels)), -1.0)
     tangent_input_indices[tangent_index_in_wheel, lane_index] = input_index
-    walk_arguments = [
-        _append_restitution(input_columns[:, lane_wheels], model),
+    walk_result, tangents = _run_walk(
+        model,
+        options.with_derivative_tolerances(),
+        n_legs,
+        1,
+        input_columns[:, lane_wheels],
         section_states[lane_wheels].T,
         tangent_input_indices,
-    ]
-    walk_result, tangents = _run_walk(
-        static_walk_settings, walk_arguments, 1, options.with_derivative_tolerances()
     )
     first_lane_of_wheel = np.searchsorted(lane_wheels, np.arange(len(section_states)))
 
@@ -137,14 +213,6 @@ def step_batch_with_jacobian(
     return jax.tree.map(
         lambda leaf: leaf[first_lane_of_wheel], walk_result.step_result
     ), jax.tree.map(gather_tangents, tangents)
-
-
-def _append_restitution(input_columns: np.ndarray, model: UnilateralWheel) -> np.ndarray:
-    """Return the input columns, extended by the model's restitution if it is not None."""
-    if model.restitution is None:
-        return input_columns
-    restitution_row = np.full_like(input_columns[:1], np.asarray(model.restitution))
-    return np.concatenate([input_columns, restitution_row])
 
 
 MAX_TANGENTS_PER_LANE = 16
@@ -311,21 +379,31 @@ def _make_static_walk_settings(
 
 
 def _run_walk(
-    static_walk_settings: BatchWalkSettings,
-    input_arrays: list[np.ndarray],
-    n_steps: int,
+    model: UnilateralWheel,
     options: StepOptions,
+    n_legs: int,
+    n_steps: int,
+    input_columns: np.ndarray,
+    section_states: np.ndarray,
+    *tangent_input_indices: np.ndarray,
 ) -> Any:
     """Return the results of all walks, with the batch elements on the first axis.
 
-    In `input_arrays`, the batch elements are on the last axis.
+    In the input arrays, the batch elements are on the last axis.
     """
-    dtype = input_arrays[0].dtype
+    settings = _make_static_walk_settings(
+        model, options, n_legs, bool(tangent_input_indices), len(input_columns)
+    )
+    dtype = input_columns.dtype
     # Neighboring lanes run as long as the slowest of them. Lanes are sorted by damping, because
     # high damping limits the step size by stability.
-    lane_order = np.argsort(-input_arrays[0][PARAMETER_NAMES.index("damping")], kind="stable")
+    lane_order = np.argsort(-input_columns[PARAMETER_NAMES.index("damping")], kind="stable")
+    if model.restitution is not None:
+        restitution_row = np.full_like(input_columns[:1], np.asarray(model.restitution))
+        input_columns = np.concatenate([input_columns, restitution_row])
     traced_options = jax.tree.map(lambda x: np.asarray(x, dtype), eqx.filter(options, eqx.is_array))
-    walk_results = _compile_walks(static_walk_settings).run(
+    input_arrays = input_columns, section_states, *tangent_input_indices
+    walk_results = _compile_walks(settings).run(
         np.int32(n_steps), traced_options, *(x[:, lane_order] for x in input_arrays)
     )
     inverse_lane_order = np.argsort(lane_order, kind="stable")

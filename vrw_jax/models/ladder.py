@@ -70,7 +70,7 @@ SELECTION_VARIABLE_ATTRIBUTES: dict[str, dict[str, object]] = {
         f"of {', '.join(SELECTION_MARGIN_NAMES)}; below: minus that wheel's outcome.",
     },
 }
-"""Attributes of the dataset variables that `ModelChoice.collect_selection_codes` returns."""
+"""Attributes of the dataset variables for the codes of the model and of the reason."""
 
 
 class ModelChoice(AbstractPrintable):
@@ -119,13 +119,6 @@ class ModelChoice(AbstractPrintable):
             )
         ]
         return [("model", type(self.model).__name__), ("reason", self.why), *margin_text_rows]
-
-    def collect_selection_codes(self) -> dict[str, Array]:
-        """Return the code of the model and the code of the reason.
-
-        The keys are the names of the dataset variables.
-        """
-        return {"rung": self.model_code, "reason": self.reason_code}
 
     @property
     def model(self) -> AbstractWheel:
@@ -206,16 +199,6 @@ class LadderStep(AbstractContactStep):
     """
 
     choice: ModelChoice
-    section_state: FullState
-    post_impact: Float[Array, "2"]
-    durations: Float[Array, "3"]
-    step_length: Scalar
-    energy_impacts: Scalar
-    energy_damping: Scalar
-    energy_friction: Scalar
-    slip: Scalar
-    outcome: Int[Array, ""]
-    solver_steps: Int[Array, ""]
 
 
 class LadderWheel(AbstractContactWheel):
@@ -380,6 +363,5 @@ class LadderWheel(AbstractContactWheel):
         unilateral_wheel = UnilateralWheel(friction=friction, infinite_friction_rule="paper")
         unilateral_wheel = unilateral_wheel.with_laws(self.laws)
         trajectory = unilateral_wheel.sample_step(params, x, options, n_samples)
-        return dataclasses.replace(
-            trajectory, model_selection=model_choice.collect_selection_codes()
-        )
+        selection = {"rung": model_choice.model_code, "reason": model_choice.reason_code}
+        return dataclasses.replace(trajectory, model_selection=selection)

@@ -46,7 +46,7 @@ from vrw_jax.flow.tableaus import compute_real_stability_limit, load_explicit_ta
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
-from vrw_jax.models.contact_batch import step_batch_with_contact
+from vrw_jax.models.contact_walks import step_batch_with_contact
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.stepping import (
     convert_heights,
@@ -59,6 +59,7 @@ from vrw_jax.models.viscoelastic import N_STEP_INPUTS, advance_gait_step
 from vrw_jax.models.walk_batch import (
     START_INPUT_NAME,
     StepBatchResult,
+    StepInput,
     WalkBatch,
     list_rises,
     make_step_input,
@@ -198,7 +199,6 @@ def step_batch(
                 f"{n_steps + 2} with that before the walk."
             )
         element_heights = element_heights.astype(dtype, copy=False)
-    has_contact_kernel = checked_model.batch_kernel == "legs"
     known_input_names = START_INPUT_NAME, *checked_model.parameter_names
     known_input_names += ("heights",) * (element_heights is not None)
     for derivative_name in derivatives:
@@ -208,17 +208,27 @@ def step_batch(
                 f"{', '.join(known_input_names)}: "
                 "give names of these."
             )
+    slopes, n_elements = values_by_parameter[SLOPE_INPUT_INDEX], len(checked_section_states)
+    make_input = lambda name, values, *offset: make_step_input(
+        name, values, n_steps, n_elements, *offset
+    )
+    inputs = [*map(make_input, checked_model.parameter_names, values_by_parameter)]
+    if element_heights is not None:
+        next_line = list_rises(element_heights, n_steps)
+    else:
+        next_line = [make_input("slope", slopes, 1)] * (slopes.ndim == 2)
+    has_contact_kernel = checked_model.batch_kernel == "legs"
     compute_batch = step_batch_with_contact if has_contact_kernel else _step_batch_without_contact
     return compute_batch(
         checked_model,
-        values_by_parameter,
+        inputs,
+        next_line,
         checked_section_states,
         n_steps,
         options,
         engine,
         params.n_legs,
         derivatives,
-        element_heights,
     )
 
 
@@ -262,7 +272,7 @@ def _check_parameter_shapes(
     n_steps: int,
 ) -> list[np.ndarray]:
     """Return each parameter as a scalar or an array over the batch, in the order of
-    `PARAMETER_NAMES`, and after them those of the laws.
+    `parameter_names` of the model.
 
     The slope, and with unilateral contact the friction, may have a second axis over gait steps.
     Raise ValueError if the shapes of states and parameters do not fit.
@@ -300,33 +310,23 @@ def _check_parameter_shapes(
                 f"{stepwise_advice * is_parameter_stepwise}."
             )
     common_dtype = np.promote_types(parameter_dtype, section_states.dtype)
-    return [np.asarray(x, common_dtype) for x in values_by_parameter[:n_parameters]]
+    return [np.asarray(x, common_dtype) for x in values_by_parameter]
 
 
 def _step_batch_without_contact(
     model: Any,
-    values_by_parameter: list[np.ndarray],
+    inputs: list[StepInput],
+    next_line: list[StepInput],
     section_states: np.ndarray,
     n_steps: int,
     options: StepOptions,
     requested_engine: str,
     n_legs: int,
     derivative_names: Sequence[str],
-    element_heights: np.ndarray | None,
 ) -> StepBatchResult:
-    n_wheels = len(section_states)
-    slopes = values_by_parameter[SLOPE_INPUT_INDEX]
-    first_values = [x.T[0] if x.ndim == 2 else x for x in values_by_parameter]
-    wheel_order = order_wheels_by_work(first_values, section_states)
-    make_input = lambda name, values, *offset: make_step_input(
-        name, values[wheel_order] if values.ndim else values, n_steps, n_wheels, *offset
-    )
-    inputs = [*map(make_input, model.parameter_names, values_by_parameter)]
-    n_parameters = len(inputs)
-    if element_heights is not None:
-        inputs += list_rises(element_heights[wheel_order], n_steps)
-    elif slopes.ndim == 2:
-        inputs += [make_input("slope", slopes, 1)]
+    n_wheels, n_parameters = len(section_states), len(inputs)
+    wheel_order = order_wheels_by_work([x.select_values(0) for x in inputs], section_states)
+    inputs = [x._replace(values=x.values[..., wheel_order]) for x in (*inputs, *next_line)]
     batch = WalkBatch(section_states.T.take(wheel_order, -1), inputs, derivative_names)
     # The kernels take parameters, section states, and then values of the ground.
     kernel_order = [*range(n_parameters), *range(n_parameters + 3, len(inputs) + 3)]

@@ -227,12 +227,12 @@ class AbstractStep(AbstractPrintable):
     axis.
     """
 
-    section_state: eqx.AbstractVar[Array]  # just before the next touchdown
-    post_impact: eqx.AbstractVar[Float[Array, "2 ..."]]  # (theta, dtheta), rad, rad/s
-    durations: eqx.AbstractVar[Float[Array, "3 ..."]]  # double support first, s
-    step_length: eqx.AbstractVar[MeasureValue]  # m
-    outcome: eqx.AbstractVar[Int[Array, "..."]]  # an Outcome
-    solver_steps: eqx.AbstractVar[Int[Array, "..."]]  # attempted solver steps
+    section_state: AnySectionState  # just before the next touchdown
+    post_impact: Float[Array, "2 ..."]  # (theta, dtheta), rad, rad/s
+    durations: Float[Array, "3 ..."]  # double support first, s
+    step_length: MeasureValue  # m
+    outcome: Int[Array, "..."]  # an Outcome
+    solver_steps: Int[Array, "..."]  # attempted solver steps
 
     @property
     def ending(self) -> Any:
@@ -314,10 +314,10 @@ class AbstractContactStep(AbstractStep):
     The `durations` are the times with two, one and no loaded feet, s.
     """
 
-    energy_impacts: eqx.AbstractVar[MeasureValue]  # lost in impacts, J
-    energy_damping: eqx.AbstractVar[MeasureValue]  # lost in the dampers, J
-    energy_friction: eqx.AbstractVar[MeasureValue]  # lost by sliding between impacts, J
-    slip: eqx.AbstractVar[MeasureValue]  # path length of sliding feet, m
+    energy_impacts: MeasureValue  # lost in impacts, J
+    energy_damping: MeasureValue  # lost in the dampers, J
+    energy_friction: MeasureValue  # lost by sliding between impacts, J
+    slip: MeasureValue  # path length of sliding feet, m
 
     def collect_model_measures(self) -> dict[str, Array]:
         """Return the values of the measures that only contact steps have, by name."""
@@ -353,16 +353,10 @@ class StepResult(AbstractStep):
         0.548 0.060 m
     """
 
-    section_state: Float[Array, "3 ..."]
-    post_impact: Float[Array, "2 ..."]
-    durations: Float[Array, "3 ..."]
-    step_length: MeasureValue
     indicators: DoubleSupportIndicators
     margins: Margins
     required_friction: RequiredFriction
     energy: EnergyLoss
-    outcome: Int[Array, "..."]
-    solver_steps: Int[Array, "..."]
     engine: str = eqx.field(static=True, default="")
 
     def collect_model_measures(self) -> dict[str, Array]:

@@ -355,8 +355,8 @@ class UnilateralWheel(AbstractContactWheel):
         return UnilateralTrajectory(
             time=start_times[:, None] + sample_times,
             state=states,
-            contact=contact_interval_log.contact_modes,
-            locked=contact_interval_log.is_leg_locked,
+            contact=contact_interval_log.contact_state.contact_modes,
+            locked=contact_interval_log.contact_state.is_leg_locked,
             tangential=tangential_forces,
             normal=normal_forces,
             duration=durations,
