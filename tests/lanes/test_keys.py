@@ -31,6 +31,7 @@ from vrw_jax.flow.segments import _integrate_flow_segments, _multiply_event_dete
 from vrw_jax.gaits.collocation_search import run_search_attempts
 from vrw_jax.gaits.derivatives import _compute_collocation_tangents
 from vrw_jax.gaits.fixed_points import _find_fixed_point_of_iterate
+from vrw_jax.gaits.force_peaks import _compute_peak_derivatives, _locate_force_peaks
 from vrw_jax.gaits.limit_cycle_result import solve_limit_cycle
 from vrw_jax.gaits.phase_sequence import CollocationSystem
 from vrw_jax.gaits.walker_finder import _find_gaits
@@ -364,6 +365,8 @@ WALK_SETTINGS = _make_static_walk_settings(vrw.UnilateralWheel(), vrw.StepOption
     [
         (run_search_attempts, SYSTEM),
         (_compute_collocation_tangents, SYSTEM),
+        (_locate_force_peaks, SYSTEM),
+        (_compute_peak_derivatives, SYSTEM),
         (make_trial_linearizer, (SYSTEM, (0, 1))),
         (lanes.make_leaf_function, (jax.tree.structure(vrw.StepOptions()), True, 0.7)),
         (take_steps_of_lanes, (True, 0.7)),
@@ -453,6 +456,7 @@ def test_no_other_function_is_compiled():
         "flow/segments.py": 3,
         "gaits/derivatives.py": 2,
         "gaits/fixed_points.py": 1,
+        "gaits/force_peaks.py": 1,
         "gaits/walker_finder.py": 1,
         "models/contact_step.py": 2,
         "models/contact_walks.py": 2,

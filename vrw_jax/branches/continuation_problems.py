@@ -34,11 +34,15 @@ from vrw_jax.branches.arclength import (
 )
 from vrw_jax.branches.branch import BIFURCATIONS, TestFunction
 from vrw_jax.branches.branch_continuation import BORDER_COLLISION, EVENT_ORDER, EVENT_ORDER_CHANGE
-from vrw_jax.gaits.cycle import average_own_measure, locate_force_peaks
 from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.limit_cycle_result import land_foot
+from vrw_jax.gaits.force_peaks import locate_force_peaks
+from vrw_jax.gaits.limit_cycle_result import evaluate_own_measure, land_foot
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
+from vrw_jax.gaits.return_map_finder import (
+    measure_return_map_cycle,
+    measure_return_map_force_peaks,
+)
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
@@ -329,14 +333,8 @@ class AbstractGaitProblem(AbstractContinuationProblem):
     def measure_steps(
         self, values: np.ndarray, states: np.ndarray, steps: AbstractStep
     ) -> QuantitiesByName:
-        """Return force peaks and measures of the user, if requested, from the steps of gaits."""
-        if not (self.measures_force_peaks or self.own_measures):
-            return {}
-        measure = functools.partial(
-            _measure_cycles, self.measures_force_peaks, self.own_measures, self.step_options,
-            self.model, self.n_legs,
-        )  # fmt: skip
-        return map_in_numpy_batches(measure, POINT_BATCH_SIZES, values, states, steps)
+        """Return further quantities of gaits, which only some models have."""
+        return {}
 
     def measure(self, wheels: BranchWheel, points: ContinuationPoint) -> QuantitiesByName:
         """Return the measures of the gaits at many points by name.
@@ -509,30 +507,57 @@ class CollocationProblem(AbstractGaitProblem):
         `takeoff_acceleration`, m/s^2. The latter is the lowest acceleration of the rear foot at
         take-off over the gait steps.
         """
-        return map_in_numpy_batches(
+        states, quantities = map_in_numpy_batches(
             functools.partial(
                 _read_collocated_gaits,
                 self.collocation_system,
                 self.shapes,
                 self.additional_quantity_function,
+                self.measures_force_peaks,
             ),
             POINT_BATCH_SIZES,
             values,
             wheels.is_phase_active,
             z,
         )
+        for measure in self.own_measures:
+            evaluate = functools.partial(
+                _measure_solutions, measure, self.collocation_system, self.model, self.shapes
+            )
+            quantities[measure.name] = map_in_numpy_batches(
+                evaluate, POINT_BATCH_SIZES, values, z, states
+            )
+        return states, quantities
 
 
 def _find_cycle(finder: Any, values: np.ndarray, guess: Any) -> Any:
     return finder.find_cycle_from_values(*jax.device_put((values, guess)))
 
 
-@functools.partial(jax.jit, static_argnums=range(3))
-@functools.partial(jax.vmap, in_axes=(None, None, None, 0, 0, 0))
+@eqx.filter_jit
+def _measure_solutions(
+    measure: Measure,
+    system: CollocationSystem,
+    model: Any,
+    shapes: SolutionShapes,
+    parameters: Array,
+    z: Array,
+    states: Array,
+) -> Array:
+    """Return a measure of the user of many collocated gaits."""
+    evaluate = functools.partial(evaluate_own_measure, measure, system, model)
+    return jax.vmap(lambda p, z, x: evaluate(p, unpack_solution(shapes, z), x))(
+        parameters, z, states
+    )
+
+
+@functools.partial(jax.jit, static_argnums=range(4))
+@functools.partial(jax.vmap, in_axes=(None, None, None, None, 0, 0, 0))
 def _read_collocated_gaits(
     system: CollocationSystem,
     shapes: SolutionShapes,
     additional_quantity_function: Callable | None,
+    has_force_peaks: bool,
     parameters: Array,
     is_phase_active: Array,
     z: Array,
@@ -555,6 +580,8 @@ def _read_collocated_gaits(
         quantities |= additional_quantity_function(
             system.make_wheel(parameters).symbols(), phase_points_by_step[0], solution
         )
+    if has_force_peaks:
+        quantities |= locate_force_peaks(system, parameters, solution)[0]
     return jnp.stack([end_point.q[0], *end_point.v]), quantities
 
 
@@ -635,6 +662,11 @@ class ReturnMapProblem(AbstractGaitProblem, AbstractStateProblem):
 
     conserved_values: Any = None
 
+    def measure_steps(
+        self, values: np.ndarray, states: np.ndarray, steps: AbstractStep
+    ) -> QuantitiesByName:
+        return _measure_cycles(self, values, states, steps)
+
     @property
     def function(self) -> Callable[[Any, Array, Array], Array]:
         return jax.tree_util.Partial(
@@ -705,7 +737,7 @@ class ContactGaitProblem(ReturnMapProblem):
             EVENT_ORDER: compute_contact_order_numbers(steps, self.n_legs),
             FRICTION_SURPLUS: self._compute_friction_surplus(values),
         }
-        return quantities | super().measure_steps(values, states, steps)
+        return quantities | _measure_cycles(self, values, states, steps)
 
     def _compute_friction_surplus(self, values: np.ndarray) -> np.ndarray:
         """Return the friction coefficient minus the slope's tangent.
@@ -724,25 +756,27 @@ class ContactGaitProblem(ReturnMapProblem):
         return bool(np.isfinite(z).all() and surplus > 0.0)
 
 
-@eqx.filter_jit
-@eqx.filter_vmap(in_axes=(*[None] * 5, 0, 0, 0))
 def _measure_cycles(
-    has_force_peaks: bool,
-    own_measures: tuple[Measure, ...],
-    options: StepOptions,
-    model: Any,
-    n_legs: int,
-    values: Array,
-    state: Array,
-    steps: AbstractStep,
-) -> dict[str, Array]:
-    model, params = model.from_parameter_values(values, n_legs)
-    cycle = model, params, state, steps.section_state
-    quantities = locate_force_peaks(options, *cycle) if has_force_peaks else {}
-    return quantities | {
-        measure.name: average_own_measure(measure, options, *cycle, steps)
-        for measure in own_measures
-    }
+    problem: AbstractGaitProblem, values: np.ndarray, states: np.ndarray, steps: AbstractStep
+) -> QuantitiesByName:
+    """Return force peaks and measures of the user, if requested, from the steps of gaits."""
+    if not (problem.measures_force_peaks or problem.own_measures):
+        return {}
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def measure(values: Array, state: Array, steps: AbstractStep) -> dict[str, Array]:
+        model, params = problem.model.from_parameter_values(values, problem.n_legs)
+        options, quantities = problem.step_options, {}
+        if problem.measures_force_peaks:
+            step_ends = steps.section_state
+            quantities = measure_return_map_force_peaks(model, params, state, step_ends, options)
+        return quantities | {
+            measure.name: measure_return_map_cycle(measure, options, model, params, state, steps)
+            for measure in problem.own_measures
+        }
+
+    return map_in_numpy_batches(measure, POINT_BATCH_SIZES, values, states, steps)
 
 
 def compute_contact_order_numbers(gait_steps_of_period: Any, n_legs: int) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import functools
 import operator
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -16,7 +15,6 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from vrw_jax.base.checks import check_choice
 from vrw_jax.base.measures import Measure, name_measures
-from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     AbstractPrintable,
@@ -284,11 +282,9 @@ class AbstractCycle(AbstractPrintable):
             for measure, name in zip(measure_names, name_measures(measure_names), strict=True)
         }
 
+    @abc.abstractmethod
     def _evaluate_own_measure(self, measure: Measure) -> Array:
         """Return the value of a measure of the user, which is undefined without a gait."""
-        average = functools.partial(average_own_measure, measure, StepOptions())
-        steps = getattr(self, "steps", None)
-        return self.map_over_batch_axes(average)(*self._wheel_and_start, self.step_ends, steps)
 
     @property
     def force_peaks(self) -> dict[str, Array]:
@@ -297,14 +293,14 @@ class AbstractCycle(AbstractPrintable):
         Each measure is the largest value over the gait steps. The measures have first derivatives.
         The derivatives of the number of peaks are zero.
         """
-        locate = self.map_over_batch_axes(functools.partial(locate_force_peaks, StepOptions()))
-        peaks = locate(*self._wheel_and_start, self.step_ends)
-        return jax.tree.map(self._zero_without_gait, peaks)
+        return {
+            measure_name: self._zero_without_gait(peak_value)
+            for measure_name, peak_value in self._locate_force_peaks().items()
+        }
 
-    @property
     @abc.abstractmethod
-    def _wheel_and_start(self) -> tuple[Any, WheelParams, Array]:
-        """Return the model, the wheel and the section state at the start of the gait."""
+    def _locate_force_peaks(self) -> dict[str, Array]:
+        """Return the measures of `force_peaks`; their values are undefined without a gait."""
 
     def map_over_batch_axes(self, function_of_cycle: Callable) -> Callable:
         """Return the function of one cycle, mapped over the batch axes of this cycle."""
@@ -342,52 +338,6 @@ class AbstractCycle(AbstractPrintable):
     def model_summary_rows(self) -> list[LabelAndText]:
         """Return the labels and texts that depend on the class of the cycle."""
         return [("durations of each kind of support", f"{format_numbers(self.durations)} s")]
-
-
-def locate_force_peaks(
-    options: StepOptions,
-    model: Any,
-    params: WheelParams,
-    section_state: Array,
-    step_ends: Array,
-) -> dict[str, Array]:
-    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, the largest over its steps.
-
-    - `section_state`: section state at the start of the cycle;
-    - `step_ends`: section state at the end of each gait step, on a leading axis.
-    """
-    start_states = jnp.concatenate([section_state[None], step_ends[:-1]])
-    measures_by_leg = []
-    for k in range(model.leg_period):
-        measure = functools.partial(model.measure_force_peaks, model.select_params(params, k))
-        starts = start_states[k :: model.leg_period]
-        measures_by_leg.append(jax.vmap(lambda x, measure=measure: measure(x, options))(starts))
-    return jax.tree.map(lambda *values: jnp.nanmax(jnp.concatenate(values)), *measures_by_leg)
-
-
-def average_own_measure(
-    measure: Measure,
-    options: StepOptions,
-    model: Any,
-    params: WheelParams,
-    section_state: Array,
-    step_ends: Array,
-    steps: Any,
-) -> Array:
-    """Return a measure of the user, as the mean over the steps of a cycle.
-
-    - `section_state`, `step_ends`: as in `locate_force_peaks`;
-    - `steps`: gait steps of the cycle on a leading axis, or None if they are not known.
-    """
-    values = []
-    for k in range(len(step_ends)):
-        step_params = model.select_params(params, k)
-        step = jax.tree.map(lambda x, k=k: x[k], steps)
-        if steps is None and not measure.phases:
-            step = model.take_step(step_params, section_state, options)
-        values.append(model.measure_step(step_params, section_state, step, options, (measure,)))
-        section_state = step_ends[k]
-    return jnp.mean(jnp.stack([value[measure.name] for value in values]), 0)
 
 
 def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str]:

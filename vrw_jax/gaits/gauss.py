@@ -132,3 +132,17 @@ def transfer_accelerations(
         node_accelerations.reshape(transfer_matrix.shape[1], *trailing_shape),
         1,
     ).reshape(target_mesh.n_intervals, N_GAUSS_NODES, *trailing_shape)
+
+
+def compute_integration_weights(location_in_interval: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights with which node values enter the single and the double integral.
+
+    The integrals extend from 0 to `location_in_interval`, the time since the start of the mesh
+    interval in interval lengths. Each array of weights has the shape (N_GAUSS_NODES,).
+    """
+    monomial_integrals = location_in_interval ** (_MONOMIAL_POWERS + 1) / (_MONOMIAL_POWERS + 1)
+    monomial_double_integrals = location_in_interval * monomial_integrals / (_MONOMIAL_POWERS + 2)
+    return (
+        monomial_integrals @ _COEFFICIENTS_FROM_NODE_VALUES,
+        monomial_double_integrals @ _COEFFICIENTS_FROM_NODE_VALUES,
+    )

@@ -29,6 +29,7 @@ from vrw_jax.gaits.derivatives import (
     attach_monodromy_derivatives,
     solve_cycle_with_derivatives,
 )
+from vrw_jax.gaits.force_peaks import measure_extremum, measure_force_peaks
 from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
 from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS, CollocationState, CollocationSystem
@@ -39,11 +40,7 @@ from vrw_jax.gaits.slope_response import (
     make_slope_response_function,
 )
 from vrw_jax.lanes.batching import is_inside_jit
-from vrw_jax.models.step_results import (
-    DoubleSupportIndicators,
-    Margins,
-    SectionState,
-)
+from vrw_jax.models.step_results import DoubleSupportIndicators, Margins, SectionState
 from vrw_jax.models.stepping import step
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel import transitions
@@ -97,7 +94,7 @@ class LimitCycle(AbstractCycle):
 
     @property
     def step_ends(self) -> Array:
-        return jnp.asarray(self.collocation_state.gait_step_end_states)[..., jnp.array([0, 2, 3])]
+        return jnp.asarray(self.collocation_state.gait_step_end_states)
 
     @property
     def warm_start(self) -> CollocationState:
@@ -198,15 +195,15 @@ class LimitCycle(AbstractCycle):
         )
 
     def _evaluate_own_measure(self, measure: Measure) -> Array:
-        if not measure.phases or measure.reduction in ("min", "max"):
-            return super()._evaluate_own_measure(measure)
-
         def make_evaluate(system: CollocationSystem) -> Callable:
-            return lambda parameters, state: integrate_own_measure(
-                measure, system, parameters, state.solution
+            return lambda parameters, state, section_state: evaluate_own_measure(
+                measure, system, self.model, parameters, state.solution, section_state
             )
 
-        return self._evaluate_on_mesh(make_evaluate)
+        return self._evaluate_on_mesh(make_evaluate, self.section_state)
+
+    def _locate_force_peaks(self) -> dict[str, Array]:
+        return self._evaluate_on_mesh(lambda system: functools.partial(measure_force_peaks, system))
 
     @property
     def margins(self) -> Margins:
@@ -220,21 +217,10 @@ class LimitCycle(AbstractCycle):
 
     @property
     def searched_wheel(self) -> tuple[ViscoelasticWheel, WheelParams]:
-        return self.model, self._make_wheel(self.searched_parameters)
-
-    def _make_wheel(self, parameters: Array) -> WheelParams:
         # A single wheel outside its domain would raise an error, and a batch of one does not.
-        wheels = self.system.make_wheel(jnp.moveaxis(parameters, -1, 0)[..., None])
-        return jax.tree.map(lambda x: x[..., 0], wheels)
-
-    @property
-    def _wheel_and_start(self) -> tuple[ViscoelasticWheel, WheelParams, Array]:
-        # Without a gait, the wheel is that in Table 1. Its step has finite derivatives, which are
-        # multiplied by zero, from a start that is not zero.
-        params = self._make_wheel(self.parameters)
-        default_start = self.model.compute_default_start(params)
-        start = jnp.where(self.found[..., None], self.section_state, default_start)
-        return self.model, params, start
+        parameters = jnp.moveaxis(self.searched_parameters, -1, 0)[..., None]
+        wheels = self.system.make_wheel(parameters)
+        return self.model, jax.tree.map(lambda x: x[..., 0], wheels)
 
     @property
     def ending(self) -> Any:
@@ -263,20 +249,32 @@ class LimitCycle(AbstractCycle):
 
 
 @eqx.filter_jit
-def integrate_own_measure(
+def evaluate_own_measure(
     measure: Measure,
     system: CollocationSystem,
+    model: ViscoelasticWheel,
     parameters: Array,
     solution: CollocationSolution,
+    section_state: Array,
 ) -> Array:
-    """Return an integral or a mean over phases, as the mean over the gait steps.
+    """Return a measure of the user, as the mean over the gait steps.
 
     The Gauss nodes of a phase integrate a function of its motion as accurately as the collocation
     integrates the motion: both have order 8.
     """
+    params = system.make_wheel(parameters)
+    if not measure.phases:
+        if system.period_n > 1:
+            raise ValueError(
+                f"{measure.name} is a function of a step, but the cycle has {system.period_n}: "
+                "give it a phase, or compute the steps by vrw.walk."
+            )
+        return jnp.asarray(measure(step(params, section_state, model=model), params))
     phase_names = [phase.phase_name for phase in PAPER_PHASES]
     for name in measure.phases:
         require_known_name(name, phase_names, "phase")
+    if measure.reduction in ("min", "max"):
+        return measure_extremum(system, parameters, solution, measure)
     indices, values = [phase_names.index(name) for name in measure.phases], []
     for k, points in enumerate(system.evaluate_phase_points(parameters, solution)):
         params = system.make_wheel(parameters, k)

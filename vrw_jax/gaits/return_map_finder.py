@@ -4,6 +4,7 @@ Only the interface of models is used. For the paper's model, `collocation_finder
 method.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Scalar
@@ -106,9 +108,59 @@ class ReturnMapCycle(AbstractCycle):
     def step_ends(self) -> Array:
         return jnp.asarray(self.steps.section_state)
 
-    @property
-    def _wheel_and_start(self) -> tuple[Any, WheelParams, Array]:
-        return self.model, self.params, self.section_state
+    def _evaluate_own_measure(self, measure: Measure) -> Array:
+        measure_cycle = functools.partial(measure_return_map_cycle, measure, StepOptions())
+        return self.map_over_batch_axes(measure_cycle)(
+            self.model, self.params, self.section_state, self.steps
+        )
+
+    def _locate_force_peaks(self) -> dict[str, Array]:
+        measure_cycle = functools.partial(measure_return_map_force_peaks, options=StepOptions())
+        return self.map_over_batch_axes(measure_cycle)(
+            self.model, self.params, self.section_state, self.step_ends
+        )
+
+
+def measure_return_map_force_peaks(
+    model: Any,
+    params: WheelParams,
+    section_state: Array,
+    step_ends: Array,
+    options: StepOptions,
+) -> dict[str, Array]:
+    """Return the `measures.FORCE_PEAK_MEASURES` of a cycle by name, the largest over its steps.
+
+    - `section_state`: section state at the start of the cycle;
+    - `step_ends`: section state at the end of each gait step, on a leading axis.
+    """
+    start_states = jnp.concatenate([section_state[None], step_ends[:-1]])
+    measures_by_leg = []
+    for k in range(model.leg_period):
+        measure = functools.partial(model.measure_force_peaks, model.select_params(params, k))
+        starts = start_states[k :: model.leg_period]
+        measures_by_leg.append(jax.vmap(lambda x, measure=measure: measure(x, options))(starts))
+    return jax.tree.map(lambda *values: jnp.nanmax(jnp.concatenate(values)), *measures_by_leg)
+
+
+def measure_return_map_cycle(
+    measure: Measure,
+    options: StepOptions,
+    model: Any,
+    params: WheelParams,
+    section_state: Array,
+    steps: Any,
+) -> Array:
+    """Return a measure of the user, as the mean over the steps of a cycle.
+
+    - `steps`: gait steps of the cycle, on a leading axis.
+    """
+    values = []
+    for k in range(len(steps.section_state)):
+        step = jax.tree.map(lambda x, k=k: x[k], steps)
+        step_params = model.select_params(params, k)
+        values.append(model.measure_step(step_params, section_state, step, options, (measure,)))
+        section_state = step.section_state
+    return jnp.mean(jnp.stack([value[measure.name] for value in values]), 0)
 
 
 @eqx.filter_jit
