@@ -12,7 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.lanes.llvm_library import ir
-from vrw_jax.lanes.value_emitter import LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
+from vrw_jax.lanes.value_emitter import (
+    LLVM_COMPARISONS,
+    LLVM_NUMBER_TYPES,
+    LlvmValue,
+    TextBuilder,
+    ValueEmitter,
+)
 
 FUSED_MULTIPLY_ADD_FLAGS = ("contract",)
 """LLVM's fast-math flag that lets the processor round a product and a following sum once instead of
@@ -38,7 +44,7 @@ class ElementwiseOperation(NamedTuple):
     result_dtype: Any
 
     @property
-    def llvm_builder(self) -> ir.IRBuilder:
+    def llvm_builder(self) -> TextBuilder:
         """Return the builder that appends LLVM instructions."""
         return self.value_emitter.llvm_builder
 
@@ -110,12 +116,10 @@ def emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -
     _require_float_dtype("div", operation)
     if _equals_llvm_constant(y, 1):
         return x
-    return operation.llvm_builder.fdiv(
-        *operation.value_emitter.to_scalars_or_vectors(x, y),
-        flags=RECIPROCAL_DIVISION_FLAGS
-        if operation.operand_dtype == np.float64
-        else FUSED_MULTIPLY_ADD_FLAGS,
-    )
+    has_float64 = operation.operand_dtype == np.float64
+    flags = RECIPROCAL_DIVISION_FLAGS if has_float64 else FUSED_MULTIPLY_ADD_FLAGS
+    operands = operation.value_emitter.to_scalars_or_vectors(x, y)
+    return operation.llvm_builder.emit_binary(f"fdiv {' '.join(flags)}", *operands)
 
 
 def emit_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
@@ -156,13 +160,11 @@ def _return_operand(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
 
 
 def emit_bitwise_operation(
-    builder_method_name: str, operation: ElementwiseOperation, *operands: LlvmValue
+    opcode: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
 ) -> LlvmValue:
-    """Emit a bitwise instruction by a method of llvmlite's `IRBuilder`, and return its LLVM
-    value.
-    """
-    return getattr(operation.llvm_builder, builder_method_name)(
-        *operation.value_emitter.to_scalars_or_vectors(*operands)
+    """Emit a bitwise instruction with two operands, and return its LLVM value."""
+    return operation.llvm_builder.emit_binary(
+        opcode, *operation.value_emitter.to_scalars_or_vectors(x, y)
     )
 
 
@@ -173,16 +175,15 @@ def emit_comparison(
 
     `comparison_operator` is an operator such as "<".
     """
-    llvm_builder, number_kind = operation.llvm_builder, operation.operand_dtype.kind
-    if number_kind == "b":  # The signed value of true would be -1.
-        compare_values = llvm_builder.icmp_unsigned
-    elif number_kind != "f":
-        compare_values = llvm_builder.icmp_signed
-    elif comparison_operator == "!=":
-        compare_values = llvm_builder.fcmp_unordered
-    else:
-        compare_values = llvm_builder.fcmp_ordered
-    return compare_values(comparison_operator, *operation.value_emitter.to_scalars_or_vectors(x, y))
+    number_kind, relation = operation.operand_dtype.kind, LLVM_COMPARISONS[comparison_operator]
+    if number_kind == "f":  # NaN differs from every number.
+        opcode = f"fcmp {'u' if relation == 'ne' else 'o'}{relation}"
+    elif relation in ("eq", "ne"):
+        opcode = f"icmp {relation}"
+    else:  # The signed value of true would be -1.
+        opcode = f"icmp {'u' if number_kind == 'b' else 's'}{relation}"
+    operands = operation.value_emitter.to_scalars_or_vectors(x, y)
+    return operation.llvm_builder.emit_comparison(opcode, *operands)
 
 
 def emit_extremum(
@@ -197,7 +198,7 @@ def emit_extremum(
     if operation.operand_dtype.kind != "f":
         return extremum
     # The result is NaN if either operand is NaN.
-    return llvm_builder.select(llvm_builder.fcmp_unordered("uno", x, x), x, extremum)
+    return llvm_builder.select(llvm_builder.emit_comparison("fcmp uno", x, x), x, extremum)
 
 
 def emit_select(
@@ -256,7 +257,7 @@ def _emit_binary_instruction(
     llvm_opcode = (
         f"f{integer_opcode} {' '.join(FUSED_MULTIPLY_ADD_FLAGS)}" if is_float else integer_opcode
     )
-    return operation.value_emitter.emit_binary_instruction(
+    return operation.llvm_builder.emit_binary(
         llvm_opcode, *operation.value_emitter.to_scalars_or_vectors(x, y)
     )
 
@@ -317,7 +318,8 @@ def _emit_intrinsic_call(
     llvm_module = operation.llvm_builder.module
     if intrinsic_name not in llvm_module.globals:
         ir.Function(llvm_module, ir.FunctionType(llvm_type, [llvm_type]), intrinsic_name)
-    return operation.llvm_builder.call(llvm_module.globals[intrinsic_name], [operand])
+    text = f"call {llvm_type} @{intrinsic_name}({llvm_type} {operand.get_reference()})"
+    return operation.llvm_builder.emit(llvm_type, text)
 
 
 def _equals_llvm_constant(llvm_value: LlvmValue, expected_number: int) -> bool:
@@ -334,7 +336,7 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "abs": emit_absolute_value,
     "add": emit_sum,
     "add_any": emit_sum,
-    "and": partial(emit_bitwise_operation, "and_"),
+    "and": partial(emit_bitwise_operation, "and"),
     "bitcast_convert_type": emit_bits,
     "convert_element_type": emit_conversion,
     "copy": _return_operand,
@@ -351,8 +353,8 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "mul": emit_product,
     "ne": partial(emit_comparison, "!="),
     "neg": emit_negative,
-    "not": partial(emit_bitwise_operation, "not_"),
-    "or": partial(emit_bitwise_operation, "or_"),
+    "not": lambda operation, x: operation.llvm_builder.not_(x),
+    "or": partial(emit_bitwise_operation, "or"),
     "select_n": emit_select,
     "shift_left": partial(emit_bitwise_operation, "shl"),
     "shift_right_arithmetic": partial(emit_bitwise_operation, "ashr"),

@@ -404,6 +404,8 @@ class ArrayEmitter:
             varying_operands[0].shape,
             [emit_result_entry(entry_operands) for entry_operands in operand_entries],
         )
+        if result_entries.shape == result_shape:
+            return result_entries
         return np.broadcast_to(result_entries, result_shape)
 
     def drop_extra_axis(self, array: LlvmArray, n_axes: int) -> LlvmArray:

@@ -18,7 +18,14 @@ from vrw_jax.lanes.lazy_arrays import EntryIndex, LazyArray, LlvmArray, MemoryAr
 from vrw_jax.lanes.llvm_library import ir
 from vrw_jax.lanes.lowering import JaxprLowering
 from vrw_jax.lanes.rules import PRIMITIVE_RULES
-from vrw_jax.lanes.value_emitter import I8, I64, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
+from vrw_jax.lanes.value_emitter import (
+    I8,
+    I64,
+    LLVM_NUMBER_TYPES,
+    LlvmValue,
+    TextBuilder,
+    ValueEmitter,
+)
 
 LANE_KERNEL_NAME = "lanes"
 
@@ -44,7 +51,7 @@ def write_llvm_kernel(
         LANE_KERNEL_NAME,
     )
     llvm_kernel.attributes.add("nounwind")
-    llvm_builder = ir.IRBuilder(llvm_kernel.append_basic_block("entry"))
+    llvm_builder = TextBuilder(llvm_kernel.append_basic_block("entry"))
     value_emitter = ValueEmitter(llvm_builder, max(lanes_per_group, 2))
     array_emitter = ArrayEmitter(value_emitter, max_unrolled_entries)
     inputs, outputs, n_lanes, first_lane_group, end_lane_group = llvm_kernel.args

@@ -18,7 +18,7 @@ from vrw_jax.lanes.array_emitter import (
 )
 from vrw_jax.lanes.lazy_arrays import LlvmArray, mark_memory_as_shared
 from vrw_jax.lanes.llvm_library import ir
-from vrw_jax.lanes.value_emitter import LlvmValue, ValueEmitter
+from vrw_jax.lanes.value_emitter import LlvmValue, TextBuilder, ValueEmitter
 
 PrimitiveRule = Callable[["JaxprLowering", Any, list[LlvmArray]], list[LlvmArray]]
 """Function that lowers one primitive. It takes the lowering, an equation and the operands, emits
@@ -174,7 +174,7 @@ class JaxprLowering:
         llvm_function.linkage = "internal"
         for llvm_attribute in ("noinline", "nounwind"):
             llvm_function.attributes.add(llvm_attribute)
-        llvm_builder = ir.IRBuilder(llvm_function.append_basic_block("entry"))
+        llvm_builder = TextBuilder(llvm_function.append_basic_block("entry"))
         array_emitter_of_caller = self.array_emitter
         array_emitter_of_function = ArrayEmitter(
             ValueEmitter(llvm_builder, array_emitter_of_caller.value_emitter.n_vector_lanes),

@@ -20,11 +20,12 @@ LLVM_NUMBER_TYPES = {
     "float32": ir.FloatType(),
     "float64": ir.DoubleType(),
 }
+LLVM_COMPARISONS = {"<": "lt", "<=": "le", ">": "gt", ">=": "ge", "==": "eq", "!=": "ne"}
 
 
 @dataclass(slots=True, eq=False)
-class LlvmBinaryInstruction:
-    """LLVM instruction with two operands of one type.
+class LlvmInstruction:
+    """LLVM instruction as text.
 
     Most instructions of a program are of this class. llvmlite's own instructions can be changed
     later, so they take six times as long to create and to write.
@@ -40,6 +41,47 @@ class LlvmBinaryInstruction:
 
     def __str__(self) -> str:
         return self.text
+
+
+class TextBuilder(ir.IRBuilder):
+    """Builder of LLVM instructions that writes the frequent ones as text at once."""
+
+    n_results = 0
+
+    def emit(self, result_type: ir.Type, text: str) -> LlvmInstruction:
+        """Append an instruction, given without the name of its result, and return it."""
+        self.n_results += 1
+        name = f"%o{self.n_results}"
+        instruction = LlvmInstruction(name, result_type, f"{name} = {text}")
+        self._insert(instruction)
+        return instruction
+
+    def emit_binary(
+        self, opcode: str, x: LlvmValue, y: LlvmValue, result_type: ir.Type = None
+    ) -> LlvmInstruction:
+        """Append an instruction with operands of one type, which its result has by default."""
+        text = f"{opcode} {x.type} {x.get_reference()}, {y.get_reference()}"
+        return self.emit(result_type or x.type, text)
+
+    def emit_comparison(self, opcode: str, x: LlvmValue, y: LlvmValue) -> LlvmInstruction:
+        """Append a comparison of operands of one type, whose results are truth values."""
+        is_vector = isinstance(x.type, ir.VectorType)
+        return self.emit_binary(opcode, x, y, ir.VectorType(I1, x.type.count) if is_vector else I1)
+
+    def select(self, condition: LlvmValue, x: LlvmValue, y: LlvmValue) -> LlvmInstruction:
+        operands = [f"{value.type} {value.get_reference()}" for value in (condition, x, y)]
+        return self.emit(x.type, f"select {', '.join(operands)}")
+
+    def gep(
+        self, pointer: LlvmValue, indices: Sequence[LlvmValue], source_etype: ir.Type
+    ) -> LlvmInstruction:
+        (index,) = indices
+        text = f"ptr {pointer.get_reference()}, {index.type} {index.get_reference()}"
+        return self.emit(ir.PointerType(), f"getelementptr {source_etype}, {text}")
+
+    def load(self, pointer: LlvmValue, typ: ir.Type, align: int | None = None) -> LlvmInstruction:
+        suffix = f", align {align}" if align else ""
+        return self.emit(typ, f"load {typ}, ptr {pointer.get_reference()}{suffix}")
 
 
 class _LlvmSplatConstant(ir.Constant):
@@ -62,7 +104,6 @@ class ValueEmitter:
         self.emitted_values: dict[tuple, Any] = {}
         # Keys of the values emitted within the innermost loop.
         self.recent_value_keys: list[tuple] = []
-        self.n_emitted_instructions = 0
         self.llvm_constants: dict[tuple[str, str], ir.Constant] = {}
 
     def make_vector_type(self, llvm_number_type: ir.Type) -> ir.VectorType:
@@ -121,23 +162,6 @@ class ValueEmitter:
             self.emitted_values[value_key] = create_llvm_value()
             self.recent_value_keys.append(value_key)
         return self.emitted_values[value_key]
-
-    def emit_binary_instruction(
-        self, llvm_opcode: str, x: LlvmValue, y: LlvmValue
-    ) -> LlvmBinaryInstruction:
-        """Emit an instruction with two operands of the same type, and return the instruction.
-
-        The type of its result is that of the operands.
-        """
-        self.n_emitted_instructions += 1
-        result_name, llvm_type = f"%o{self.n_emitted_instructions}", x.type
-        instruction = LlvmBinaryInstruction(
-            result_name,
-            llvm_type,
-            f"{result_name} = {llvm_opcode} {llvm_type} {x.get_reference()}, {y.get_reference()}",
-        )
-        self.llvm_builder._insert(instruction)
-        return instruction
 
     def to_scalars_or_vectors(self, *llvm_values: LlvmValue) -> list[LlvmValue]:
         """Return all LLVM values as vectors if one of them is a vector, else unchanged."""
