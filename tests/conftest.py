@@ -101,6 +101,16 @@ def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_protocol() -> None:
-    """Check the first call of each function in every test."""
+def pytest_runtest_protocol(item: pytest.Item) -> None:
+    """Check the first call of each function in every test.
+
+    LLVM compiles groups of one vector in 40 % of the time that groups of two take. The slow tests,
+    and those of machine code, run the groups of users, which have the same bits.
+    """
+    from vrw_jax.lanes import program
+
     shape_checks.start_test()
+    is_short = item.config.getoption("markexpr") == "not slow" and not (
+        item.path.parent.name == "lanes" or item.path.stem == "test_lane_engine"
+    )
+    program.VECTORS_PER_GROUP = 1 if is_short else 2
