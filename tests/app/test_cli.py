@@ -18,6 +18,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.figure import Figure
 from support.scanning import CountingEngine, evaluate_arithmetically
 from support.slow_variants import mark_slow
 from typer.testing import CliRunner, Result
@@ -263,6 +264,9 @@ def test_figures_are_drawn_again_only_if_results_or_code_have_changed(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = config.parent / "results" / "small"
+    # Another test draws the figures of a scan.
+    draw = lambda dataset, width: {"scan_over_stiffness": Figure(figsize=(1.0, 1.0))}
+    monkeypatch.setattr(vrw.plot, "scan_figures", draw)
 
     def scan_and_list_drawn_figures() -> list[str]:
         previous_times = {path: path.stat().st_mtime_ns for path in folder.glob("scan_over_*")}

@@ -5,6 +5,7 @@ Nothing here uses a multiplier: forces and impulses are balances of hub and legs
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -171,34 +172,41 @@ def compute_margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     phases: dict[str, Phase] = {phase.name: phase for phase in result["phases"]}
     length, legs = wheel.params["locked_length"], int(wheel.params["n_legs"])
 
-    def motion(phase: Phase, t: float) -> tuple[Array, Array, Array, Array]:
-        q, v = phase.sample(t)
-        a, multipliers = wheel.acceleration(q, v, phase.name)
+    @functools.cache  # Many margins are functions of the same forces at the same times.
+    def motion(name: str, t: float) -> tuple[Array, Array, Array, Array]:
+        q, v = phases[name].sample(t)
+        a, multipliers = wheel.acceleration(q, v, name)
         return q, v, a, multipliers
 
-    def forces(phase: Phase, t: float) -> Array:
-        q, v, a, _ = motion(phase, t)
-        return contact_forces(wheel, q, v, a, phase.name)
+    @functools.cache
+    def forces(name: str, t: float) -> Array:
+        q, v, a, _ = motion(name, t)
+        return contact_forces(wheel, q, v, a, name)
 
-    def lowest(function: Callable[[Phase, float], float], name: str, skip: bool = False) -> float:
-        phase = phases[name]
-        return _lowest(lambda t: function(phase, t), phase.duration, skip_start=skip)
+    @functools.cache
+    def stoppers(name: str, t: float) -> Array:
+        return stopper_forces(wheel, *motion(name, t)[:3])
+
+    def lowest(function: Callable[[str, float], float], name: str, skip: bool = False) -> float:
+        duration = phases[name].duration
+        return _lowest(lambda t: function(name, t), duration, skip_start=skip)
+
+    def height(name: str, t: float) -> float:
+        return wheel.foot2(phases[name].sample(t)[0])[1]
 
     out: dict[str, Any] = {}
-    out["lambda2"] = {name: lowest(lambda p, t: float(forces(p, t)[1]), name) for name in phases}
-    out["lambda4"] = {"DLS": lowest(lambda p, t: float(forces(p, t)[3]), "DLS")}
-    out["foot2_clearance_sls1"] = lowest(
-        lambda p, t: wheel.foot2(p.sample(t)[0])[1], "SLS-I", skip=True
-    )
-    q, v, a, _ = motion(phases["SLS-I"], 0.0)
+    out["lambda2"] = {x: lowest(lambda name, t: float(forces(name, t)[1]), x) for x in phases}
+    out["lambda4"] = {"DLS": lowest(lambda name, t: float(forces(name, t)[3]), "DLS")}
+    out["foot2_clearance_sls1"] = lowest(height, "SLS-I", skip=True)
+    q, v, a, _ = motion("SLS-I", 0.0)
     foot2 = mass_accelerations(wheel, q, v, a)[0] - _leg_motion(
         (q[2] + wheel.alpha, v[2], a[2]), (q[4], v[4], a[4])
     )
     out["takeoff_acceleration"] = float(foot2[1])
-    out["foot2_clearance_sls2"] = lowest(lambda p, t: wheel.foot2(p.sample(t)[0])[1], "SLS-II")
+    out["foot2_clearance_sls2"] = lowest(height, "SLS-II")
 
-    def stopper(leg: int, name: str) -> float:
-        return lowest(lambda p, t: float(stopper_forces(wheel, *motion(p, t)[:3])[leg - 2]), name)
+    def stopper(leg: int, phase_name: str) -> float:
+        return lowest(lambda name, t: float(stoppers(name, t)[leg - 2]), phase_name)
 
     minimum = [np.nanmin([stopper(leg, name) for name in phases]) for leg in range(3, legs + 1)]
     out["stopper_force_legs"] = np.array(minimum)
@@ -206,15 +214,15 @@ def compute_margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     out["stopper_force_leg2"] = stopper(2, "SLS-II")
     # One function over the whole step: only its very start is left out.
     ends = [
-        lowest(lambda p, t: length - float(p.sample(t)[0][3]), name, skip=i == 0)
+        lowest(lambda x, t: length - float(phases[x].sample(t)[0][3]), name, skip=i == 0)
         for i, name in enumerate(name for name in phases if phases[name].duration > 0)
     ]
     out["shortening"] = float(np.nanmin(ends))
     out["friction_leg1"] = -float(
         np.nanmin(
             [
-                lowest(lambda p, t: -abs(forces(p, t)[0]) / float(forces(p, t)[1]), name)
-                for name in phases
+                lowest(lambda name, t: -abs(forces(name, t)[0]) / float(forces(name, t)[1]), x)
+                for x in phases
             ]
         )
     )
@@ -232,7 +240,7 @@ def compute_margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
     out["impulse_friction_leg2"] = abs(landing[2]) / landing[3] if planted else math.nan
     out["friction_leg2_landing"] = math.nan
     if phases["DLS"].duration > 0:
-        start = forces(phases["DLS"], 0.0)
+        start = forces("DLS", 0.0)
         out["friction_leg2_landing"] = abs(start[2]) / start[3]
 
     q, before, after = result["stopper"]
@@ -244,9 +252,9 @@ def compute_margins(wheel: Wheel, result: Mapping[str, Any]) -> dict[str, Any]:
 
     residual = float(np.max(np.abs(landing - result["lambda_impulse_applied"])))
     residual = max(residual, abs(float(total[1] - result["lambda_stopper"][1])))
-    for phase in phases.values():
+    for name, phase in phases.items():
         for t in np.linspace(0.0, phase.duration, 11) if phase.duration > 0 else []:
-            gap = forces(phase, float(t)) - motion(phase, float(t))[3]
+            gap = forces(name, float(t)) - motion(name, float(t))[3]
             residual = max(residual, float(np.max(np.abs(gap))))
     out["newton_residual"] = residual
     return out

@@ -37,10 +37,16 @@ def list_files(complete_store: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.fixture(scope="module")
+def written_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("stores") / "s.zarr"
+    run_plan(make_plan(), path, evaluate=evaluate_arithmetically)
+    return path
+
+
 @pytest.fixture
-def complete_store(tmp_path: Path) -> Path:
-    run_plan(make_plan(), tmp_path / "s.zarr", evaluate=evaluate_arithmetically)
-    return tmp_path / "s.zarr"
+def complete_store(written_store: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(written_store, tmp_path / "s.zarr"))
 
 
 # Damage
