@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.leg_laws import ProgressiveLeg, QuadraticDamper, make_wheel
+from support.leg_laws import QuadraticDamper, make_progressive_leg, make_wheel
 
 import vrw_jax as vrw
 
@@ -34,10 +34,10 @@ def test_points_of_the_branch_are_gaits_of_their_laws(branch):
 
 @pytest.mark.slow
 def test_a_border_along_a_parameter_of_the_wheel_has_a_gait_of_the_law():
-    model = make_wheel(ProgressiveLeg(1000.0, 300.0))
+    model = make_wheel(make_progressive_leg(1000.0, 300.0))
     branch = vrw.continue_branch(
         vrw.WheelParams(damping=120.0), "damping", (100.0, 180.0), model=model
     )
     (border,) = (x for x in branch.special_points if x.name == "lambda_4_plus")
     assert abs(float(border.cycle.indicators.lambda_4)) < 1e-6
-    np.testing.assert_array_equal(border.cycle.parameters[9:], [1000.0, 300.0])
+    np.testing.assert_array_equal(border.cycle.parameters[9:], [0.0, 1000.0, 300.0])

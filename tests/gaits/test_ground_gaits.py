@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.machine_code import disable_machine_code
-from support.slow_variants import mark_slow
+from support.slow_variants import ENGINES, mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.branches.branch import evaluate_bifurcations
@@ -280,7 +280,7 @@ def unilateral_batch():
     return damping, friction, states, walked
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_unilateral_batches_equal_single_wheels(unilateral_batch, engine):
     damping, friction, states, walk_result = unilateral_batch
     solution = walk_result(slice(None))

@@ -1,5 +1,7 @@
 """The machine-code and the diffrax engine agree on one step, in values and derivatives."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,6 +58,22 @@ def results_of_both_engines():
             for engine in ("lanes", "diffrax")
         )
     return lanes, diffrax
+
+
+def test_a_batch_by_diffrax_without_elements_has_results_of_the_usual_shapes(
+    results_of_both_engines, monkeypatch
+):
+    monkeypatch.setattr(batch_sizes, "DIFFRAX_BATCH_SIZE", N)
+    _, full = results_of_both_engines
+    for names, expected in (ALL_INPUT_NAMES, full), ((), dataclasses.replace(full, derivatives={})):
+        empty = vrw.step_batch(
+            vrw.WheelParams(), np.empty((0, 3)), options=TIGHT_OPTIONS, engine="diffrax",
+            derivatives=names,
+        )  # fmt: skip
+        assert empty.section_state.shape == (0, 3)
+        shapes = [[x.shape[1:] for x in jax.tree.leaves(y)] for y in (empty, expected)]
+        assert shapes[0] == shapes[1]
+        assert len(empty.durations) == 0
 
 
 def test_model_and_solver_choose_the_engine_and_the_result_names_it(results_of_both_engines):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from reference_code import complementarity, uneven_ground
 from reference_code.five_coordinates import TABLE_1
-from support.slow_variants import mark_slow
+from support.slow_variants import ENGINES, mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.base import compute_arcsine
@@ -18,7 +18,7 @@ HEIGHTS = (0.004, -0.003, 0.006, -0.002, 0.001, -0.006, 0.003)
 RIGID, CONTACT = vrw.RigidWheel(), vrw.UnilateralWheel(friction=0.7)
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_five_steps_over_heights_are_those_in_an_absolute_frame(engine):
     walk = vrw.walk(WHEEL, START, 5, heights=HEIGHTS, options=TIGHT, engine=engine)
     other = uneven_ground.walk_over_heights(OTHER, START, 0.3, HEIGHTS)

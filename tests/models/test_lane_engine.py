@@ -227,11 +227,8 @@ def test_a_batched_walk_equals_single_walks_and_ends_at_its_first_failure():
     np.testing.assert_allclose(batch_result.section_state[0], last, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    "arguments", [{}, {"engine": "diffrax"}, {"model": vrw.UnilateralWheel()}], ids=str
-)
-def test_a_batch_without_elements_has_results_of_the_usual_shapes(arguments, monkeypatch):
-    monkeypatch.setattr(batch_sizes, "DIFFRAX_BATCH_SIZE", 2)  # without padding
+@pytest.mark.parametrize("arguments", [{}, {"model": vrw.UnilateralWheel()}], ids=str)
+def test_a_batch_without_elements_has_results_of_the_usual_shapes(arguments):
     results = [
         vrw.step_batch(
             vrw.WheelParams(), np.tile(vrw.paper_start(), (n, 1)), derivatives=names, **arguments

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from reference_code import five_coordinates
 from support.machine_code import CodeRegistrySpy
-from support.slow_variants import mark_slow
+from support.slow_variants import ENGINES
 
 import vrw_jax as vrw
 
@@ -46,7 +46,7 @@ def advance(torque, params=PARAMS):
     return vrw.return_map(params, START, model=make_wheel(torque))
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("torque", [20.0, DirectCurrentMotor()], ids=["constant", "rate"])
 def test_a_step_agrees_with_five_coordinates(torque, engine):
     step = vrw.step(
@@ -84,7 +84,7 @@ def test_a_torque_of_angle_and_rate_agrees_with_five_coordinates():
 
 def test_the_work_of_a_torque_of_the_angle_is_in_the_energy_of_damping():
     """The reference is the torque, integrated over the angle, and the power of the dampers."""
-    torque = lambda theta, dtheta, params: 30.0 * jnp.cos(3.0 * theta)
+    torque = SwingMotor(30.0, 0.0)
     step = vrw.step(PARAMS, START, model=make_wheel(torque))
     walk = vrw.simulate(PARAMS, START, 1, model=make_wheel(torque), n_samples=2001)
     integrate = lambda theta: 10.0 * np.sin(3.0 * theta)
@@ -94,13 +94,12 @@ def test_the_work_of_a_torque_of_the_angle_is_in_the_energy_of_damping():
 
 
 def test_a_torque_with_further_arguments_that_have_defaults_depends_on_the_rate():
-    expected = vrw.step(PARAMS, START, model=make_wheel(lambda dtheta, params: 10.0 - dtheta))
+    expected = advance(lambda dtheta, params: 10.0 - dtheta)
     for torque in (
         lambda dtheta, params, stall=10.0: stall - dtheta,
         functools.partial(lambda dtheta, params, stall: stall - dtheta, stall=10.0),
     ):
-        step = vrw.step(PARAMS, START, model=make_wheel(torque))
-        np.testing.assert_array_equal(step.section_state, expected.section_state)
+        np.testing.assert_array_equal(advance(torque), expected)
 
 
 def test_unilateral_contact_refuses_a_torque_of_the_angle():

@@ -16,7 +16,7 @@ from support.batched import (
     compute_states_and_work,
     make_parameter_rows,
 )
-from support.slow_variants import mark_slow
+from support.slow_variants import ENGINES, mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
@@ -50,7 +50,7 @@ def test_a_solver_that_runs_out_of_steps_is_a_code():
     assert int(result.solver_steps) >= vrw.StepOptions().max_solver_steps
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("model", [None, vrw.UnilateralWheel()], ids=lambda m: type(m).__name__)
 def test_a_step_without_touchdown_ends_at_the_time_limit(model, engine):
     options = vrw.StepOptions(max_phase_time=0.15, engine=engine)
@@ -88,7 +88,7 @@ def test_a_wheel_at_rest_has_the_same_outcome_from_every_engine(tolerance):
     assert not np.any(lanes == Outcome.SOLVER_FAILED)
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_a_wheel_comes_to_rest_where_the_ground_carries_its_weight(engine):
     """Reference: statics, the sum of both feet's forces against gravity in the slope's frame."""
     parameter_rows, start = OUTCOME_CASES[Outcome.CAME_TO_REST]

@@ -8,13 +8,13 @@ import pytest
 from reference_code import five_coordinates
 from support.leg_laws import (
     PaperLeg,
-    ProgressiveLeg,
     QuadraticDamper,
+    make_progressive_leg,
     make_reference_params,
     make_wheel,
 )
 from support.machine_code import CodeRegistrySpy
-from support.slow_variants import mark_slow
+from support.slow_variants import ENGINES
 
 import vrw_jax as vrw
 from vrw_jax.wheel import PARAMETER_NAMES
@@ -28,7 +28,7 @@ def advance(law, params=PARAMS, **options):
     return vrw.return_map(params, START, model=make_wheel(law), **options)
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_the_papers_law_as_a_law_gives_the_papers_step(engine):
     expected = vrw.step(PARAMS, START, engine=engine)
     step = vrw.step(PARAMS, START, model=make_wheel(PaperLeg()), engine=engine)
@@ -36,7 +36,9 @@ def test_the_papers_law_as_a_law_gives_the_papers_step(engine):
         np.testing.assert_allclose(value, expected_value, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.parametrize("law", [QuadraticDamper(), ProgressiveLeg()], ids=["damper", "spring"])
+@pytest.mark.parametrize(
+    "law", [QuadraticDamper(), make_progressive_leg()], ids=["damper", "spring"]
+)
 def test_a_step_agrees_with_five_coordinates(law):
     step = vrw.step(PARAMS, START, model=make_wheel(law), options=TIGHT_OPTIONS)
     reference = five_coordinates.step(make_reference_params(law, damping=150.0), START)
@@ -89,7 +91,7 @@ def test_a_batch_of_laws_gives_the_bits_of_each_law_alone_and_a_code_for_a_bad_o
         np.testing.assert_array_equal(alone.section_state[0], batch.section_state[index])
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_derivatives_of_batches_are_those_of_the_return_map(engine):
     model = make_wheel(QuadraticDamper())
     names = ("section_state", "leg.c2", *PARAMETER_NAMES)
@@ -130,7 +132,7 @@ def test_a_function_without_parameters_is_a_law():
 
 
 def test_the_dissipated_power_is_the_loss_of_energy_in_each_phase():
-    walk = vrw.simulate(PARAMS, START, 1, model=make_wheel(ProgressiveLeg()), n_samples=1001)
+    walk = vrw.simulate(PARAMS, START, 1, model=make_wheel(make_progressive_leg()), n_samples=1001)
     for phase in range(3):
         part = walk.isel(time=walk.phase.values == phase)
         lost = float(part.total_energy[0] - part.total_energy[-1])

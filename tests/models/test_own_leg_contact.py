@@ -1,11 +1,13 @@
 """Unilateral contact with laws of the legs and of the hub that a user gives."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference_code import complementarity
-from support.leg_laws import PaperLeg, QuadraticDamper
+from support.leg_laws import QuadraticDamper
+from support.slow_variants import ENGINES
 
 import vrw_jax as vrw
 
@@ -13,7 +15,16 @@ PARAMS = vrw.WheelParams(damping=100.0, stiffness=2000.0)
 START_IN_FLIGHT = np.array([0.1, 1.2, -0.1])
 """Section state of a step in which all feet leave the ground, with a friction of 0.5."""
 TIGHT_OPTIONS = vrw.StepOptions.tight()
-BRAKE = lambda dtheta, params: 4.0 - 3.0 * dtheta
+
+
+class Brake(eqx.Module):
+    """A torque on the hub that falls with the rate."""
+
+    torque: float = 4.0
+    slope: float = 3.0
+
+    def __call__(self, dtheta, params):
+        return self.torque - self.slope * dtheta
 
 
 def make_wheel(law, friction=0.5, **laws):
@@ -30,12 +41,14 @@ def compute_section_state(place):
     return np.r_[q[2] + complementarity.ALPHA, v[2], v[:2], np.roll(q[3:], -1), np.roll(v[3:], -1)]
 
 
-# XLA compiles the step of diffrax for a minute.
-@pytest.mark.parametrize("engine", ["lanes", pytest.param("diffrax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_the_papers_law_as_a_law_gives_the_papers_step_with_flight(engine):
     expected, step = (
         vrw.step(PARAMS, START_IN_FLIGHT, model=model, engine=engine)
-        for model in (vrw.UnilateralWheel(friction=0.5), make_wheel(PaperLeg(2000.0)))
+        for model in (
+            vrw.UnilateralWheel(friction=0.5),
+            make_wheel(QuadraticDamper(0.0), hub_torque=Brake(0.0, 0.0)),
+        )
     )
     for value, expected_value in zip(jax.tree.leaves(step), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(value, expected_value, rtol=1e-9, atol=1e-9)
@@ -43,10 +56,9 @@ def test_the_papers_law_as_a_law_gives_the_papers_step_with_flight(engine):
 
 def test_a_step_with_flight_agrees_with_another_event_driven_code():
     law = QuadraticDamper(20.0)
-    step = vrw.step(
-        PARAMS, START_IN_FLIGHT, model=make_wheel(law, hub_torque=BRAKE), options=TIGHT_OPTIONS
-    )
-    reference_wheel = make_reference(law, hub_torque=lambda rate: BRAKE(rate, None))
+    model = make_wheel(law, hub_torque=Brake())
+    step = vrw.step(PARAMS, START_IN_FLIGHT, model=model, options=TIGHT_OPTIONS)
+    reference_wheel = make_reference(law, hub_torque=lambda rate: 4.0 - 3.0 * rate)
     place = complementarity.paper_start(reference_wheel, *START_IN_FLIGHT)
     reference = complementarity.compute_step(reference_wheel, place)
     assert reference.durations[2] > 0.01  # s, without a foot on the ground

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.slow_variants import mark_slow
+from support.slow_variants import ENGINES, mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.models.unit_scaling import UNIT_SCALING_BY_PARAMETER_INDEX
@@ -91,7 +91,7 @@ def scale_wheel(unit, factor, params=DAMPED_WHEEL):
     return params.scaled(**{unit: factor}), 1.0 / time, speed
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("scale", SCALES, ids=str)
 def test_a_step_is_the_same_in_units_of_any_size(scale, engine):
     """With unilateral contact and without. Reference: the same step in SI."""
@@ -126,7 +126,7 @@ def test_gaits_are_the_same_in_units_of_any_size(scale):
         assert float(here.spectral_radius) == pytest.approx(radius, rel=1e-7)
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("model", [GROUND, None], ids=["unilateral", "paper"])
 def test_the_time_limit_of_a_phase_scales_with_the_unit_of_time(model, engine):
     """In milliseconds a phase of this wheel lasts longer than the limit's number of seconds."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from reference_code import complementarity, uneven_ground
 from reference_code.five_coordinates import TABLE_1
-from support.slow_variants import mark_slow
+from support.slow_variants import ENGINES
 
 import vrw_jax as vrw
 from vrw_jax.models.contact_mechanics import find_contact_slots, select_slot_friction
@@ -27,7 +27,7 @@ def paper_walk(slopes, n_steps, **given):
     return vrw.walk(vrw.WheelParams(**WHEEL, slope=jnp.asarray(slopes)), START, n_steps, **given)
 
 
-@pytest.mark.parametrize("engine", ["lanes", *mark_slow("diffrax")])
+@pytest.mark.parametrize("engine", ENGINES)
 def test_ten_steps_of_the_papers_wheel_are_those_in_an_absolute_frame(engine):
     walk = paper_walk(LINES, 10, options=TIGHT, engine=engine)
     other = uneven_ground.walk(OTHER, START, LINES)

@@ -13,9 +13,11 @@ DESIGN = vrw.grid({"leg.c2": [0.0, 60.0], "damping": [140.0, 150.0]})
 
 
 class CubicDamper(eqx.Module):
-    """Another law with a parameter of the same name."""
+    """Another law with parameters of the same names."""
 
     c2: float = 60.0
+    k3: float = 0.0
+    c1: float = 0.0
 
     def __call__(self, L, dL, params):
         spring = params.stiffness * (params.natural_length - L)
@@ -40,11 +42,16 @@ def test_samples_are_gaits_of_their_laws(scan):
     assert scan["leg.c2"].attrs["units"] == "N s^2/m^2"
 
 
-@pytest.mark.parametrize("model_class", [vrw.UnilateralWheel, vrw.LadderWheel])
-def test_samples_with_unilateral_contact_are_those_of_the_papers_model(model_class, scan):
+@pytest.mark.parametrize(
+    "model",
+    [
+        vrw.UnilateralWheel(np.inf, leg_force=QuadraticDamper(), hub_torque=0.0),
+        vrw.LadderWheel(50.0, leg_force=QuadraticDamper()),
+    ],
+    ids=["UnilateralWheel", "LadderWheel"],
+)
+def test_samples_with_unilateral_contact_are_those_of_the_papers_model(model, scan):
     """No foot leaves the ground early in these gaits, and none slides."""
-    friction = np.inf if model_class is vrw.UnilateralWheel else 50.0
-    model = model_class(friction=friction, leg_force=QuadraticDamper())
     contact_scan = vrw.scan(DESIGN, ["period"], base=PARAMS, model=model)
     np.testing.assert_allclose(contact_scan.period, scan.period, atol=1e-9)
 

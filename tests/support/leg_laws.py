@@ -12,25 +12,25 @@ import vrw_jax as vrw
 
 
 class QuadraticDamper(eqx.Module):
-    """The paper's spring and damper, and a quadratic damper."""
+    """The paper's spring and damper, and a quadratic damper.
+
+    The other two numbers make the spring stiffer and the damper stronger with the compression, so
+    that tests of either law share compiled programs.
+    """
 
     c2: Any = vrw.parameter(60.0, unit="N s^2/m^2", symbol="c_2", domain=(0.0, math.inf))
-
-    def __call__(self, L, dL, params):
-        spring = params.stiffness * (params.natural_length - L)
-        return spring - params.damping * dL - self.c2 * jnp.abs(dL) * dL
-
-
-class ProgressiveLeg(eqx.Module):
-    """A spring that becomes stiffer, and a damper that grows with the compression."""
-
-    k3: Any = vrw.parameter(2000.0, unit="N/m^3", domain=(0.0, math.inf))
-    c1: Any = 300.0
+    k3: Any = vrw.parameter(0.0, unit="N/m^3", domain=(0.0, math.inf))
+    c1: Any = 0.0
 
     def __call__(self, L, dL, params):
         compression = params.natural_length - L
-        damping = params.damping + self.c1 * compression
+        damping = params.damping + self.c1 * compression + self.c2 * jnp.abs(dL)
         return params.stiffness * compression + self.k3 * compression**3 - damping * dL
+
+
+def make_progressive_leg(k3=2000.0, c1=300.0):
+    """Return a spring that becomes stiffer, and a damper that grows with the compression."""
+    return QuadraticDamper(0.0, k3, c1)
 
 
 class PaperLeg(eqx.Module):
@@ -64,18 +64,9 @@ def make_reference_params(law, **changes) -> dict:
     """Return parameters of the reference code, whose legs have a law of this module."""
     params = TABLE_1 | changes
 
-    class View:
-        stiffness, damping = params["stiffness"], params["damping"]
-        natural_length = params["natural_length"]
-
     def leg_force(length, rate):
-        compression = View.natural_length - length
-        if isinstance(law, QuadraticDamper):
-            return View.stiffness * compression - (View.damping + law.c2 * np.abs(rate)) * rate
-        return (
-            View.stiffness * compression
-            + law.k3 * compression**3
-            - (View.damping + law.c1 * compression) * rate
-        )
+        compression = params["natural_length"] - length
+        damping = params["damping"] + law.c1 * compression + law.c2 * np.abs(rate)
+        return params["stiffness"] * compression + law.k3 * compression**3 - damping * rate
 
     return params | {"leg_force": leg_force}

@@ -17,6 +17,10 @@ def mark_slow(*variants: Any) -> list[Any]:
     ]
 
 
+ENGINES = [pytest.param("auto", id="lanes"), *mark_slow("diffrax")]
+"""Engines of a test. "auto" selects "lanes", by the programs of tests that name no engine."""
+
+
 def make_params_with_slow_marks(names: Iterable[str], slow_names: Collection[str]) -> list[Any]:
     """Return the names as values of a parametrized test, and mark those in `slow_names` as slow."""
     return [pytest.param(x, marks=[pytest.mark.slow] * (x in slow_names)) for x in names]
