@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from support.machine_code import CodeRegistrySpy, use_cache_folder
 from support.slow_variants import mark_slow
 
-from vrw_jax.lanes import compile_batch_function, mark_noinline, program
+from vrw_jax.lanes import code_cache, compile_batch_function, mark_noinline, program
 from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
 from vrw_jax.lanes.rules import PRIMITIVE_RULES
 
@@ -120,6 +121,23 @@ def test_a_lane_gives_the_same_bits_in_any_batch_and_on_any_number_of_cores(monk
         run([np.float64(0.7)], [x[selection] for x in lanes]), results_of_all_lanes, strict=True
     ):
         np.testing.assert_array_equal(part, all_[selection])
+
+
+@pytest.mark.parametrize("few_first", [True, False])
+def test_few_lanes_have_smaller_code_with_the_same_bits_unless_more_ran_before(
+    monkeypatch, few_first
+):
+    CodeRegistrySpy(monkeypatch)
+    with use_cache_folder(None):
+        lanes = [RANDOM_GENERATOR.normal(size=20) for _ in range(2)]
+        run = make_program(evaluate_arithmetic, lanes)
+        counts = (3, 20, 4) if few_first else (20, 3, 4)
+        results = [run([np.float64(0.7)], [x[:n] for x in lanes]) for n in counts]
+        assert len(code_cache._lane_program_by_index_name) == 1 + few_first
+    for others in results[1:]:
+        for first, other in zip(results[0], others, strict=True):
+            n = min(len(first), len(other))
+            np.testing.assert_array_equal(first[..., :n], other[..., :n])
 
 
 def use_arrays_in_loops(x):

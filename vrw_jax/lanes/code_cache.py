@@ -14,7 +14,7 @@ import hashlib
 import pickle
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -87,18 +87,9 @@ def get_lane_program(
         return _trace_lane_program(
             lane_function, argument_shapes, None, None, lanes_per_group, max_unrolled_entries
         )
-    trace_key = (
-        function_key,
-        [(x.shape, x.dtype.name, bool(getattr(x, "weak_type", False))) for x in argument_shapes],
-        max_unrolled_entries,
-        disk_cache.describe_trace_environment(),
-        describe_compiler_settings(),
+    trace_name, index_name = _make_names(
+        function_key, argument_shapes, lanes_per_group, max_unrolled_entries
     )
-    trace_name, index_digest = (
-        hashlib.sha256(repr(key).encode()).hexdigest()
-        for key in (trace_key, (trace_key, lanes_per_group))
-    )
-    index_name = f"lanes_index_{index_digest}"
     if index_name not in _lane_program_by_index_name:
         trace_program = functools.partial(
             _trace_lane_program,
@@ -113,6 +104,47 @@ def get_lane_program(
             _load_lane_program(index_name, trace_program) or trace_program()
         )
     return _lane_program_by_index_name[index_name]
+
+
+def _make_names(
+    function_key: str, argument_shapes: Any, lanes_per_group: int, max_unrolled_entries: int
+) -> tuple[str, str]:
+    """Return the names of the trace of a function, and of the index record of a program."""
+    trace_key = (
+        function_key,
+        [(x.shape, x.dtype.name, bool(getattr(x, "weak_type", False))) for x in argument_shapes],
+        max_unrolled_entries,
+        disk_cache.describe_trace_environment(),
+        describe_compiler_settings(),
+    )
+    trace_name, index_digest = (
+        hashlib.sha256(repr(key).encode()).hexdigest()
+        for key in (trace_key, (trace_key, lanes_per_group))
+    )
+    return trace_name, f"lanes_index_{index_digest}"
+
+
+def find_first_known_program(
+    function_key: str | None,
+    argument_shapes: Any,
+    numbers_of_lanes: Sequence[int],
+    max_unrolled_entries: int,
+) -> int:
+    """Return the first number of lanes per group for which this process or else the disk cache has
+    a program of `get_lane_program`, or the first of all if there is none.
+    """
+    if function_key is None:
+        return numbers_of_lanes[0]
+    index_names = [
+        _make_names(function_key, argument_shapes, n, max_unrolled_entries)[1]
+        for n in numbers_of_lanes
+    ]
+    is_saved = lambda name: disk_cache.load_cache_record(name) is not None
+    for is_known in (_lane_program_by_index_name.__contains__, is_saved):
+        for n, index_name in zip(numbers_of_lanes, index_names, strict=True):
+            if is_known(index_name):
+                return n
+    return numbers_of_lanes[0]
 
 
 def _load_lane_program(

@@ -22,7 +22,12 @@ from vrw_jax.lanes import disk_cache, fallback
 from vrw_jax.lanes.array_emitter import MAX_UNROLLED_ENTRIES, LaneAxisError
 from vrw_jax.lanes.autodiff import enable_all_ad_modes
 from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
-from vrw_jax.lanes.code_cache import LaneProgram, get_lane_program, targets_machine_code
+from vrw_jax.lanes.code_cache import (
+    LaneProgram,
+    find_first_known_program,
+    get_lane_program,
+    targets_machine_code,
+)
 from vrw_jax.lanes.keys import (
     UnresolvableFunctionError,
     lift_numbers,
@@ -115,7 +120,11 @@ class CompiledBatchFunction:
         flat_function = functools.partial(_call_with_leaves, self._function, structure)
         if is_machine_code_available() and self._has_machine_code():
             with contextlib.suppress(_NoMachineCodeError):
-                return run_machine_code(functools.partial(self._get_program, structure), leaves)
+                return run_machine_code(
+                    functools.partial(self._get_program, structure),
+                    functools.partial(self._find_known_program, structure),
+                    leaves,
+                )
         # Each program is traced once, while the function has the values of the key.
         argument_types = [(x.shape[:-1] if x.ndim else None, x.dtype) for x in leaves]
         program_key = self._find_key(structure, argument_types)
@@ -159,6 +168,21 @@ class CompiledBatchFunction:
         if self._lasting_key not in (None, "by content"):
             self._programs[signature] = lane_program
         return lane_program
+
+    def _find_known_program(
+        self, structure: Any, argument_types: ArgumentTypes, numbers_of_lanes: Sequence[int]
+    ) -> int:
+        """Return which number of lanes per group has a program already, by default the first."""
+        environment = disk_cache.describe_trace_environment()
+        for n in numbers_of_lanes:
+            if (structure, argument_types, n, environment) in self._programs:
+                return n
+        return find_first_known_program(
+            self._find_key(structure),
+            make_argument_shapes(argument_types),
+            numbers_of_lanes,
+            self._max_unrolled_entries,
+        )
 
     def _find_key(self, *further_values: Any) -> str | None:
         """Return the key of the function, or None if it has none."""

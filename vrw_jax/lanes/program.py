@@ -43,7 +43,7 @@ VECTORS_PER_GROUP = 2
 """Number of vectors of 256 bits in a group of lanes that `run_machine_code` computes at a time.
 
 One vector computes during the latency of the other. The results are bitwise those of one vector,
-which LLVM compiles in 40 % of the time.
+which LLVM compiles in 40 % of the time. A batch that fits into one vector has code for one.
 """
 LANE_GROUPS_PER_TASK = 64
 """Number of groups of lanes in one task of a thread.
@@ -165,17 +165,24 @@ def call_machine_code(
     )
 
 
-def run_machine_code(get_program: GetProgram, argument_leaves: Sequence[np.ndarray]) -> Any:
+def run_machine_code(
+    get_program: GetProgram,
+    find_known_program: Callable[[ArgumentTypes, Sequence[int]], int],
+    argument_leaves: Sequence[np.ndarray],
+) -> Any:
     """Return the results of a function of NumPy arrays, computed on all cores of the process.
 
     The last axis of the arrays is the lane axis; arrays without axes are the same for all lanes.
-    The results of a lane are bitwise the same whatever the other lanes are.
+    The results of a lane are bitwise the same whatever the other lanes are. A few lanes have code
+    for one vector, unless that for several vectors is known already.
     """
     n_lanes = next(x.shape[-1] for x in argument_leaves if x.ndim)
     # An empty batch needs no code: that of groups of one lane is compiled when it is needed.
     lanes_per_vector = count_lanes_per_256_bits(argument_leaves)
     lanes_per_group = VECTORS_PER_GROUP * lanes_per_vector if n_lanes else 1
     argument_types = tuple((x.shape[:-1] if x.ndim else None, x.dtype) for x in argument_leaves)
+    if 0 < n_lanes <= lanes_per_vector < lanes_per_group:
+        lanes_per_group = find_known_program(argument_types, (lanes_per_vector, lanes_per_group))
     lane_program = get_program(argument_types, lanes_per_group)
     if n_lanes == 0:
         result_types = lane_program.result_shapes_and_dtypes
