@@ -126,7 +126,7 @@ class HybridGait(NamedTuple):
 
         Their derivatives are NaN; those from `vrw.solve_fixed_point` of the return map are not.
         """
-        return self.fixed_point.multipliers
+        return jnp.where(self.found[..., None], self.fixed_point.multipliers, 0.0)
 
     @property
     def spectral_radius(self) -> Any:
