@@ -320,6 +320,11 @@ def test_a_distant_fixed_point_is_found(start):
     np.testing.assert_allclose(fixed_point.x, 2e14, rtol=1e-12)
 
 
+def test_the_tolerance_of_a_noisy_map_decides_whether_its_fixed_point_is_found():
+    quantize = lambda x: (0.5 * x + 1.0 + 2e10) - 2e10  # in steps of 4e-6
+    assert solve_fixed_point(quantize, jnp.array([0.3]), tolerance=1e-4).converged
+
+
 def test_volumes_shrink_by_friction_and_by_every_bounce():
     """x' = v, v' = -g - v: exp(-t) in all, and r² at each bounce."""
     drag = lambda y: jnp.stack([y[1], -G - y[1]])

@@ -1126,6 +1126,21 @@ def register_wrong_calls() -> None:
         "cannot encode",
     )
     add_wrong_call(
+        "scan into a store without a name", lambda: scan(store=""), "ValueError", "store is ''"
+    )
+    add_wrong_call(
+        "scan into a name with a null character",
+        lambda: scan(store="a\0b.zarr"),
+        "ValueError",
+        "cannot have this name",
+    )
+    add_wrong_call(
+        "solve_fixed_point with one invariant outside a list",
+        lambda: vrw.solve_fixed_point(lambda x: x, start, invariants=jnp.sum),
+        "TypeError",
+        "give a list of functions",
+    )
+    add_wrong_call(
         "solve_fixed_point tolerance of a random key",
         lambda: vrw.solve_fixed_point(lambda x: x, start, tolerance=jax.random.key(0)),
         "TypeError",

@@ -336,13 +336,13 @@ def check_path(argument_name: str, given_value: Any, remedy_text: str) -> Path:
     """
     check_type(argument_name, given_value, (str, Path), remedy_text)
     try:
-        is_possible = str(given_value) and b"\0" not in os.fsencode(given_value)
+        encoded_name, problem = os.fsencode(given_value), "have"
     except UnicodeEncodeError:
-        is_possible = False
-    if not is_possible:
+        encoded_name, problem = b"", "encode"
+    if not encoded_name or b"\0" in encoded_name:
         raise ValueError(
-            f"{argument_name} is {str(given_value)!r}, but the file system cannot have this name: "
-            f"{remedy_text}."
+            f"{argument_name} is {str(given_value)!r}, but the file system cannot {problem} this "
+            f"name: {remedy_text}."
         )
     if URL_PATTERN.match(str(given_value)):
         raise ValueError(

@@ -385,13 +385,18 @@ def _simulate_one_event(
     next state and the next mode, which is -1 if the guard ends the walk.
     """
     mode = modes[mode_index]
-    guard_values, guard_rates = lax.stop_gradient(
-        jax.jvp(mode.guard_values, (state,), (mode.field(state),))
+    compute_guard_rates = lambda y: jax.jvp(mode.guard_values, (y,), (mode.field(y),))[1]
+    guard_values = mode.guard_values(state)
+    guard_rates, second_guard_rates = jax.jvp(compute_guard_rates, (state,), (mode.field(state),))
+    guard_values, guard_rates, second_guard_rates = lax.stop_gradient(
+        (guard_values, guard_rates, second_guard_rates)
     )
-    growth = _find_growth_from_rest(
+    growth = _evaluate_rise_from_rest(
         mode, guard_values, guard_rates, *lax.stop_gradient((state, options.dt0))
     )
-    will_guard_rise = (growth > 0.0) | lax.stop_gradient(_find_rising_ties(mode, state))
+    # For a guard exactly at rest the second derivative decides, also if the growth is round-off.
+    will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
+    will_guard_rise |= (growth > 0.0) | lax.stop_gradient(_find_rising_ties(mode, state))
     time_after_first_step = lax.stop_gradient(time + options.dt0)
     time_resolution = 1e3 * jnp.finfo(state.dtype).eps * time_after_first_step
     is_guard_near_zero = will_guard_rise | (-guard_values <= jnp.abs(guard_rates) * time_resolution)
@@ -400,7 +405,7 @@ def _simulate_one_event(
     guard_offset = jnp.where(
         (guard_values < 0.0) & is_guard_near_zero & (guard_rates > 0.0), -guard_values, 0.0
     )
-    # The offset keeps such a guard positive where round-off of its rates makes it fall at first.
+    # Round-off of its rates may make a guard fall at first that will rise.
     least_value = jnp.finfo(state.dtype).tiny + GROWTH_SHARE_AT_START * growth
     guard_offset = jnp.where(
         will_guard_rise, least_value + jnp.maximum(-guard_values, 0.0), guard_offset
@@ -423,7 +428,7 @@ def _simulate_one_event(
     return phase_end, violated_guard.astype(jnp.int32), next_state, next_mode.astype(jnp.int32)
 
 
-PROBE_LENGTH = 1e-2
+PROBE_TIME_RATIO = 1e-2
 """Time after which a guard at rest is evaluated again, as a fraction of the first solver step.
 
 The value is chosen because the cube of the time, with which the height of a foot begins to grow, is
@@ -441,20 +446,20 @@ MAX_SHARE_OF_ROUNDOFF = 1e-6
 
 GROWTH_SHARE_AT_START = 1e-9
 """Initial value of a guard that rises from rest, as a fraction of its growth over the probe. The
-value is chosen between the guard's round-off there and that at its next event.
+value is chosen above round-off at the start, and below round-off at the next event.
 """
 
 
-def _find_growth_from_rest(
+def _evaluate_rise_from_rest(
     mode: Mode, guard_values: Array, guard_rates: Array, state: StateArray, dt0: Array
 ) -> Float[Array, " n_guards"]:
-    """Return the growth of guards that are zero and at rest at first, up to round-off, or zero.
+    """Return the value after the probe of each guard that starts at zero and at rest, else 0.
 
     A guard that grows does not end the mode. A foot that lifts off smoothly has no height, no rate
     and no acceleration at first. Only the values after a short time, by Heun's method of third
     order, determine its direction.
     """
-    h, field = PROBE_LENGTH * dt0, mode.field
+    h, field = PROBE_TIME_RATIO * dt0, mode.field
     start_rates = field(state)
     middle_rates = field(state + (h / 3.0) * start_rates)
     last_rates = field(state + (2.0 * h / 3.0) * middle_rates)

@@ -10,7 +10,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vrw_jax.base.checks import check_callable, check_int, check_positive, check_reals
+from vrw_jax.base.checks import (
+    check_callable,
+    check_int,
+    check_positive,
+    check_reals,
+    check_type,
+)
 from vrw_jax.base.printing import (
     format_each_batch_element,
     format_heading_and_rows,
@@ -131,16 +137,22 @@ the fixed point needs.
 
 
 MAX_RESIDUAL = 1e-6
-"""Largest change of a fixed point, relative to the sizes of the start and its image.
+"""Largest change of a fixed point, relative to the sizes of the start and its image, for a map
+whose Jacobian is small.
 
 If the map does not conserve the invariants, the equations have no solution, although the
 corrections vanish. From a start with a singular Jacobian, Newton's method may also move so far that
 any change is round-off. The value is chosen far above the error of a step with default options.
 """
 
-MAX_SIZE_RATIO = 1e3
+MAX_RESIDUAL_SIZE_RATIO = 1e3
 """Largest ratio of the sizes of a fixed point and of its start up to which the residual is relative
 to the fixed point. Beyond it, residuals that are round-off of a distant state would be accepted.
+"""
+
+RESIDUAL_ROUNDOFF_IN_EPS = 1e3
+"""Smallest limit of a residual, in units of the machine epsilon. The value is chosen because terms
+of a map may be a thousand times its values.
 """
 
 
@@ -179,10 +191,12 @@ def solve_fixed_point(
             conserve them, the search does not converge. Derivatives are those along this curve: by
             a value that breaks the conservation there are none, and what is returned is no
             derivative.
-        max_residual: with `invariants`, largest change of a fixed point by the map, relative to
-            the size of the state.
-        differentiates_jacobian: whether the Jacobian has derivatives. If not, they are NaN, and a
-            map whose second derivatives are expensive is differentiated once.
+        max_residual: largest change of a fixed point by the map, relative to the largest of the
+            `units` and of the components of the start, its image and, up to a thousand times
+            these, the fixed point. The limit is at least ten times `tolerance`, and is multiplied
+            by 1 plus the norm of the Jacobian.
+        differentiates_jacobian: whether the Jacobian has derivatives; if not, they are NaN. Choose
+            False if second derivatives of the map are expensive.
 
     Returns:
         A `FixedPointResult`: the state, its multipliers, and the status of the iteration.
@@ -200,10 +214,11 @@ def solve_fixed_point(
     max_iterations = check_int("max_iterations", max_iterations)
     start = lax.stop_gradient(start)
     check_vector_map(function, "start", start)
-    if isinstance(tolerance, jax.Array):
-        tolerance = check_reals("tolerance", tolerance)
-    else:
-        check_positive("tolerance", tolerance)
+    for name, value in ("tolerance", tolerance), ("max_residual", max_residual):
+        (check_reals if isinstance(value, jax.Array) else check_positive)(name, value)
+    check_type("invariants", invariants, (list, tuple), "give a list of functions of the state")
+    for invariant in invariants:
+        check_callable("an invariant", invariant, "of the state")
 
     tolerance, max_residual = lax.stop_gradient(
         [jnp.asarray(x, start.dtype) for x in (tolerance, max_residual)]
@@ -394,11 +409,13 @@ def _run_newton_loop(
     x, correction_norm, n_iterations, *_, size, jacobian, residual = lax.while_loop(
         needs_newton_iteration, iterate_newton, initial_loop_state
     )
-    size = jnp.maximum(size, jnp.minimum(jnp.max(jnp.abs(x)), MAX_SIZE_RATIO * size))
+    size = jnp.maximum(size, jnp.minimum(jnp.max(jnp.abs(x)), MAX_RESIDUAL_SIZE_RATIO * size))
     # The residual is the last correction times a matrix of the size of the Jacobian.
     growth = 1.0 + jnp.max(jnp.sum(jnp.abs(jacobian), 1))
+    roundoff = RESIDUAL_ROUNDOFF_IN_EPS * jnp.finfo(x.dtype).eps
+    largest = jnp.maximum(jnp.maximum(max_residual, 10.0 * tolerance), roundoff)
     has_newton_converged = correction_norm <= tolerance
-    has_newton_converged &= residual <= max_residual * growth * size
+    has_newton_converged &= residual <= largest * growth * size
     return FixedPointResult(
         jnp.where(has_newton_converged, x, start),
         jacobian,

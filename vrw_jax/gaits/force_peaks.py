@@ -23,7 +23,6 @@ from vrw_jax.base.measures import Measure
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.flow.smooth_parts import StepForceExtrema, summarize_forces
-from vrw_jax.gaits.collocation_search import CollocationState, CollocationSystem
 from vrw_jax.gaits.derivatives import attach_derivatives, make_tangent_function
 from vrw_jax.gaits.extrema import (
     ExtremumValues,
@@ -34,6 +33,7 @@ from vrw_jax.gaits.extrema import (
     reconstruct_motion,
 )
 from vrw_jax.gaits.phase_collocation import CollocationSolution, PhasePoint
+from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
 from vrw_jax.lanes.autodiff import make_implicit_jacobian
 from vrw_jax.lanes.batching import BatchFunction, unbatch
 from vrw_jax.lanes.lane_function import compile_batch_function, with_lane_axis

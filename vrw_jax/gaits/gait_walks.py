@@ -302,9 +302,9 @@ def find_attracting_gaits(
 ) -> tuple[np.ndarray, Any]:
     """Find the attracting gaits of each wheel, in the order of increasing speed.
 
-    Walks begin at WALK_STARTS. If a wheel has no gait from these starts, walks also begin at
-    FALLBACK_WALK_STARTS. A wheel without an attracting gait has one cycle, whose outcome is a
-    failure.
+    By default, walks begin at WALK_STARTS. If a wheel has no gait from these starts, walks also
+    begin at FALLBACK_WALK_STARTS. A wheel without an attracting gait has one cycle, whose outcome
+    is a failure.
 
     Args:
         gait_finder: finder of gaits with unilateral contact.
@@ -391,12 +391,17 @@ def find_slow_gaits(gait_finder: Any, parameter_values: Any) -> Any:
     If the walk reaches no gait, the slowest attracting gait is returned. The two gaits are equal
     for each of 1,200 random wheels.
     """
+    values = np.asarray(parameter_values)
     slow_start = lambda params: compute_walk_starts(params)[:1]
-    wheels, gaits = find_attracting_gaits(
-        gait_finder, parameter_values, (slow_start, *START_FUNCTIONS)
-    )
-    slowest = find_slowest_gait_indices(wheels, len(parameter_values))
-    return select_rows_on_device(gaits, slowest)
+    _, slow_gaits = _find_gaits_from_starts(gait_finder, values, slow_start)
+    missing = np.flatnonzero(np.asarray(slow_gaits.outcome) != Outcome.STEPPED)
+    if not len(missing):
+        return slow_gaits
+    # A wheel without a gait has the failure of the walks from all starts.
+    wheels, gaits = find_attracting_gaits(gait_finder, values[missing])
+    rows = np.arange(len(values))
+    rows[missing] = len(values) + find_slowest_gait_indices(wheels, len(missing))
+    return select_rows_on_device(concatenate_tree_rows(slow_gaits, gaits), rows)
 
 
 def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> np.ndarray:

@@ -25,8 +25,8 @@ from vrw_jax.lanes.autodiff import compute_square_root, with_implicit_derivative
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams
 
 N_DOUBLINGS = 45
-"""Number of times that the number of later steps in a sum doubles. The value is chosen because the
-sum is then complete, unless a multiplier differs from 1 by little more than round-off.
+"""Number of doublings of the steps whose effects are summed. The value is chosen because the sum is
+then complete, unless the modulus of a multiplier differs from 1 by little more than round-off.
 """
 
 

@@ -124,7 +124,7 @@ def _make_names(
     return trace_name, f"lanes_index_{index_digest}"
 
 
-def find_first_known_program(
+def choose_lanes_per_group(
     function_key: str | None,
     argument_shapes: Any,
     numbers_of_lanes: Sequence[int],

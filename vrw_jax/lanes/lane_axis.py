@@ -138,8 +138,8 @@ def _evaluate_with_lanes(
     if name in ELEMENTWISE_RULES:
         shape = equation.outvars[0].aval.shape
         # Numbers that lanes share need no axes, except where operands have one shape.
-        can_share = name not in ("add_any", "select_n")
-        is_number = lambda x: can_share and not x.has_lanes and jnp.ndim(x.array) == 0
+        may_lack_lane_axis = name not in ("add_any", "select_n")
+        is_number = lambda x: may_lack_lane_axis and not x.has_lanes and jnp.ndim(x.array) == 0
         arrays = [x.array if is_number(x) else _with_lanes(n_lanes, x, shape) for x in operands]
         return _bind(equation, arrays, True)
     if name in PRIMITIVES_WITH_LEADING_AXES:

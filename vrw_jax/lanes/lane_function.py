@@ -24,7 +24,7 @@ from vrw_jax.lanes.autodiff import enable_all_ad_modes
 from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
 from vrw_jax.lanes.code_cache import (
     LaneProgram,
-    find_first_known_program,
+    choose_lanes_per_group,
     get_lane_program,
     targets_machine_code,
 )
@@ -122,7 +122,7 @@ class CompiledBatchFunction:
             with contextlib.suppress(_NoMachineCodeError):
                 return run_machine_code(
                     functools.partial(self._get_program, structure),
-                    functools.partial(self._find_known_program, structure),
+                    functools.partial(self._choose_lanes_per_group, structure),
                     leaves,
                 )
         # Each program is traced once, while the function has the values of the key.
@@ -169,7 +169,7 @@ class CompiledBatchFunction:
             self._programs[signature] = lane_program
         return lane_program
 
-    def _find_known_program(
+    def _choose_lanes_per_group(
         self, structure: Any, argument_types: ArgumentTypes, numbers_of_lanes: Sequence[int]
     ) -> int:
         """Return which number of lanes per group has a program already, by default the first."""
@@ -177,7 +177,7 @@ class CompiledBatchFunction:
         for n in numbers_of_lanes:
             if (structure, argument_types, n, environment) in self._programs:
                 return n
-        return find_first_known_program(
+        return choose_lanes_per_group(
             self._find_key(structure),
             make_argument_shapes(argument_types),
             numbers_of_lanes,

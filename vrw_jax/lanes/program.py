@@ -43,7 +43,8 @@ VECTORS_PER_GROUP = 2
 """Number of vectors of 256 bits in a group of lanes that `run_machine_code` computes at a time.
 
 One vector computes during the latency of the other. The results are bitwise those of one vector,
-which LLVM compiles in 40 % of the time. A batch that fits into one vector has code for one.
+which LLVM compiles in 40 % of the time. A batch that fits into one vector has code for one,
+unless that for two is known already.
 """
 LANE_GROUPS_PER_TASK = 64
 """Number of groups of lanes in one task of a thread.
@@ -167,7 +168,7 @@ def call_machine_code(
 
 def run_machine_code(
     get_program: GetProgram,
-    find_known_program: Callable[[ArgumentTypes, Sequence[int]], int],
+    choose_lanes_per_group: Callable[[ArgumentTypes, Sequence[int]], int],
     argument_leaves: Sequence[np.ndarray],
 ) -> Any:
     """Return the results of a function of NumPy arrays, computed on all cores of the process.
@@ -182,7 +183,9 @@ def run_machine_code(
     lanes_per_group = VECTORS_PER_GROUP * lanes_per_vector if n_lanes else 1
     argument_types = tuple((x.shape[:-1] if x.ndim else None, x.dtype) for x in argument_leaves)
     if 0 < n_lanes <= lanes_per_vector < lanes_per_group:
-        lanes_per_group = find_known_program(argument_types, (lanes_per_vector, lanes_per_group))
+        lanes_per_group = choose_lanes_per_group(
+            argument_types, (lanes_per_vector, lanes_per_group)
+        )
     lane_program = get_program(argument_types, lanes_per_group)
     if n_lanes == 0:
         result_types = lane_program.result_shapes_and_dtypes

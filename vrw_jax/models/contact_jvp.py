@@ -55,7 +55,7 @@ class ContactConfiguration(NamedTuple):
 def find_slot_contacts(
     friction: Friction | float, contact_modes: Array, is_leg_locked: Array
 ) -> tuple[SlotArray, ContactSlots, Array, Array, Array]:
-    """Return the fields of `ContactConfiguration` from friction on, for the contacts of all legs.
+    """Return friction and all further fields of `ContactConfiguration` that describe contacts.
 
     - `friction`: friction coefficient for all feet, or a pair for the foot that landed last and for
       all other feet;
@@ -251,7 +251,7 @@ def _compute_free_motion_tangent(
     inputs, constants = eqx.partition(select_inputs(contact_configuration), eqx.is_inexact_array)
     s, friction, motion = select_inputs(contact_configuration)
     fixed_friction, fixed_theta = replace_infinite_friction(friction), motion.theta
-    fixed_legs, fixed_feet, fixed_hub, *_ = list_motion_terms(
+    leg_terms_at_point, foot_terms_at_point, fixed_hub, *_ = list_motion_terms(
         s, motion, contact_slots, force_solution
     )
     decompose = lambda sin, cos, x, z: (sin * x + cos * z, cos * x - sin * z)
@@ -263,17 +263,20 @@ def _compute_free_motion_tangent(
         )
         # Directions turn with the legs. The fixed vectors make the derivatives short.
         turn = motion.theta - fixed_theta
-        turn_forward = lambda u, e, fixed_u, fixed_e: (u - fixed_e * turn, e + fixed_u * turn)
-        turn_back = lambda u, e, fixed_u, fixed_e: (u + fixed_e * turn, e - fixed_u * turn)
+        rotate_with = lambda u, e, fixed_u, fixed_e: (u - fixed_e * turn, e + fixed_u * turn)
+        rotate_against = lambda u, e, fixed_u, fixed_e: (
+            u + fixed_e * turn,
+            e - fixed_u * turn,
+        )
         friction_change = replace_infinite_friction(friction) - fixed_friction
         changed_t = t - compute_slip_signs(slot_modes) * friction_change * n
-        leg_pulls, transverse_forces = turn_back(
+        leg_pulls, transverse_forces = rotate_against(
             *decompose(slot_sin, slot_cos, changed_t, n), *decompose(slot_sin, slot_cos, t, n)
         )
-        hub_outward, hub_transverse = turn_back(
+        hub_outward, hub_transverse = rotate_against(
             *decompose(sin, cos, x, z), *decompose(sin, cos, *fixed_hub)
         )
-        foot_radial, foot_transverse = turn_forward(*feet, *fixed_feet)
+        foot_radial, foot_transverse = rotate_with(*feet, *foot_terms_at_point)
         pulls = contact_slots.scatter_to_legs(leg_pulls + force_solution.stopper_forces)
         length_residual = (leg_force - pulls) / s.m + hub_outward - legs[0]
         leg_moments = s.m * ((motion.L - s.a) * (legs[1] - hub_transverse))
@@ -283,7 +286,7 @@ def _compute_free_motion_tangent(
             -s.Mt * z,
             hub_torque - sum_over_legs(leg_moments) - sum_over_legs(foot_moments),
         )
-        leg_inertia_forces = [s.m * term for term in turn_forward(*legs, *fixed_legs)]
+        leg_inertia_forces = [s.m * term for term in rotate_with(*legs, *leg_terms_at_point)]
         return (
             length_residual,
             hub_residual,

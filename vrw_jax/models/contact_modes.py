@@ -120,8 +120,8 @@ def _solve_slot_forces(
 
     The unknown c is the transverse force on a sticking foot. For a sliding foot, c is the normal
     force. In the limit of infinite friction, c is the friction force instead. For an unloaded foot,
-    c = 0. The stopper forces s are eliminated first: they solve N s = p + P c. For an open stopper,
-    the corresponding equation is s = 0, so the system is always regular. In matrices, the first
+    c = 0. The stopper forces f are eliminated first: they solve N f = p + P c. For an open stopper,
+    the corresponding equation is f = 0, so the system is always regular. In matrices, the first
     index is that of the equation.
     """
     sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
@@ -137,8 +137,8 @@ def _solve_slot_forces(
     )
     # These are the force on a foot for c = 1, and the weights of the foot's transverse motion and
     # of the force on the leg's mass in the foot's condition.
-    force_transverse = select_by_mode(1.0, friction_factor * cos - normal_force_factor * sin)
-    force_radial = select_by_mode(0.0, friction_factor * sin + normal_force_factor * cos)
+    transverse_per_c = select_by_mode(1.0, friction_factor * cos - normal_force_factor * sin)
+    radial_per_c = select_by_mode(0.0, friction_factor * sin + normal_force_factor * cos)
     weight_transverse = select_by_mode(1.0, -sin)
     weight_radial = select_by_mode(0.0, cos * inverse_leg_mass)
 
@@ -159,8 +159,8 @@ def _solve_slot_forces(
     p = jnp.where(is_stopper_holding, free_length_motion, 0.0)
     P = jnp.where(
         is_stopper_holding[:, None],
-        inverse_inertia.H * force_transverse
-        - _make_diagonal_matrix(force_radial * inverse_leg_mass),
+        inverse_inertia.H * transverse_per_c
+        - _make_diagonal_matrix(radial_per_c * inverse_leg_mass),
         0.0,
     )
     p, P, N = prevent_fusion((p, P, N), opaque_one)
@@ -172,8 +172,8 @@ def _solve_slot_forces(
         inverse_inertia.H, 0, 1
     )
     C = (
-        weight_transverse[:, None] * inverse_inertia.G * force_transverse
-        + _make_diagonal_matrix(weight_radial * force_radial)
+        weight_transverse[:, None] * inverse_inertia.G * transverse_per_c
+        + _make_diagonal_matrix(weight_radial * radial_per_c)
         + R[:, :1] * stopper_response[0]
         + R[:, 1:] * stopper_response[1]
         + _make_diagonal_matrix(jnp.where(is_loaded, 0.0, 1.0))
@@ -190,13 +190,14 @@ def _solve_slot_forces(
         stopper_without_feet + stopper_response[:, 0] * c[0] + stopper_response[:, 1] * c[1]
     )
     foot_force_radial = jnp.where(
-        is_sticking, -s.m * free_motion.foot_radial_motion - stopper_force, force_radial * c
+        is_sticking, -s.m * free_motion.foot_radial_motion - stopper_force, radial_per_c * c
     )
     scale_masses = jnp.where(is_sticking, s.Mt / REFERENCE_MASS_RATIO, s.m)
     scale_masses = jnp.where(is_loaded, scale_masses, 1.0)
     painleve_determinant = scale_masses[0] * scale_masses[1] * _compute_determinant(C)
     return prevent_fusion(
-        (stopper_force, force_transverse * c, foot_force_radial, painleve_determinant), opaque_one
+        (stopper_force, transverse_per_c * c, foot_force_radial, painleve_determinant),
+        opaque_one,
     )
 
 

@@ -183,7 +183,8 @@ class GaitStepSummary(NamedTuple):
 
 
 class StepRecord(NamedTuple):
-    """Results of the present walking step so far, as in `UnilateralStep`.
+    """Results of the present walking step so far, as in `UnilateralStep`. Solver steps are those of
+    the whole walk.
 
     Without details, the fields other than the first three are None.
     """

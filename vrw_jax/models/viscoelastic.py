@@ -452,9 +452,9 @@ def _sample_lane_parts(
         )
     )
     # A step that the solver does not finish has no measures, as if it had too many kinks.
-    is_lost = sequence.outcome == Outcome.SOLVER_FAILED
+    has_solver_failed = sequence.outcome == Outcome.SOLVER_FAILED
     return tuple(
-        parts._replace(n_kinks=jnp.where(is_lost, 1 + MAX_LOGGED_KINKS, parts.n_kinks))
+        parts._replace(n_kinks=jnp.where(has_solver_failed, 1 + MAX_LOGGED_KINKS, parts.n_kinks))
         for parts in parts_by_phase
     )
 

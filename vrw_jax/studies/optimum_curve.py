@@ -125,7 +125,7 @@ def follow_optimum(
         if result.status != TuneStatus.CONVERGED:
             failures.append(result.status.meaning)
             return None
-        prices = problem.find_prices(result).price_ranges[:, 1]
+        prices = problem.compute_conditions_per_unit(result).price_ranges[:, 1]
         active = tuple(x for x, price in zip(limit_names, prices, strict=True) if price > 0.0)
         parameters = local.denormalize_parameters(result.best_trial.normalized_parameters)
         free = parameters[problem.free_parameter_indices]

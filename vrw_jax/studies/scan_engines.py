@@ -500,9 +500,9 @@ def find_selection_reasons(
     return reasons.astype(np.int8)
 
 
-def evaluate_selected_models(
+def evaluate_with_simplest_model(
     request: EvaluationRequest,
-    evaluate_paper_gaits: SampleEvaluator,
+    evaluate_with_paper_model: SampleEvaluator,
     evaluate_contact_gaits: SampleEvaluator,
     samples_by_parameter: ParameterSamples,
 ) -> ValuesByVariable:
@@ -518,7 +518,7 @@ def evaluate_selected_models(
     friction = paper_samples.pop(
         FRICTION_NAME, np.full(n_samples, float(request.wheel_model.friction))
     )
-    results = evaluate_paper_gaits(paper_samples)
+    results = evaluate_with_paper_model(paper_samples)
     reasons = find_selection_reasons(request.wheel_model, results, friction)
     for contact_measure, paper_measures in PAPER_MEASURES_BY_CONTACT_MEASURE.items():
         if contact_measure in request.measure_names:
@@ -527,10 +527,10 @@ def evaluate_selected_models(
             )
     names = (*request.measure_names, "outcome", "spectral_radius")
     results = {name: results[name] for name in names}
-    contact_samples = np.flatnonzero(reasons)
-    if contact_samples.size:
-        contact_rows = select_tree_rows(samples_by_parameter, contact_samples)
-        results = replace_rows(results, contact_samples, evaluate_contact_gaits(contact_rows))
+    contact_indices = np.flatnonzero(reasons)
+    if contact_indices.size:
+        contact_samples = select_tree_rows(samples_by_parameter, contact_indices)
+        results = replace_rows(results, contact_indices, evaluate_contact_gaits(contact_samples))
     model_codes = np.where(reasons == 0, ModelCode.VISCOELASTIC, ModelCode.UNILATERAL)
     return results | {"rung": model_codes.astype(np.int8), "reason": reasons}
 
@@ -621,7 +621,7 @@ def make_scan_engine(request: EvaluationRequest, n_threads: int | None = None) -
         )
         contact_request = request._replace(wheel_model=model.fallback_model)
         return functools.partial(
-            evaluate_selected_models,
+            evaluate_with_simplest_model,
             request,
             make_scan_engine(paper_request, n_threads),
             make_scan_engine(contact_request, n_threads),

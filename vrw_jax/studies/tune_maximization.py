@@ -480,7 +480,8 @@ class OptimalityConditions(NamedTuple):
     """Lagrange multipliers of the constraints and bounds at an optimum, as prices.
 
     A price is the gain of the objective per unit of a relaxed constraint, or per width of a relaxed
-    bound. Constraints come first, then lower and upper bounds.
+    bound, unless `TuneProblem.compute_conditions_per_unit` has converted it. Constraints come
+    first, then lower and upper bounds.
     """
 
     price_ranges: np.ndarray  # (n_limits, 2): smallest and largest price that satisfy the condition

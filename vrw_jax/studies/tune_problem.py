@@ -446,7 +446,7 @@ class TuneProblem:
             self.evaluate_trial, np.vstack([self.normalized_start, random_normalized_starts])
         )
 
-    def find_prices(self, result: MaximizationResult) -> OptimalityConditions:
+    def compute_conditions_per_unit(self, result: MaximizationResult) -> OptimalityConditions:
         """Return the optimality conditions at the best trial, with prices per unit of each limit:
         of the constraints, of the lower bounds and of the upper bounds.
         """
@@ -474,7 +474,7 @@ class TuneProblem:
         if laws is not None:
             model = model.with_laws(laws)
         unit_by_parameter = {name: x.unit for name, x in model.parameter_domains.items()}
-        conditions = self.find_prices(maximization_result)
+        conditions = self.compute_conditions_per_unit(maximization_result)
         limited_names = (*self.constraint_names, *self.free_parameters * 2)
         limits = [*self.min_constraint_values, *self.lower_bounds, *self.upper_bounds]
         price_ranges = conditions.price_ranges
