@@ -62,7 +62,8 @@ FINE = vrw.CycleOptions(mesh_intervals=(40, 32, 16), tolerance=1e-12)
 def compute_final_rate(slope, gait):
     """Return the rate of the fore foot's force just before the touchdown, N/s, by the reference."""
     params = dataclasses.replace(STIFF, slope=np.asarray(slope))
-    numbers = {f.name: float(getattr(params, f.name)) for f in dataclasses.fields(params)}
+    fields = [field for field in dataclasses.fields(params) if field.init]
+    numbers = {field.name: float(getattr(params, field.name)) for field in fields}
     state = vrw.limit_cycle(params, guess=gait, options=FINE).section_state
     phase = five_coordinates.step(numbers | {"n_legs": 8}, np.asarray(state))["phases"][-1]
     wheel = five_coordinates.Wheel(numbers | {"n_legs": 8})

@@ -27,7 +27,7 @@ def reference_rate(stiffness, gait, damping=100.0):
     The gait is a fixed point of the reference's own step.
     """
     params = dataclasses.replace(SOFT, stiffness=np.asarray(stiffness), damping=np.asarray(damping))
-    numbers = {f.name: getattr(params, f.name) for f in dataclasses.fields(params)}
+    numbers = {f.name: getattr(params, f.name) for f in dataclasses.fields(params) if f.init}
     numbers = {name: float(value) for name, value in numbers.items()} | {"n_legs": 8}
     x = np.asarray(vrw.limit_cycle(params, guess=gait, options=FINE).section_state)
     step = five_coordinates.step(numbers, x)
