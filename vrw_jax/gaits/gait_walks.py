@@ -169,7 +169,6 @@ MAX_NEWTON_START_DEFECT = 0.1
 
 StartFunction = Callable[[WheelParams], np.ndarray]
 """Function that maps wheels to section states, shape (starts, wheels, 3)."""
-START_FUNCTIONS: tuple[StartFunction, ...] = compute_walk_starts, compute_fallback_walk_starts
 
 
 def walk_to_gaits(
@@ -298,7 +297,10 @@ treated as equal.
 def find_attracting_gaits(
     gait_finder: Any,
     parameter_values: Any,
-    start_functions: tuple[StartFunction, ...] = START_FUNCTIONS,
+    start_functions: tuple[StartFunction, ...] = (
+        compute_walk_starts,
+        compute_fallback_walk_starts,
+    ),
 ) -> tuple[np.ndarray, Any]:
     """Find the attracting gaits of each wheel, in the order of increasing speed.
 
