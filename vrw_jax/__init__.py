@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 from vrw_jax.app.explorer import explore
 from vrw_jax.base.checks import format_name_suggestion
 from vrw_jax.base.measures import measure
-from vrw_jax.base.options import StepOptions
+from vrw_jax.base.options import StepOptions, parameter
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import parameter
-from vrw_jax.base.start import start_jax
+from vrw_jax.base.progress import start_jax
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve

@@ -4,16 +4,21 @@ from vrw_jax.flow.complementarity import LCPStatus, enumerate_lcp_solutions
 from vrw_jax.flow.hybrid_simulation import (
     Guard,
     HybridSolution,
+    HybridStep,
     Mode,
-    ReturnMap,
     Termination,
     simulate_hybrid,
+)
+from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.flow.integrate import PhaseEnd
+from vrw_jax.flow.orbits import (
+    ReturnMap,
+    flow_jacobian_determinant,
+    product_multipliers,
+    segment_maps,
     time_errors,
 )
-from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem
-from vrw_jax.flow.integrate import PhaseEnd
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
-from vrw_jax.flow.segments import flow_jacobian_determinant, product_multipliers, segment_maps
 
 __all__ = (
     "Guard",

@@ -16,8 +16,14 @@ from vrw_jax.flow.integrate import (
     integrate_to_event,
     make_idle_state,
 )
-from vrw_jax.flow.tableaus import StageAccelerations, estimate_step_error, take_rk_step
-from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, PhaseTangents
+from vrw_jax.flow.solver_steps import (
+    BatchPhase,
+    ImplicitDynamics,
+    StageAccelerations,
+    estimate_step_error,
+    take_rk_step,
+)
+from vrw_jax.flow.tangents import PhaseTangents
 
 TIGHT = vrw.StepOptions(rtol=1e-12, atol=1e-12, max_phase_time=2.0)
 TABLEAU = load_explicit_tableau("Dopri8")

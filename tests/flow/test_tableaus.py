@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vrw_jax.base.options import SOLVER_NAMES
-from vrw_jax.flow import load_explicit_tableau, tableaus
+from vrw_jax.flow import load_explicit_tableau, solver_steps
 
 
 def read_tableau(name):
@@ -32,7 +32,7 @@ def read_tableau(name):
 
 @pytest.mark.parametrize("name", SOLVER_NAMES)
 def test_coefficients_equal_those_of_diffrax(name):
-    parsed = json.loads(Path(tableaus.__file__).with_name("tableaus.json").read_text())
+    parsed = json.loads(Path(solver_steps.__file__).with_name("tableaus.json").read_text())
     assert parsed.get(name) == read_tableau(name)
     assert (load_explicit_tableau(name) is None) == (read_tableau(name) is None)
 

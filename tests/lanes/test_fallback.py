@@ -12,7 +12,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import lanes
-from vrw_jax.lanes import ffi_handler, ffi_primitive
+from vrw_jax.lanes import kernel, program
 
 PROGRAM = """
 import json, sys, warnings
@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from vrw_jax.lanes import fallback, ffi_handler, rules
-fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
+from vrw_jax.lanes import program, kernel, lowering
+program.LATEST_TESTED_JAX_RELEASE = (0, 1)
 {change}
 import vrw_jax as vrw
 from vrw_jax import lanes
@@ -41,16 +41,16 @@ print(json.dumps([in_jit, of_arrays, messages, lanes.is_machine_code_available()
 """
 
 CHANGES = {
-    "a primitive is new": 'del rules.PRIMITIVE_RULES["while"]',
-    "the call interface differs": "ffi_handler.read_ffi_api_version = lambda: (7, 0)",
+    "a primitive is new": 'del lowering.PRIMITIVE_RULES["while"]',
+    "the call interface differs": "kernel.read_ffi_api_version = lambda: (7, 0)",
     "nothing differs": "",
 }
 
 
-def run_program(program, folder):
+def run_program(source, folder):
     """Return the JSON that a program prints in a process of its own."""
     process = subprocess.run(
-        [sys.executable, "-c", program, str(folder)],
+        [sys.executable, "-c", source, str(folder)],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True, text=True,
     )  # fmt: skip
@@ -74,9 +74,9 @@ def test_xla_computes_where_an_untested_jax_differs(change, tmp_path):
 WHEEL_PROGRAM = """
 import json, sys, warnings
 import numpy as np
-from vrw_jax.lanes import fallback, ffi_handler
-fallback.LATEST_TESTED_JAX_RELEASE = (0, 1)
-ffi_handler.read_ffi_api_version = lambda: (7, 0)
+from vrw_jax.lanes import program, kernel
+program.LATEST_TESTED_JAX_RELEASE = (0, 1)
+kernel.read_ffi_api_version = lambda: (7, 0)
 import vrw_jax as vrw
 vrw.start_jax(sys.argv[1])
 warnings.simplefilter("ignore")
@@ -100,15 +100,15 @@ def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
     """Structs of xla/ffi/api/c_api.h: a call frame, its extension, and the metadata."""
     run = lanes.compile_batch_function(lambda x: x + 1.0)
     np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
-    code = list(ffi_primitive.LOADED_CODE_BY_FFI_TARGET.values())[-1]
+    code = list(program.LOADED_CODE_BY_FFI_TARGET.values())[-1]
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(
-        code.find_function_address(ffi_handler.FFI_HANDLER_NAME)
+        code.find_function_address(kernel.FFI_HANDLER_NAME)
     )
     metadata = (ctypes.c_int64 * 8)()
-    extension = (ctypes.c_int64 * 4)(32, ffi_handler.FFI_METADATA_EXTENSION_TYPE, 0)
+    extension = (ctypes.c_int64 * 4)(32, kernel.FFI_METADATA_EXTENSION_TYPE, 0)
     extension[3] = ctypes.addressof(metadata)
     frame = (ctypes.c_int64 * 32)(0, ctypes.addressof(extension))
     assert not handler(ctypes.addressof(frame))
-    version = ffi_handler.read_ffi_api_version()
+    version = kernel.read_ffi_api_version()
     assert tuple((ctypes.c_int32 * 2).from_buffer(metadata, 24)) == version
     assert version != (0, 0)

@@ -20,14 +20,18 @@ import vrw_jax as vrw
 from vrw_jax import lanes
 from vrw_jax.base.walker import compile_step
 from vrw_jax.branches.continuation_problems import make_trial_linearizer
-from vrw_jax.flow.hybrid_simulation import _estimate_time_errors, simulate_modes
+from vrw_jax.flow.hybrid_simulation import simulate_modes
 from vrw_jax.flow.hybrid_system import (
     _compile_mode_measures,
     _compile_sampling,
     compile_finish,
     compile_simulation,
 )
-from vrw_jax.flow.segments import _integrate_flow_segments, _multiply_event_determinants
+from vrw_jax.flow.orbits import (
+    _estimate_time_errors,
+    _integrate_flow_segments,
+    _multiply_event_determinants,
+)
 from vrw_jax.gaits.collocation_search import run_search_attempts
 from vrw_jax.gaits.derivatives import _compute_collocation_tangents
 from vrw_jax.gaits.fixed_points import _find_fixed_point_of_iterate
@@ -451,9 +455,9 @@ def test_no_other_function_is_compiled():
     assert {name: count for name, count in counts.items() if count} == {
         "base/walker.py": 1,
         "branches/continuation_problems.py": 1,
-        "flow/hybrid_simulation.py": 3,
+        "flow/hybrid_simulation.py": 2,
         "flow/hybrid_system.py": 4,
-        "flow/segments.py": 3,
+        "flow/orbits.py": 4,
         "gaits/derivatives.py": 2,
         "gaits/fixed_points.py": 1,
         "gaits/force_peaks.py": 1,

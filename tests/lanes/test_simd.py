@@ -9,8 +9,8 @@ from support.machine_code import CodeRegistrySpy, use_cache_folder
 from support.slow_variants import mark_slow
 
 from vrw_jax.lanes import code_cache, compile_batch_function, mark_noinline, program
-from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
-from vrw_jax.lanes.rules import PRIMITIVE_RULES
+from vrw_jax.lanes.lowering import PRIMITIVE_RULES
+from vrw_jax.lanes.value_emitter import ELEMENTWISE_RULES
 
 RANDOM_GENERATOR = np.random.default_rng(0)
 

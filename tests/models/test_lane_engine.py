@@ -19,14 +19,14 @@ import vrw_jax as vrw
 from vrw_jax import Outcome, lanes
 from vrw_jax.base import batch_sizes, compute_sine_cosine
 from vrw_jax.flow import integrate_batch_phase
-from vrw_jax.flow.tableaus import (
+from vrw_jax.flow.solver_steps import (
+    BatchPhase,
     StageAccelerations,
     StageState,
     compute_real_stability_limit,
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.flow.tangents import BatchPhase
 from vrw_jax.lanes import lane_function
 from vrw_jax.lanes.batching import choose_batch_size
 from vrw_jax.models import step_batch as lane_batch

@@ -7,8 +7,8 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 from vrw_jax.lanes import code_cache as code
-from vrw_jax.lanes import fallback, program
-from vrw_jax.lanes import ffi_primitive as ffi
+from vrw_jax.lanes import program
+from vrw_jax.lanes import program as ffi
 
 _REGISTERED = ffi.LOADED_CODE_BY_FFI_TARGET  # XLA never releases code and accepts one code per name
 
@@ -32,7 +32,7 @@ def wait_for_compiler():
 
 def disable_machine_code(monkeypatch):
     """Let XLA compute everything."""
-    monkeypatch.setattr(fallback, "_machine_code_failure_reasons", ["a test"])
+    monkeypatch.setattr(program, "_machine_code_failure_reasons", ["a test"])
 
 
 class CodeRegistrySpy:

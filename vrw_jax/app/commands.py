@@ -38,8 +38,7 @@ from vrw_jax.app.explorer import make_page_address
 from vrw_jax.base.checks import check_path
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.progress import PROGRESS_VARIABLE
-from vrw_jax.base.start import start_jax
+from vrw_jax.base.progress import PROGRESS_VARIABLE, start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.continuation import continue_branch
 from vrw_jax.branches.special_point_curves import SPECIAL_POINT_MEASURES

@@ -17,13 +17,13 @@ from jaxtyping import Array, Float, Int
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_reals, check_type, has_traced_leaf
 from vrw_jax.base.measures import Measure
-from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import (
+from vrw_jax.base.options import (
+    StepOptions,
     is_tree_in_domain,
     list_tree_parameters,
     replace_tree_parameter,
 )
+from vrw_jax.base.outcomes import Outcome
 
 
 class AdvanceResult(eqx.Module):

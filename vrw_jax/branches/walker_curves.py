@@ -17,9 +17,8 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.options import StepOptions
+from vrw_jax.base.options import StepOptions, find_tree_parameter
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import find_tree_parameter
 from vrw_jax.base.walker import AbstractWalker
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import BIFURCATIONS, Codim2Point, SpecialPointCurve

@@ -1,9 +1,10 @@
 """Integration of motion exactly to the next event, with minima and derivatives."""
 
-from vrw_jax.flow.integrate import (
+from vrw_jax.flow.integrate import integrate_batch_phase
+from vrw_jax.flow.solver_steps import (
+    compute_real_stability_limit,
     divide_equally,
-    integrate_batch_phase,
+    load_explicit_tableau,
     sample_batch_phase,
 )
-from vrw_jax.flow.tableaus import compute_real_stability_limit, load_explicit_tableau
-from vrw_jax.flow.tangents import with_batched_jvp
+from vrw_jax.lanes.autodiff import with_batched_jvp

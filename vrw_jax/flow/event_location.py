@@ -1,5 +1,6 @@
 """Locate the earliest root of the guards inside a solver step, for each batch element."""
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -9,10 +10,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base.elementwise import select_entry_by_mask, select_trees_by_condition
+from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.minima import MarginMinimaState
-from vrw_jax.flow.tableaus import (
+from vrw_jax.flow.solver_steps import (
+    BatchPhase,
     ButcherTableau,
     SolverStepFunction,
     StageState,
@@ -20,7 +22,7 @@ from vrw_jax.flow.tableaus import (
     load_explicit_tableau,
     take_rk_step,
 )
-from vrw_jax.flow.tangents import BatchPhase
+from vrw_jax.lanes.batching import make_zeros_like_output
 
 
 class IntegrationStatus(IntEnum):
@@ -378,50 +380,6 @@ class _EventLocator(NamedTuple):
         )
 
 
-def propagate_to_event(
-    tableau: ButcherTableau,
-    solver_step_function: SolverStepFunction | None,
-    phase_tangents: Any,
-    integrator_state: IntegratorState,
-    last_step_length: Array,
-    event_guard_index: Array,
-) -> tuple[Array, Array, Array]:
-    """Return the tangents after the last solver step of a phase.
-
-    They are those at a fixed time, that of the event's time, and those of positions and rates at
-    the event. The axes are those of directions, components and the batch. Without an event, or if
-    its guard does not fall, the tangent of the time is zero.
-
-    - `solver_step_function`: None if the last solver step is already taken;
-    - `last_step_length`: time from `integrator_state` to the event, s.
-    """
-    end_state, end_tangents = integrator_state.state, integrator_state.state_tangents
-    assert end_tangents is not None
-    if solver_step_function is not None:
-        stage_states, _ = solver_step_function(end_state, last_step_length)
-        end_state = stage_states[-1]
-        end_tangents = phase_tangents.propagate_to_step_end(
-            tableau, stage_states, end_tangents, last_step_length
-        )
-    guard_rate, guard_tangent = phase_tangents.evaluate_rate_and_tangents(
-        lambda phase, state: select_entry_by_mask(event_guard_index, phase.evaluate_guards(state)),
-        end_state,
-        end_tangents,
-    )
-    # The guard is zero at the event of the perturbed motion too.
-    is_guard_falling = integrator_state.has_guard_crossed & (guard_rate < 0.0)
-    event_time_tangent = jnp.where(
-        is_guard_falling, -guard_tangent / jnp.where(is_guard_falling, guard_rate, -1.0), 0.0
-    )
-    motion_rates = evaluate_motion_rates(end_state)
-    motion_tangents = end_tangents[:, : len(motion_rates)]
-    return (
-        end_tangents,
-        event_time_tangent,
-        motion_tangents + event_time_tangent[:, None] * motion_rates,
-    )
-
-
 def evaluate_motion_rates(state: StageState) -> Array:
     """Return the time derivatives of positions and rates, (components, batch)."""
     return jnp.stack([*state.v[: len(state.q)], *state.acceleration.acceleration[: len(state.v)]])
@@ -505,3 +463,82 @@ def _find_parabola_zeros(
             fraction_to_zero,
         )
     return fraction_to_zero
+
+
+def find_events(
+    take_steps: Callable[[IntegratorState], IntegratorState],
+    locate: Callable[[IntegratorState], EventSearch],
+    integrator_state: IntegratorState,
+) -> tuple[IntegratorState, EventSearch]:
+    """Return the state of the loop before the solver steps to the events, and the events."""
+    integrator_state = take_steps(integrator_state)
+    return integrator_state, locate(integrator_state)
+
+
+def arrive_at_events(
+    take_steps: Callable[[IntegratorState], IntegratorState],
+    locate: Callable[[IntegratorState], EventSearch],
+    integrator_state: IntegratorState,
+) -> tuple[IntegratorState, EventSearch]:
+    """Return the state of the loop after a last solver step to each event, and the events.
+
+    A second pass through the same loop takes the last steps and propagates tangents over them, so
+    that the program contains both only once.
+    """
+
+    no_count: Any = None
+
+    def run_pass(carry: tuple) -> tuple:
+        n_passes, crossing_step_length, integrator_state, event_search = carry
+        integrator_state = take_steps(integrator_state)
+        is_arriving: Any = integrator_state.is_arriving
+        has_crossed = integrator_state.has_guard_crossed & ~is_arriving
+        located = locate(integrator_state)._replace(n_iterations=no_count)
+        event_search = select_trees_by_condition(has_crossed, located, event_search)
+        begins_last_step = has_crossed & ~event_search.is_event_unresolved
+        status = integrator_state.integration_status
+        status = jnp.where(integrator_state.is_running, IntegrationStatus.PAUSED, status)
+        status = jnp.where(begins_last_step, IntegrationStatus.RUNNING, status)
+        step_length = integrator_state.next_step_length
+        return (
+            n_passes + 1,
+            jnp.where(begins_last_step, step_length, crossing_step_length),
+            integrator_state._replace(
+                integration_status=status.astype(jnp.int32),
+                next_step_length=jnp.where(
+                    begins_last_step, event_search.event_step_length, step_length
+                ),
+                n_iterations=jnp.zeros((), jnp.int32),
+                is_arriving=is_arriving | begins_last_step,
+            ),
+            event_search,
+        )
+
+    no_search = make_zeros_like_output(
+        lambda: locate(integrator_state)._replace(n_iterations=no_count)
+    )
+    initial_state = integrator_state._replace(
+        is_arriving=jnp.zeros_like(integrator_state.is_running)
+    )
+    _, crossing_step_length, integrator_state, event_search = lax.while_loop(
+        lambda carry: carry[0] < 2,
+        run_pass,
+        (jnp.zeros((), jnp.int32), initial_state.next_step_length, initial_state, no_search),
+    )
+    status = integrator_state.integration_status
+    has_arrived: Any = integrator_state.is_arriving
+    status = jnp.where(status == IntegrationStatus.PAUSED, IntegrationStatus.RUNNING, status)
+    return (
+        # The search has counted the last step.
+        integrator_state._replace(
+            integration_status=status.astype(jnp.int32),
+            next_step_length=jnp.where(
+                has_arrived, crossing_step_length, integrator_state.next_step_length
+            ),
+            n_tried_steps=integrator_state.n_tried_steps - has_arrived,
+            is_arriving=None,
+        ),
+        event_search._replace(
+            event_step_length=jnp.where(has_arrived, 0.0, event_search.event_step_length)
+        ),
+    )

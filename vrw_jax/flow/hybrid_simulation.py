@@ -7,26 +7,31 @@ A mode whose functions have wrong shapes raises a ValueError. If the simulation 
 has a code of `Termination` and contains all earlier events.
 """
 
-import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
 from vrw_jax.base.elementwise import make_opaque_loop_condition, select_entry_by_mask
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     StatusCode,
     describe_step_ending,
+    format_each_batch_element,
     format_heading_and_rows,
+    format_numbers,
     format_outcome_counts,
     format_quantity,
 )
@@ -40,7 +45,7 @@ from vrw_jax.flow.phase_integration import (
     integrate_phase,
     is_machine_code_better,
 )
-from vrw_jax.flow.tangents import forbid_reverse_mode
+from vrw_jax.lanes.code_cache import targets_machine_code
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 MAX_STORED_NUMBERS = 100_000_000
@@ -237,83 +242,6 @@ def _simulate_modes_compiled(
     """Return the simulation of modes that a function returns, with which the code is compiled."""
     modes, events, mode = get_static_arguments()
     return simulate_modes((modes, events), options, start, jnp.asarray(mode, jnp.int32))
-
-
-def time_errors(
-    modes: Sequence[Mode] | Mode,
-    start: ArrayLike | Sequence,
-    solution: HybridSolution,
-    options: StepOptions | None = None,
-) -> Float[Array, " events"]:
-    """Return estimated errors of the event times, s, shape (events,).
-
-    The simulation is repeated with tolerances that are ten and a hundred times as large. The change
-    of each event's time is divided by the `time_tolerance` of that event. Ratios below 1 are
-    replaced by 1. The estimate for an event is twice its `time_tolerance` times the largest ratio
-    for this and all earlier events. The estimate is at least the sum of the round-off of all states
-    and of the time.
-
-    Unlike `time_tolerance`, the estimate includes the accumulated errors of solver steps and of
-    earlier events. It also includes errors that the error estimate of an implicit solver omits in a
-    stiff field. The estimate is infinite from the first event that the simulation at ten times the
-    tolerance does not reach. The estimate is no proven bound.
-
-    Args:
-        modes: modes of the system, as in `simulate_hybrid`.
-        start: state at which `solution` begins, shape (dim,).
-        solution: result of `simulate_hybrid`.
-        options: options with which `solution` was computed.
-    """
-    options = StepOptions() if options is None else options
-    modes = convert_modes_to_tuple(modes)
-    start, solution = lax.stop_gradient((check_reals("start", start), solution))
-    return call_compiled_program(_estimate_time_errors, modes, start, solution, options)
-
-
-def _estimate_time_errors(
-    modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
-) -> Float[Array, " events"]:
-    """Return the result of `time_errors` for a tuple of modes whose guards are tuples."""
-    event_indices = jnp.arange(len(solution.times))
-
-    def compute_time_change(tolerance_factor: Array) -> Array:
-        looser_options = options.with_tightened_tolerances(tolerance_factor)
-        modes_and_max_events = (modes, len(event_indices))
-        looser_solution = simulate_modes(
-            modes_and_max_events, looser_options, start, solution.modes[0]
-        )
-        is_same_event = (looser_solution.guards == solution.guards) & (
-            looser_solution.modes == solution.modes
-        )
-        is_same_event = jnp.cumprod(is_same_event & (event_indices < looser_solution.n_events)) > 0
-        return jnp.where(is_same_event, jnp.abs(looser_solution.times - solution.times), jnp.inf)
-
-    # Each event adds the round-off of its state, and the time has its own.
-    accumulated_roundoff = jnp.cumsum(
-        jnp.where(jnp.isfinite(solution.time_roundoff), solution.time_roundoff, 0.0)
-    )
-    accumulated_roundoff = accumulated_roundoff + jnp.finfo(start.dtype).eps * jnp.abs(
-        solution.times
-    )
-    changes_at_tenfold_tolerance, changes_at_hundredfold_tolerance = lax.stop_gradient(
-        lax.map(compute_time_change, jnp.asarray([0.1, 0.01], start.dtype))
-    )
-    largest_time_change = (
-        jnp.maximum(
-            changes_at_tenfold_tolerance,
-            jnp.where(
-                jnp.isinf(changes_at_hundredfold_tolerance), 0.0, changes_at_hundredfold_tolerance
-            ),
-        )
-        / solution.time_tolerance
-    )
-    largest_time_change = lax.cummax(
-        jnp.where(jnp.isnan(largest_time_change), jnp.inf, jnp.maximum(largest_time_change, 1.0))
-    )
-    time_errors = jnp.maximum(
-        2.0 * largest_time_change * solution.time_tolerance, accumulated_roundoff
-    )
-    return jnp.where(event_indices < solution.n_events, time_errors, 0.0)
 
 
 def convert_modes_to_tuple(modes: Sequence[Mode] | Mode) -> tuple[Mode, ...]:
@@ -674,57 +602,146 @@ def simulate_modes(
     return HybridSolution._make((*run.log, *last_values))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class ReturnMap:
-    """Map from section coordinates to the section coordinates after `events` events.
+_FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
+"""Identity operation whose transpose raises an error."""
 
-    The map returns NaN if the simulation ends early, so that its last state is not taken for a
-    return. `solve_fixed_point` reports the termination of the simulation in addition to the fixed
-    point.
 
-    - `modes`: modes of the system, as in `simulate_hybrid`;
-    - `embed`: function from section coordinates to the state in which the simulation begins;
-    - `project`: function from the state after the last event to its section coordinates;
-    - `events`: number of events per return;
-    - `mode`: index of the mode in which the simulation begins;
-    - `options`: options of the simulation.
+def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, function_name: str) -> None:
+    """Raise a ValueError that explains why reverse mode is not available."""
+    raise ValueError(
+        f"hybrid.{function_name} has no derivative in reverse mode, since the number of its solver "
+        "steps is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of "
+        "jax.grad, jax.jacrev or jax.vjp."
+    )
+
+
+_FORWARD_ONLY_PRIMITIVE.def_impl(lambda x, *, function_name: x)
+
+
+_FORWARD_ONLY_PRIMITIVE.def_abstract_eval(lambda x, *, function_name: x)
+
+
+ad.deflinear2(_FORWARD_ONLY_PRIMITIVE, _raise_reverse_mode_error)
+
+
+batching.defvectorized(_FORWARD_ONLY_PRIMITIVE)
+
+
+mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, function_name: [x])
+
+
+def forbid_reverse_mode(function_name: str, function_result: PyTree) -> PyTree:
+    """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
+    error.
+
+    `function_name` is the function in `flow` that computed the result. Inside `lanes.jit` there is
+    no mark, because reverse mode transposes the derivatives that machine code computes.
+    """
+    if targets_machine_code():
+        return function_result
+
+    def mark_leaf_as_forward_only(leaf: Any) -> Any:
+        if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
+            return _FORWARD_ONLY_PRIMITIVE.bind(leaf, function_name=function_name)
+        return leaf
+
+    return jax.tree.map(mark_leaf_as_forward_only, function_result)
+
+
+OUTCOME_BY_TERMINATION = np.array(
+    [
+        Outcome.TOO_MANY_EVENTS,
+        Outcome.NO_TOUCHDOWN_IN_TIME,
+        Outcome.TOO_MANY_EVENTS,
+        Outcome.GUARD_VIOLATED,
+        Outcome.SOLVER_FAILED,
+        Outcome.SOLVER_FAILED,
+        Outcome.STEPPED,
+        Outcome.ENDED_BY_GUARD,
+        Outcome.BAD_INPUT,
+    ],
+    np.int32,
+)
+"""Outcome of a step by the `Termination` of its simulation."""
+
+
+def describe_step(termination: Termination) -> str:
+    """Return why the simulation of a step ended, as one sentence."""
+    if termination == Termination.MAX_EVENTS_REACHED:
+        return "The step has not ended after max_events events: raise it in the system."
+    return termination.meaning
+
+
+class HybridStep(eqx.Module):
+    """One step of a hybrid system, from section to section.
+
+    - `section_state`: section coordinates at the end of the step; where the simulation ended early,
+      those of its last state;
+    - `duration`: duration of the step, s;
+    - `mode_durations`: time in each mode, s, in the order of the modes;
+    - `events`: number of the guard of each event, counted over the guards of all modes; -1 after
+      the last event;
+    - `n_events`, `solver_steps`: numbers of events and of solver steps;
+    - `termination`: a `Termination`; a complete step has `Termination.SECTION_REACHED`;
+    - `last_mode`, `last_guard`: numbers of the mode in which the simulation ended, and of its guard
+      that was negative when the mode began, or that ended the walk; otherwise -1;
+    - `guard_names`: names of the guards by the name of each mode.
     """
 
-    modes: Sequence[Mode] | Mode
-    embed: Callable[[Float[Array, " n"]], StateArray]
-    project: Callable[[StateArray], Float[Array, " n"]]
-    events: int = 1
-    mode: int = 0
-    options: StepOptions | None = None
+    section_state: Float[Array, " n"]
+    duration: Scalar
+    mode_durations: Float[Array, " modes"]
+    events: Int[Array, " max_events"]
+    n_events: Int[Array, ""]
+    solver_steps: Int[Array, ""]
+    termination: Int[Array, ""]
+    last_mode: Int[Array, ""]
+    last_guard: Int[Array, ""]
+    guard_names: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True)
 
-    def simulate(self, x: Float[Array, " n"]) -> HybridSolution:
-        """Return the simulation that begins at section coordinates `x`, shape (n,)."""
-        return simulate_hybrid(
-            self.modes, self.embed(x), events=self.events, mode=self.mode, options=self.options
+    @property
+    def durations(self) -> Any:
+        """Return the durations of all modes, s."""
+        return self.mode_durations
+
+    @property
+    def outcome(self) -> Any:
+        """Return the `Outcome` of the step, whose codes are the same for all walkers."""
+        array_module: Any = jnp if isinstance(self.termination, jax.Array) else np
+        return array_module.asarray(OUTCOME_BY_TERMINATION)[self.termination]
+
+    @property
+    def is_complete(self) -> Any:
+        """Return whether the step has reached the section."""
+        return self.termination == Termination.SECTION_REACHED
+
+    @property
+    def ending(self) -> Any:
+        """Return sentences on how the step ended; for a batch, an array of texts."""
+
+        def describe(termination: int, mode: int, guard: int) -> str:
+            ending, (mode_name, guards) = Termination(int(termination)), self.guard_names[mode]
+            if ending in (Termination.SECTION_REACHED, Termination.BAD_INPUT):
+                return ending.meaning
+            place = f"guard {guards[guard]!r} of mode" if guard >= 0 else "mode"
+            return f"{describe_step(ending)} This is {place} {mode_name!r}."
+
+        return format_each_batch_element(
+            describe, self.termination, self.last_mode, self.last_guard
         )
 
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the section coordinates after one return from `x`, shape (n,).
-
-        The result is NaN if the simulation ends early.
-        """
-        hybrid_solution = self.simulate(x)
-        section_coordinates = self.project(hybrid_solution.state)
-        return section_coordinates * jnp.where(
-            hybrid_solution.termination == Termination.MAX_EVENTS_REACHED, 1.0, jnp.nan
-        ).astype(section_coordinates.dtype)
-
-    def find_termination(self, x: Float[Array, " n"], period_n: int = 1) -> Int[Array, ""]:
-        """Return the `Termination` of the first of `period_n` returns from `x` that ends early.
-
-        If no return ends early, the result is the termination of the last return.
-        """
-        x = lax.stop_gradient(x)
-        termination = jnp.full((), Termination.MAX_EVENTS_REACHED, jnp.int32)
-        for _ in range(period_n):
-            solution = self.simulate(x)
-            termination = jnp.where(
-                termination == Termination.MAX_EVENTS_REACHED, solution.termination, termination
-            )
-            x = self.project(solution.state)
-        return termination
+    def __repr__(self) -> str:
+        if isinstance(self.termination, jax.core.Tracer):
+            return f"HybridStep({self.section_state}, {self.duration})"
+        if np.ndim(self.termination):
+            return f"HybridStep of a batch ({format_outcome_counts(self.outcome, Outcome)})"
+        rows = [
+            ("section state", format_numbers(self.section_state)),
+            ("duration", format_quantity(self.duration, "s")),
+            *(
+                (f"duration of {name}", format_quantity(duration, "s"))
+                for (name, _), duration in zip(self.guard_names, self.mode_durations, strict=True)
+            ),
+            ("ending", self.ending),
+        ]
+        return format_heading_and_rows("HybridStep", rows)

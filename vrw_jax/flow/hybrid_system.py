@@ -12,12 +12,11 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import (
@@ -26,17 +25,10 @@ from vrw_jax.base.checks import (
     check_type,
     require_known_name,
 )
+from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
-from vrw_jax.base.options import StepOptions
+from vrw_jax.base.options import StepOptions, is_tree_in_domain
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import is_tree_in_domain
-from vrw_jax.base.printing import (
-    format_each_batch_element,
-    format_heading_and_rows,
-    format_numbers,
-    format_outcome_counts,
-    format_quantity,
-)
 from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import (
     AbstractWalker,
@@ -49,14 +41,17 @@ from vrw_jax.base.walker import (
     step_batch_of_walker,
 )
 from vrw_jax.flow.hybrid_simulation import (
+    OUTCOME_BY_TERMINATION,
     Event,
     EventRun,
     Guard,
     HybridSolution,
+    HybridStep,
     Mode,
     Termination,
     check_mode_functions,
     continue_after_event,
+    describe_step,
     no_margins,
     run_events,
     simulate_modes,
@@ -65,105 +60,6 @@ from vrw_jax.flow.phase_integration import StateArray, sample_phase
 
 MAX_EVENTS_PER_STEP = 16
 """Default limit of the events in one step, chosen above those of walkers with several legs."""
-
-
-OUTCOME_BY_TERMINATION = np.array(
-    [
-        Outcome.TOO_MANY_EVENTS,
-        Outcome.NO_TOUCHDOWN_IN_TIME,
-        Outcome.TOO_MANY_EVENTS,
-        Outcome.GUARD_VIOLATED,
-        Outcome.SOLVER_FAILED,
-        Outcome.SOLVER_FAILED,
-        Outcome.STEPPED,
-        Outcome.ENDED_BY_GUARD,
-        Outcome.BAD_INPUT,
-    ],
-    np.int32,
-)
-"""Outcome of a step by the `Termination` of its simulation."""
-
-
-def describe_step_ending(termination: Termination) -> str:
-    """Return why the simulation of a step ended, as one sentence."""
-    if termination == Termination.MAX_EVENTS_REACHED:
-        return "The step has not ended after max_events events: raise it in the system."
-    return termination.meaning
-
-
-class HybridStep(eqx.Module):
-    """One step of a hybrid system, from section to section.
-
-    - `section_state`: section coordinates at the end of the step; where the simulation ended early,
-      those of its last state;
-    - `duration`: duration of the step, s;
-    - `mode_durations`: time in each mode, s, in the order of the modes;
-    - `events`: number of the guard of each event, counted over the guards of all modes; -1 after
-      the last event;
-    - `n_events`, `solver_steps`: numbers of events and of solver steps;
-    - `termination`: a `Termination`; a complete step has `Termination.SECTION_REACHED`;
-    - `last_mode`, `last_guard`: numbers of the mode in which the simulation ended, and of its guard
-      that was negative when the mode began, or that ended the walk; otherwise -1;
-    - `guard_names`: names of the guards by the name of each mode.
-    """
-
-    section_state: Float[Array, " n"]
-    duration: Scalar
-    mode_durations: Float[Array, " modes"]
-    events: Int[Array, " max_events"]
-    n_events: Int[Array, ""]
-    solver_steps: Int[Array, ""]
-    termination: Int[Array, ""]
-    last_mode: Int[Array, ""]
-    last_guard: Int[Array, ""]
-    guard_names: tuple[tuple[str, tuple[str, ...]], ...] = eqx.field(static=True)
-
-    @property
-    def durations(self) -> Any:
-        """Return the durations of all modes, s."""
-        return self.mode_durations
-
-    @property
-    def outcome(self) -> Any:
-        """Return the `Outcome` of the step, whose codes are the same for all walkers."""
-        array_module: Any = jnp if isinstance(self.termination, jax.Array) else np
-        return array_module.asarray(OUTCOME_BY_TERMINATION)[self.termination]
-
-    @property
-    def is_complete(self) -> Any:
-        """Return whether the step has reached the section."""
-        return self.termination == Termination.SECTION_REACHED
-
-    @property
-    def ending(self) -> Any:
-        """Return sentences on how the step ended; for a batch, an array of texts."""
-
-        def describe(termination: int, mode: int, guard: int) -> str:
-            ending, (mode_name, guards) = Termination(int(termination)), self.guard_names[mode]
-            if ending in (Termination.SECTION_REACHED, Termination.BAD_INPUT):
-                return ending.meaning
-            place = f"guard {guards[guard]!r} of mode" if guard >= 0 else "mode"
-            return f"{describe_step_ending(ending)} This is {place} {mode_name!r}."
-
-        return format_each_batch_element(
-            describe, self.termination, self.last_mode, self.last_guard
-        )
-
-    def __repr__(self) -> str:
-        if isinstance(self.termination, jax.core.Tracer):
-            return f"HybridStep({self.section_state}, {self.duration})"
-        if np.ndim(self.termination):
-            return f"HybridStep of a batch ({format_outcome_counts(self.outcome, Outcome)})"
-        rows = [
-            ("section state", format_numbers(self.section_state)),
-            ("duration", format_quantity(self.duration, "s")),
-            *(
-                (f"duration of {name}", format_quantity(duration, "s"))
-                for (name, _), duration in zip(self.guard_names, self.mode_durations, strict=True)
-            ),
-            ("ending", self.ending),
-        ]
-        return format_heading_and_rows("HybridStep", rows)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -720,3 +616,77 @@ def _check_input(params: Any, start: Array, termination: Array) -> Array:
     """
     is_valid = is_tree_in_domain(params) & jnp.all(jnp.isfinite(start))
     return jnp.where(is_valid, termination, jnp.asarray(Termination.BAD_INPUT, termination.dtype))
+
+
+def sample_walk_of_system(
+    system: HybridSystem,
+    params_of_steps: Sequence[Any],
+    x: Any,
+    options: StepOptions,
+    n_samples: int,
+) -> xr.Dataset:
+    """Return the states of a walk at `n_samples` times of each mode, over time.
+
+    The walk ends at the first step that fails, with the motion until its end.
+    """
+    mode_names, time, step, outcome = tuple(system.modes), 0.0, 0, Outcome.STEPPED
+    pieces: list[tuple[np.ndarray, np.ndarray, int, int]] = []
+    for step, params in enumerate(params_of_steps):
+        start = system.embed(jnp.asarray(x), params)
+        motion = jax.tree.map(np.asarray, compile_simulation(system)(params, start, options))
+        n_events = int(motion.n_events)
+        outcome = Outcome(OUTCOME_BY_TERMINATION[motion.termination])
+        ending = describe_step(Termination(int(motion.termination)))
+        end_times, modes = motion.times[:n_events], motion.modes[:n_events]
+        if outcome != Outcome.STEPPED and not (n_events and end_times[-1] == motion.time):
+            end_times, modes = np.append(end_times, motion.time), np.append(modes, motion.mode)
+        starts = [start, *motion.states_after[: len(modes) - 1]]
+        for begin, end, state, mode in zip(
+            [0.0, *end_times], end_times, starts, modes, strict=False
+        ):
+            sample = _compile_mode_sampling(system, mode_names[mode], n_samples)
+            states = np.asarray(sample(params, jnp.asarray(state), end - begin, options))
+            pieces.append((time + np.linspace(begin, end, n_samples), states, step, int(mode)))
+        if outcome != Outcome.STEPPED:
+            break
+        x = system.project(jnp.asarray(motion.states_after[n_events - 1]), params)
+        time += float(end_times[-1])
+    times, states, steps, modes = zip(*pieces, strict=True)
+    repeat = lambda values: np.repeat(values, n_samples)
+    units = system.state_units
+    columns = dict(zip(system.state, np.concatenate(states).T, strict=True))
+    flags = {"flag_values": list(range(len(mode_names))), "flag_meanings": " ".join(mode_names)}
+    coordinates = {
+        "time": ("time", np.concatenate(times), {"units": "s"}),
+        "step": ("time", repeat(steps)),
+        "phase": ("time", repeat(modes), {"long_name": "mode", **flags}),
+    }
+    return xr.Dataset(
+        {
+            f"state_{name}" if name in coordinates else name: (
+                "time",
+                column,
+                {"units": units[name]} if name in units else {},
+            )
+            for name, column in columns.items()
+        },
+        coordinates,
+        {
+            "title": "Walk of a HybridSystem",
+            "section": system.section,
+            "n_steps": step + (outcome == Outcome.STEPPED),
+            "outcome": outcome.name,
+            "outcome_meaning": ending,
+        },
+    )
+
+
+@functools.lru_cache
+def _compile_mode_sampling(system: HybridSystem, mode_name: str, n_samples: int) -> Any:
+    evaluate: Any = system.modes[mode_name].field
+
+    @jax.jit
+    def sample(params: Any, state: Any, duration: Any, options: StepOptions) -> Any:
+        return sample_phase(lambda y: evaluate(y, params), state, duration, n_samples, options)
+
+    return sample

@@ -26,10 +26,11 @@ from vrw_jax.flow.event_location import (
     EventSearch,
     IntegrationStatus,
     IntegratorState,
+    arrive_at_events,
+    find_events,
     find_first_guard,
     has_guard_crossed,
     locate_event,
-    propagate_to_event,
 )
 from vrw_jax.flow.kinks import find_sides, integrate_over_kinks
 from vrw_jax.flow.minima import (
@@ -40,23 +41,18 @@ from vrw_jax.flow.minima import (
     refine_margin_minima,
     update_margin_minima_state,
 )
-from vrw_jax.flow.tableaus import (
+from vrw_jax.flow.solver_steps import (
+    BatchPhase,
     ButcherTableau,
+    MakeBatchPhase,
     SolverStepFunction,
     StageState,
     compute_step_size_factor,
-    estimate_step_error,
     find_earliest_guard_minimum_fraction,
-    take_rk_step,
+    make_solver_step_function,
 )
-from vrw_jax.flow.tangents import (
-    BatchPhase,
-    MakeBatchPhase,
-    PhaseTangents,
-    apply_batched_jvp_rule,
-    stack_directions,
-)
-from vrw_jax.lanes.batching import make_zeros_like_output
+from vrw_jax.flow.tangents import PhaseTangents, propagate_to_event, stack_directions
+from vrw_jax.lanes.autodiff import apply_batched_jvp_rule
 
 
 class PhaseEnd(NamedTuple):
@@ -102,7 +98,7 @@ def integrate_batch_phase(
 
     - `make_phase`: function that returns the phase for `phase_constants` and `held_constants`;
     - `phase_constants`, `held_constants`: constants of the equations, see
-      `tangents.MakeBatchPhase`;
+      `solver_steps.MakeBatchPhase`;
     - `tableau`: tableau of the Runge-Kutta method;
     - `q`, `v`: tuples of arrays (batch,), one array per coordinate;
     - `is_active`: which elements are integrated, (batch,);
@@ -260,7 +256,7 @@ def integrate_to_event(
         phase, enter_sides, n_guards = _enter_first_sides(
             phase, phase_tangents, phase.make_state(q, v), tableau, options
         )
-    solver = _make_solver_step_function(phase, tableau, options)
+    solver = make_solver_step_function(phase, tableau, options)
     start_state = phase.make_state(q, v)
     guard_values, is_guard_met_at_start = _evaluate_start_guards(phase, start_state, n_guards)
     # The index is that of the first guard whose event is the start itself.
@@ -288,17 +284,16 @@ def integrate_to_event(
             # The functions are called, not inlined, because the program is already long.
             if not has_last_step:
                 phase = phase_with_kinks = _wrap_each_phase_function(phase, lanes.mark_noinline)
-                solver = _make_solver_step_function(phase, tableau, options)
+                solver = make_solver_step_function(phase, tableau, options)
         if phase.take_last_step is not None:
             take_last_step = phase.take_last_step
             solver = jax.jit(lambda state, h: (take_last_step(state, h), jnp.zeros_like(h)))
-        find_events = _arrive_at_events if has_last_step else _find_events
-        integrator_state, event_search = find_events(
+        integrator_state, event_search = (arrive_at_events if has_last_step else find_events)(
             take_steps, functools.partial(locate, phase, solver), integrator_state
         )
     else:
         sides, integrator_state, event_search, end_guard_index, _, log = integrate_over_kinks(
-            lambda phase, solver, tangents, state: _find_events(
+            lambda phase, solver, tangents, state: find_events(
                 make_loop(phase, solver, tangents), functools.partial(locate, phase, solver), state
             ),
             enter_sides, sides, n_guards, tableau, integrator_state, options, attach_derivatives,
@@ -337,23 +332,13 @@ def _enter_first_sides(
     def enter_sides(sides: Vector) -> tuple[BatchPhase, SolverStepFunction, Any]:
         phase = _wrap_each_phase_function(phase_with_kinks.on_sides(sides), lanes.mark_noinline)
         tangents = None if phase_tangents is None else phase_tangents.on_sides(sides)
-        return phase, _make_solver_step_function(phase, tableau, options), tangents
+        return phase, make_solver_step_function(phase, tableau, options), tangents
 
     return (
         phase_with_kinks.on_sides(find_sides(phase_with_kinks, start_state)),
         enter_sides,
         len(phase_with_kinks.evaluate_guards(start_state)),
     )
-
-
-def _find_events(
-    take_steps: Callable[[IntegratorState], IntegratorState],
-    locate: Callable[[IntegratorState], EventSearch],
-    integrator_state: IntegratorState,
-) -> tuple[IntegratorState, EventSearch]:
-    """Return the state of the loop before the solver steps to the events, and the events."""
-    integrator_state = take_steps(integrator_state)
-    return integrator_state, locate(integrator_state)
 
 
 def _evaluate_start_guards(
@@ -462,23 +447,6 @@ def _add_margin_minima(
     )
 
 
-def _make_solver_step_function(
-    phase: BatchPhase, tableau: ButcherTableau, options: StepOptions
-) -> SolverStepFunction:
-    """Return a function of state and length that takes one solver step in the phase.
-
-    The function is traced once for all its calls.
-    """
-
-    def take_step(state: StageState, h: Array) -> tuple[list[StageState], Array]:
-        stage_states = take_rk_step(tableau, phase.evaluate_acceleration, state, h)
-        return stage_states, _compute_mean_squared_error(
-            tableau, stage_states, h, options, phase.state_units
-        )
-
-    return jax.jit(phase.take_solver_step or take_step)
-
-
 def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
     """Return a copy of the phase in which `wrap_function` has been applied to each function."""
     return phase._replace(
@@ -486,75 +454,6 @@ def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> Bat
         evaluate_guards=wrap_function(phase.evaluate_guards),
         evaluate_margins=wrap_function(phase.evaluate_margins),
         on_sides=lambda sides: _wrap_each_phase_function(phase.on_sides(sides), wrap_function),
-    )
-
-
-def _arrive_at_events(
-    take_steps: Callable[[IntegratorState], IntegratorState],
-    locate: Callable[[IntegratorState], EventSearch],
-    integrator_state: IntegratorState,
-) -> tuple[IntegratorState, EventSearch]:
-    """Return the state of the loop after a last solver step to each event, and the events.
-
-    A second pass through the same loop takes the last steps and propagates tangents over them, so
-    that the program contains both only once.
-    """
-
-    no_count: Any = None
-
-    def run_pass(carry: tuple) -> tuple:
-        n_passes, crossing_step_length, integrator_state, event_search = carry
-        integrator_state = take_steps(integrator_state)
-        is_arriving: Any = integrator_state.is_arriving
-        has_crossed = integrator_state.has_guard_crossed & ~is_arriving
-        located = locate(integrator_state)._replace(n_iterations=no_count)
-        event_search = select_trees_by_condition(has_crossed, located, event_search)
-        begins_last_step = has_crossed & ~event_search.is_event_unresolved
-        status = integrator_state.integration_status
-        status = jnp.where(integrator_state.is_running, IntegrationStatus.PAUSED, status)
-        status = jnp.where(begins_last_step, IntegrationStatus.RUNNING, status)
-        step_length = integrator_state.next_step_length
-        return (
-            n_passes + 1,
-            jnp.where(begins_last_step, step_length, crossing_step_length),
-            integrator_state._replace(
-                integration_status=status.astype(jnp.int32),
-                next_step_length=jnp.where(
-                    begins_last_step, event_search.event_step_length, step_length
-                ),
-                n_iterations=jnp.zeros((), jnp.int32),
-                is_arriving=is_arriving | begins_last_step,
-            ),
-            event_search,
-        )
-
-    no_search = make_zeros_like_output(
-        lambda: locate(integrator_state)._replace(n_iterations=no_count)
-    )
-    initial_state = integrator_state._replace(
-        is_arriving=jnp.zeros_like(integrator_state.is_running)
-    )
-    _, crossing_step_length, integrator_state, event_search = lax.while_loop(
-        lambda carry: carry[0] < 2,
-        run_pass,
-        (jnp.zeros((), jnp.int32), initial_state.next_step_length, initial_state, no_search),
-    )
-    status = integrator_state.integration_status
-    has_arrived: Any = integrator_state.is_arriving
-    status = jnp.where(status == IntegrationStatus.PAUSED, IntegrationStatus.RUNNING, status)
-    return (
-        # The search has counted the last step.
-        integrator_state._replace(
-            integration_status=status.astype(jnp.int32),
-            next_step_length=jnp.where(
-                has_arrived, crossing_step_length, integrator_state.next_step_length
-            ),
-            n_tried_steps=integrator_state.n_tried_steps - has_arrived,
-            is_arriving=None,
-        ),
-        event_search._replace(
-            event_step_length=jnp.where(has_arrived, 0.0, event_search.event_step_length)
-        ),
     )
 
 
@@ -816,145 +715,3 @@ def _classify_solver_step(
         next_step_length=jnp.where(is_running & ~is_crossing, next_step_length_limit, step_length),
     )
     return next_state, is_accepted
-
-
-def _compute_mean_squared_error(
-    tableau: ButcherTableau,
-    stage_states: list[StageState],
-    step_length: Array,
-    options: StepOptions,
-    state_units: Vector | None,
-) -> Array:
-    """Return the mean square of the error of a solver step, divided by the tolerance.
-
-    The result is infinite for a solver step whose end is not finite. The mean is computed in
-    float32, because an error estimate needs no higher precision.
-
-    - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
-      units.
-    """
-    start_state, end_state = stage_states[0], stage_states[-1]
-    start_state_components = (*start_state.q, *start_state.v)
-    convert_to_float32 = lambda x: x.astype(jnp.float32)
-    sum_of_squares: Any = 0.0
-    component_units: Any = (
-        (1.0,) * len(start_state_components) if state_units is None else state_units
-    )
-    for component_error, start_component, end_component, component_unit in zip(
-        estimate_step_error(tableau, stage_states, step_length),
-        start_state_components,
-        (*end_state.q, *end_state.v),
-        component_units,
-        strict=True,
-    ):
-        error_tolerance = options.atol * component_unit + options.rtol * jnp.maximum(
-            jnp.abs(start_component), jnp.abs(end_component)
-        )
-        relative_error = convert_to_float32(component_error) / convert_to_float32(error_tolerance)
-        sum_of_squares = sum_of_squares + relative_error * relative_error
-    return jnp.where(
-        jnp.isfinite(sum_of_squares), sum_of_squares / len(start_state_components), jnp.inf
-    )
-
-
-def sample_batch_phase(
-    phase: BatchPhase,
-    tableau: ButcherTableau,
-    q: Vector,
-    v: Vector,
-    interval_lengths: Array,
-    options: StepOptions,
-) -> Array:
-    """Return positions and rates at the start of a phase and after each interval of time.
-
-    The result has the shape (samples, 2 coordinates, batch), with the positions before the rates.
-
-    - `interval_lengths`: see `sample_between_intervals`.
-    """
-
-    take_solver_step = _make_solver_step_function(phase, tableau, options)
-
-    def solver_step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
-        stage_states, mean_squared_error = take_solver_step(state, step_length)
-        return stage_states[-1], mean_squared_error
-
-    pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
-    return sample_between_intervals(
-        solver_step_function,
-        pack_sample,
-        phase.make_state(q, v),
-        tableau,
-        interval_lengths,
-        options,
-    )
-
-
-def divide_equally(duration: Array, n_samples: int) -> Array:
-    """Return the lengths of the intervals between `n_samples` equally spaced times, s."""
-    return jnp.broadcast_to(duration / (n_samples - 1), (n_samples - 1, *duration.shape))
-
-
-def sample_between_intervals(
-    solver_step_function: Callable[[Any, Array], tuple[Any, Array]],
-    pack_sample: Callable[[Any], Array],
-    start_state: Any,
-    tableau: ButcherTableau,
-    interval_lengths: Array,
-    options: StepOptions,
-) -> Array:
-    """Return samples at the start of a motion and after each interval of time.
-
-    - `solver_step_function`: function of state and step length, s, that returns the state at the
-      end of a solver step and the squared ratio of its error to the tolerance;
-    - `pack_sample`: function that returns the sample for a state. The first axis of the result
-      contains the samples;
-    - `interval_lengths`: lengths of the intervals between samples, on the first axis, s.
-    """
-    initial_count = jnp.zeros((), jnp.int32)
-
-    def take_solver_step_to_sample(loop_carry: tuple) -> tuple:
-        sample_state, previous_h, remaining_time_to_sample, n_tried_steps = loop_carry
-        h = previous_h
-        sampled_step_length = jnp.where(h < remaining_time_to_sample, h, remaining_time_to_sample)
-        step_end, mean_squared_error = solver_step_function(sample_state, sampled_step_length)
-        step_length_factor = compute_step_size_factor(
-            tableau, mean_squared_error, sampled_step_length.dtype
-        )
-        is_within_tolerance = mean_squared_error <= 1.0
-        # A step that was shortened to end at a sample does not reduce the next step's length.
-        h = jnp.where(
-            is_within_tolerance & (sampled_step_length < h),
-            jnp.maximum(h, sampled_step_length * step_length_factor),
-            sampled_step_length * step_length_factor,
-        )
-        is_running = remaining_time_to_sample > 0.0
-        return (
-            select_trees_by_condition(is_running & is_within_tolerance, step_end, sample_state),
-            lax.stop_gradient(jnp.where(is_running, h, previous_h)),
-            jnp.where(
-                is_running & is_within_tolerance,
-                jnp.where(
-                    sampled_step_length == remaining_time_to_sample,
-                    0.0,
-                    remaining_time_to_sample - sampled_step_length,
-                ),
-                remaining_time_to_sample,
-            ),
-            n_tried_steps + 1,
-        )
-
-    def integrate_to_next_sample(loop_carry: tuple, length: Array) -> tuple[tuple, Array]:
-        needs_step = lambda loop_carry: (
-            jnp.any(loop_carry[2] > 0.0) & (loop_carry[3] < options.max_solver_steps)
-        )
-        initial_loop_carry = (*loop_carry, length, initial_count)
-        sample_state, h, _, _ = lax.while_loop(
-            needs_step, take_solver_step_to_sample, initial_loop_carry
-        )
-        return (sample_state, h), pack_sample(sample_state)
-
-    initial_loop_carry = start_state, options.dt0 + jnp.zeros_like(interval_lengths[0])
-    samples_after_start = lax.scan(integrate_to_next_sample, initial_loop_carry, interval_lengths)[
-        1
-    ]
-    return jnp.concatenate([pack_sample(start_state)[None], samples_after_start])

@@ -17,8 +17,7 @@ from jaxtyping import Array
 from vrw_jax.base.elementwise import select_entry_by_mask, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
-from vrw_jax.flow.tableaus import ButcherTableau, SolverStepFunction, StageState
-from vrw_jax.flow.tangents import BatchPhase
+from vrw_jax.flow.solver_steps import BatchPhase, ButcherTableau, SolverStepFunction, StageState
 
 MINIMUM_LOCATION_TOLERANCE = 1e-6
 """Accuracy of the location of a minimum, as a fraction of the solver step. The value is chosen

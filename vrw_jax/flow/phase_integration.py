@@ -29,23 +29,20 @@ from vrw_jax.flow.event_location import (
     IntegratorState,
     has_guard_crossed,
 )
-from vrw_jax.flow.integrate import (
-    PhaseEnd,
-    divide_equally,
-    integrate_to_event,
-    sample_batch_phase,
-)
-from vrw_jax.flow.tableaus import (
+from vrw_jax.flow.integrate import PhaseEnd, integrate_to_event
+from vrw_jax.flow.solver_steps import (
     STEP_LENGTH_SAFETY_FACTOR,
+    BatchPhase,
     ButcherTableau,
     SolverStepFunction,
     StageAccelerations,
     StageState,
+    divide_equally,
     estimate_step_error,
     load_explicit_tableau,
+    sample_batch_phase,
     take_rk_step,
 )
-from vrw_jax.flow.tangents import BatchPhase
 from vrw_jax.lanes.batching import is_inside_jit
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 
@@ -104,7 +101,7 @@ class GuardsAndMargins(NamedTuple):
 
 
 class PhaseKinks(NamedTuple):
-    """Kinks of a vector field, see `tangents.BatchPhase`."""
+    """Kinks of a vector field, see `solver_steps.BatchPhase`."""
 
     evaluate_kinks: Callable[[StateArray], Vector]
     on_sides: Callable[[Vector], tuple[VectorField, EvaluateGuardsAndMargins]]

@@ -4,226 +4,32 @@ Each Runge-Kutta step is repeated for the linearized equations, for all requeste
 Jacobians at the stages are the same for all directions and are computed once. Each direction then
 costs about a hundred products. Step sizes and iterations of the event search are not
 differentiated. The derivative is that of the discrete flow with constant step lengths, and of the
-time at which the guard becomes zero.
-
-Directions come from `jax.vmap` around a derivative. This module stores the directions on the first
-axis of arrays. Loops are therefore traced once and not again for the vmap.
+time at which the guard becomes zero. The first axis of arrays contains the directions.
 """
 
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
-from vrw_jax import lanes
+from vrw_jax.base.elementwise import select_entry_by_mask
 from vrw_jax.base.types import Vector
-from vrw_jax.flow.tableaus import (
+from vrw_jax.flow.event_location import IntegratorState, evaluate_motion_rates
+from vrw_jax.flow.solver_steps import (
+    BatchPhase,
     ButcherTableau,
-    EvaluateAcceleration,
+    ImplicitDynamics,
+    MakeBatchPhase,
     SolverStepFunction,
     StageAccelerations,
     StageState,
     evaluate_stage,
 )
-from vrw_jax.lanes.code_cache import targets_machine_code
-
-
-class ImplicitDynamics(NamedTuple):
-    """Implicit form of the equations of motion near a state."""
-
-    evaluate_residual: Callable[[StageState], Vector]
-    """Function that returns the left minus the right side of the equations of motion."""
-    solve_for_accelerations: Callable[[StageState, Vector], Vector]
-    """Function that returns accelerations for which the left side equals the second argument."""
-
-
-class BatchPhase(NamedTuple):
-    """Functions that define a phase, elementwise for all batch elements.
-
-    The function `evaluate_acceleration` returns the accelerations at a state. The guards are
-    positive inside the phase, and an event occurs when a guard falls through zero. The earliest
-    event ends the phase. If two guards are zero at the same time, the first in the list ends the
-    phase.
-    """
-
-    evaluate_acceleration: EvaluateAcceleration
-    evaluate_guards: Callable[[StageState], Array]
-    """Function that returns all guards as one array (guards, batch)."""
-    evaluate_margins: Callable[[StageState], Vector] = lambda stage_state: ()
-    """Function that returns the margins whose minima are computed."""
-    margins_include_start: tuple[bool, ...] = ()
-    """Whether each margin counts at the phase's start, see `hybrid.GuardsAndMargins`."""
-    implicit_dynamics: ImplicitDynamics = None  # type: ignore[assignment]
-    """Equations of motion in implicit form. Only derivatives need them."""
-    is_compiled_separately: bool = False
-    """Whether machine code calls the phase's functions instead of inlining them at each use.
-
-    With calls, the code compiles in half of the time and runs a sixth slower than with inlining.
-    """
-    state_units: Vector | None = None
-    """Units of the coordinates `q` and of their rates `v` for the absolute tolerance.
-
-    The default is SI units.
-    """
-    take_solver_step: SolverStepFunction | None = None
-    """Solver step of the phase; by default, a step of the tableau."""
-    take_last_step: Callable[[StageState, Array], list[StageState]] | None = None
-    """Function that returns the stages of the same solver step by shorter and slower code, for the
-    search for events."""
-    has_exact_events: bool = False
-    """Whether an event is located to round-off, and not to the tolerances."""
-    max_event_correction: Array | None = None
-    """Largest last correction of an exact event's time, as a fraction of the solver step.
-
-    The state is extrapolated linearly over the correction, with an error of its square. By default,
-    that error is round-off.
-    """
-    guards_rising_at_start: Array | None = None
-    """Whether each guard rises from its round-off at the start of the phase.
-
-    Such a guard has no minimum in the first solver step. If it grows as the cube of the time, the
-    errors of inner stages are as large as its values. By default, such guards start at zero.
-    """
-    guard_scales: Array | None = None
-    """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
-    guards_met_at_start: Array | None = None
-    """Whether each guard ends the phase at its start; by default, its value and rate decide."""
-    evaluate_kinks: Callable[[StageState], Vector] | None = None
-    """Function that returns the values of functions at whose zeros the equations have kinks."""
-    on_sides: Callable[[Vector], "BatchPhase"] = lambda sides: NotImplemented
-    """Function that returns the phase with equations that are smooth, for the signs of the values
-    of `evaluate_kinks`. Each kink adds a guard, which triggers where its sign changes.
-    """
-    sides: Vector = ()
-    """Signs for which the equations are smooth; empty without kinks."""
-    n_logged_kinks: int = 0
-    """Largest number of kinks that the end of the phase lists, see `kinks.KinkLog`."""
-
-    def make_state(self, q: Any, v: Any) -> StageState:
-        """Return the state with positions `q`, rates `v` and the accelerations there."""
-        return StageState(q, v, self.evaluate_acceleration(q, v))
-
-    def evaluate_with_rates(
-        self, evaluate_functions: Callable[[StageState], Any], state: StageState
-    ) -> tuple[Any, Any]:
-        """Return the values of `evaluate_functions` at a state, and their time derivatives."""
-        return jax.jvp(
-            lambda q, v: evaluate_functions(self.make_state(q, v)),
-            (state.q, state.v),
-            (state.v[: len(state.q)], state.acceleration.acceleration[: len(state.v)]),
-        )
-
-
-MakeBatchPhase = Callable[[Any, Vector], BatchPhase]
-"""Function that returns the `BatchPhase` for two kinds of constants.
-
-The first argument is a tree of arrays with few tangent directions. The second argument contains the
-held constants. These are arrays that are constant during the phase and have arbitrary tangents,
-such as the state at its start.
-"""
-
-
-def apply_batched_jvp_rule(
-    evaluate_jvp_rule: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
-) -> tuple[Any, Any]:
-    """Return the values and tangents of a JVP rule that computes all directions of a vmap together.
-
-    - `evaluate_jvp_rule`: function of primals and tangents that returns the values and their
-      tangents. The first axis of its tangents contains the directions. The length of this axis is 1
-      if all directions have the same tangents;
-    - `primals`, `tangents`: arguments of the JVP rule, without an axis of directions.
-    """
-    leaves, tree_structure = jax.tree.flatten((primals, tangents))
-    n_primal_leaves = len(jax.tree.leaves(primals))
-    n_directions = len(_count_vmapped_directions(tangents))
-    if n_directions == 0:
-        function_values, output_tangents = evaluate_jvp_rule(
-            primals, jax.tree.map(lambda x: x[None], tangents)
-        )
-        return function_values, jax.tree.map(lambda x: x[0], output_tangents)
-    output_structure: Any = None
-
-    def evaluate_batched_jvp_rule(leaves: Any, axes: Any) -> tuple[list, list]:
-        nonlocal output_structure
-        if any(leaf_axis is not None for leaf_axis in axes[:n_primal_leaves]):
-            raise NotImplementedError(
-                "jax.vmap around a derivative of lanes maps its directions only: put batches of "
-                "values on the lanes' axis, the last one."
-            )
-        leaves_and_axes = zip(leaves[n_primal_leaves:], axes[n_primal_leaves:], strict=True)
-        direction_leaves = [
-            x[None] if leaf_axis is None else jnp.moveaxis(x, leaf_axis, 0)
-            for x, leaf_axis in leaves_and_axes
-        ]
-        function_values, output_tangents = evaluate_jvp_rule(
-            *jax.tree.unflatten(tree_structure, [*leaves[:n_primal_leaves], *direction_leaves])
-        )
-        output_tangents = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (n_directions, *x.shape[1:])), output_tangents
-        )
-        flat_results, output_structure = jax.tree.flatten((function_values, output_tangents))
-        n_function_values = len(jax.tree.leaves(function_values))
-        return flat_results, [None] * n_function_values + [0] * (
-            len(flat_results) - n_function_values
-        )
-
-    flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(
-        *leaves, map_over_axes=evaluate_batched_jvp_rule
-    )
-    return jax.tree.unflatten(output_structure, flat_results)
-
-
-@custom_vmap
-def _count_vmapped_directions(_: Any) -> Array:
-    """Return zeros whose length is the number of directions in an enclosing `jax.vmap`.
-
-    Without such a vmap, the array is empty.
-    """
-    return jnp.zeros(0)
-
-
-@_count_vmapped_directions.def_vmap
-@lanes.with_default_jax_settings
-def _count_vmapped_directions_rule(n_directions: int, _: list, _tangent: Any) -> tuple[Array, bool]:
-    return jnp.zeros(n_directions), False
-
-
-_HOIST_OUT_OF_VMAP_PRIMITIVE = Primitive("beyond")
-_HOIST_OUT_OF_VMAP_PRIMITIVE.multiple_results = True
-batching.primitive_batchers[_HOIST_OUT_OF_VMAP_PRIMITIVE] = lambda values, axes, map_over_axes: (
-    map_over_axes(values, axes)
-)
-"""Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
-loops again.
-"""
-
-
-def _map_directions(
-    evaluate_for_direction: Callable[[Any], Any], directions: Any, is_unrolled: bool = False
-) -> Any:
-    """Return the results of a function for all directions.
-
-    They are computed in a loop, which makes the values for one direction fit into registers. With
-    `is_unrolled` there is no loop, so that the compiler removes entries that are known to be zero.
-    """
-    varying_tangents, shared_tangents = eqx.partition(directions, lambda x: len(x) > 1)
-    shared_tangents = jax.tree.map(lambda x: x[0], shared_tangents)
-    evaluate_varying = lambda tangents: evaluate_for_direction(
-        eqx.combine(tangents, shared_tangents)
-    )
-    if not jax.tree.leaves(varying_tangents):
-        return jax.tree.map(lambda x: x[None], evaluate_varying(varying_tangents))
-    if is_unrolled:
-        return jax.vmap(evaluate_varying)(varying_tangents)
-    return lax.map(evaluate_varying, varying_tangents)
+from vrw_jax.lanes.autodiff import compute_each_jvp, map_directions
 
 
 def stack_directions(directions: Vector) -> Array:
@@ -292,7 +98,7 @@ def _compute_stage_jacobians(
                 (phase_constants, held_constants), (phase_constants_direction, zero_held_constants)
             )
         )
-        return jnp.stack(jacobian_columns, 1), _map_directions(
+        return jnp.stack(jacobian_columns, 1), map_directions(
             differentiate_by_phase_constants, phase_constants_directions, is_unrolled=True
         )
 
@@ -364,53 +170,10 @@ def _propagate_tangents(
             )
         return jnp.stack([*q, *v, *held_constants_tangents])
 
-    return _map_directions(
+    return map_directions(
         propagate_tangent_direction,
         (jnp.moveaxis(phase_constants_tangents, 1, 0), start_tangents),
     )
-
-
-def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
-    """Return the tangents of a function's result for all directions, computed with `jax.jvp`.
-
-    The program is as short as for one direction.
-    """
-    return _map_directions(lambda direction: jax.jvp(function, primals, direction)[1], directions)
-
-
-def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return `function` with a JVP rule that computes the tangents of all directions together.
-
-    The rule differentiates with respect to all floating-point arrays among the arguments.
-    """
-
-    def call_with_batched_jvp(*arguments: Any) -> Any:
-        float_arguments, nonfloat_arguments = eqx.partition(arguments, eqx.is_inexact_array)
-        evaluate_with_float_arguments = lambda *float_arguments: function(
-            *eqx.combine(float_arguments, nonfloat_arguments)
-        )
-        evaluate_float_results = lambda *float_arguments: eqx.filter(
-            evaluate_with_float_arguments(*float_arguments), eqx.is_inexact_array
-        )
-        differentiable_function = jax.custom_jvp(evaluate_with_float_arguments)
-
-        @differentiable_function.defjvp
-        @lanes.with_default_jax_settings
-        def evaluate_float_jvp(primals: tuple, tangent: tuple) -> tuple:
-            evaluate_with_tangents = lambda primals, directions: (
-                evaluate_with_float_arguments(*primals),
-                compute_each_jvp(evaluate_float_results, primals, directions),
-            )
-            function_outputs, float_tangents = apply_batched_jvp_rule(
-                evaluate_with_tangents, primals, tangent
-            )
-            return function_outputs, eqx.combine(
-                float_tangents, lanes.make_zero_tangent(function_outputs)
-            )
-
-        return differentiable_function(*float_arguments)
-
-    return call_with_batched_jvp
 
 
 class PhaseTangents(NamedTuple):
@@ -498,39 +261,45 @@ class PhaseTangents(NamedTuple):
         )
 
 
-_FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
-"""Identity operation whose transpose raises an error."""
+def propagate_to_event(
+    tableau: ButcherTableau,
+    solver_step_function: SolverStepFunction | None,
+    phase_tangents: Any,
+    integrator_state: IntegratorState,
+    last_step_length: Array,
+    event_guard_index: Array,
+) -> tuple[Array, Array, Array]:
+    """Return the tangents after the last solver step of a phase.
 
+    They are those at a fixed time, that of the event's time, and those of positions and rates at
+    the event. The axes are those of directions, components and the batch. Without an event, or if
+    its guard does not fall, the tangent of the time is zero.
 
-def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, function_name: str) -> None:
-    """Raise a ValueError that explains why reverse mode is not available."""
-    raise ValueError(
-        f"hybrid.{function_name} has no derivative in reverse mode, since the number of its solver "
-        "steps is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of "
-        "jax.grad, jax.jacrev or jax.vjp."
-    )
-
-
-_FORWARD_ONLY_PRIMITIVE.def_impl(lambda x, *, function_name: x)
-_FORWARD_ONLY_PRIMITIVE.def_abstract_eval(lambda x, *, function_name: x)
-ad.deflinear2(_FORWARD_ONLY_PRIMITIVE, _raise_reverse_mode_error)
-batching.defvectorized(_FORWARD_ONLY_PRIMITIVE)
-mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, function_name: [x])
-
-
-def forbid_reverse_mode(function_name: str, function_result: PyTree) -> PyTree:
-    """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
-    error.
-
-    `function_name` is the function in `flow` that computed the result. Inside `lanes.jit` there is
-    no mark, because reverse mode transposes the derivatives that machine code computes.
+    - `solver_step_function`: None if the last solver step is already taken;
+    - `last_step_length`: time from `integrator_state` to the event, s.
     """
-    if targets_machine_code():
-        return function_result
-
-    def mark_leaf_as_forward_only(leaf: Any) -> Any:
-        if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
-            return _FORWARD_ONLY_PRIMITIVE.bind(leaf, function_name=function_name)
-        return leaf
-
-    return jax.tree.map(mark_leaf_as_forward_only, function_result)
+    end_state, end_tangents = integrator_state.state, integrator_state.state_tangents
+    assert end_tangents is not None
+    if solver_step_function is not None:
+        stage_states, _ = solver_step_function(end_state, last_step_length)
+        end_state = stage_states[-1]
+        end_tangents = phase_tangents.propagate_to_step_end(
+            tableau, stage_states, end_tangents, last_step_length
+        )
+    guard_rate, guard_tangent = phase_tangents.evaluate_rate_and_tangents(
+        lambda phase, state: select_entry_by_mask(event_guard_index, phase.evaluate_guards(state)),
+        end_state,
+        end_tangents,
+    )
+    # The guard is zero at the event of the perturbed motion too.
+    is_guard_falling = integrator_state.has_guard_crossed & (guard_rate < 0.0)
+    event_time_tangent = jnp.where(
+        is_guard_falling, -guard_tangent / jnp.where(is_guard_falling, guard_rate, -1.0), 0.0
+    )
+    motion_rates = evaluate_motion_rates(end_state)
+    motion_tangents = end_tangents[:, : len(motion_rates)]
+    return (
+        end_tangents,
+        event_time_tangent,
+        motion_tangents + event_time_tangent[:, None] * motion_rates,
+    )

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 from jax import export, lax
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.batch_algebra import LaneArray
-from vrw_jax.base.elementwise import select_trees_by_condition
+from vrw_jax.base.elementwise import LaneArray, select_trees_by_condition
 from vrw_jax.base.types import Vector
 from vrw_jax.gaits.gait_surface import predict_gait
 from vrw_jax.gaits.gauss import N_GAUSS_NODES

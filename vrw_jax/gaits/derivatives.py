@@ -43,8 +43,7 @@ from vrw_jax.lanes.batching import (
     unbatch,
 )
 from vrw_jax.lanes.lane_function import compile_batch_function
-from vrw_jax.lanes.python_calls import call_python
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.settings import call_python, with_default_jax_settings
 from vrw_jax.models import unit_scaling as scales
 from vrw_jax.wheel.params import (
     NO_LAWS,

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.base.elementwise import select_entry_by_mask
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.tableaus import load_explicit_tableau
+from vrw_jax.flow.solver_steps import load_explicit_tableau
 from vrw_jax.gaits.gauss import (
     DOUBLE_END_WEIGHTS,
     END_WEIGHTS,

@@ -25,7 +25,8 @@ from vrw_jax.base.printing import (
 )
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.hybrid_simulation import ReturnMap, Termination
+from vrw_jax.flow.hybrid_simulation import Termination
+from vrw_jax.flow.orbits import ReturnMap
 from vrw_jax.gaits.floquet import (
     UNIT_CIRCLE_DISTANCE,
     compute_multipliers,

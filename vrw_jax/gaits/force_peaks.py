@@ -22,7 +22,7 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.smooth_parts import StepForceExtrema, summarize_forces
+from vrw_jax.flow.kinks import StepForceExtrema, summarize_forces
 from vrw_jax.gaits.derivatives import attach_derivatives, make_tangent_function
 from vrw_jax.gaits.extrema import (
     ExtremumValues,

@@ -59,8 +59,7 @@ from vrw_jax.lanes.batching import (
     select_tree_rows,
     unbatch,
 )
-from vrw_jax.lanes.python_calls import call_python, can_programs_call_jax
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.settings import call_python, can_programs_call_jax, with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
 from vrw_jax.wheel.params import WheelParams

@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from vrw_jax import lanes
-from vrw_jax.base.batch_algebra import (
+from vrw_jax.base.elementwise import (
     FusionBarrierFn,
     LaneArray,
     apply_matrix,

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from vrw_jax.base.batch_algebra import LaneArray
-from vrw_jax.base.elementwise import compute_sine_cosine
+from vrw_jax.base.elementwise import LaneArray, compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.gaits.gauss import PhaseMesh
 from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration

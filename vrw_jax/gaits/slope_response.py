@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from vrw_jax.base.batch_algebra import evaluate_with_jvps
+from vrw_jax.base.elementwise import evaluate_with_jvps
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits import floquet
 from vrw_jax.gaits.derivatives import make_derivative_compiler, make_tangent_function

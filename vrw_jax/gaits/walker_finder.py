@@ -16,14 +16,14 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_reals, has_traced_leaf, require_known_name
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.measures import Measure
-from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import (
+from vrw_jax.base.options import (
     ParameterDomain,
+    StepOptions,
     find_tree_parameter,
     list_tree_parameters,
     replace_tree_parameter,
 )
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     format_each_batch_element,
     format_heading_and_rows,
@@ -60,8 +60,8 @@ from vrw_jax.lanes.batching import (
     select_rows_on_device,
     select_tree_rows,
 )
-from vrw_jax.lanes.python_calls import call_python, can_programs_call_jax
 from vrw_jax.lanes.saved_traces import call_compiled_program
+from vrw_jax.lanes.settings import call_python, can_programs_call_jax
 
 
 class HybridGait(NamedTuple):

@@ -18,7 +18,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from vrw_jax.lanes.arithmetic import emit_llvm_elementwise_primitive
 from vrw_jax.lanes.lazy_arrays import (
     EntryIndex,
     JoinedArray,
@@ -28,8 +27,14 @@ from vrw_jax.lanes.lazy_arrays import (
     PendingArrayUpdate,
     UninitializedArray,
 )
-from vrw_jax.lanes.llvm_library import ir
-from vrw_jax.lanes.value_emitter import I64, LLVM_NUMBER_TYPES, LlvmValue, ValueEmitter
+from vrw_jax.lanes.machine import ir
+from vrw_jax.lanes.value_emitter import (
+    I64,
+    LLVM_NUMBER_TYPES,
+    LlvmValue,
+    ValueEmitter,
+    emit_llvm_elementwise_primitive,
+)
 
 LANE_AXIS_SENTINEL = 1021
 """Length of the lane axis in a trace, chosen because no other axis has this length, so that the

@@ -5,6 +5,10 @@ rule in this module computes the Jacobian in forward mode, with respect to the i
 tangents. It returns the product of the Jacobian and the tangent. The product is linear in the
 tangent, so `jax.grad` transposes a small matrix instead of a loop. The Jacobian itself has the same
 rule, so Hessians work in every combination of modes.
+
+Directions of forward mode come from `jax.vmap` around a derivative. `with_batched_jvp` and its
+parts put them on the first axis of arrays, so that loops are traced once and not again for the
+vmap.
 """
 
 import functools
@@ -17,7 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
+from jax.interpreters import batching
 from jaxtyping import Array, PyTree
 
 from vrw_jax.lanes.batching import BatchFunction, unbatch
@@ -364,3 +371,145 @@ def compute_square_root(x: Array) -> Array:
     """Return the square root of max(x, 0). Its derivative is zero for x <= 0."""
     is_argument_positive = x > 0.0
     return jnp.where(is_argument_positive, jnp.sqrt(jnp.where(is_argument_positive, x, 1.0)), 0.0)
+
+
+def apply_batched_jvp_rule(
+    evaluate_jvp_rule: Callable[[Any, Any], tuple[Any, Any]], primals: Any, tangents: Any
+) -> tuple[Any, Any]:
+    """Return the values and tangents of a JVP rule that computes all directions of a vmap together.
+
+    - `evaluate_jvp_rule`: function of primals and tangents that returns the values and their
+      tangents. The first axis of its tangents contains the directions. The length of this axis is 1
+      if all directions have the same tangents;
+    - `primals`, `tangents`: arguments of the JVP rule, without an axis of directions.
+    """
+    leaves, tree_structure = jax.tree.flatten((primals, tangents))
+    n_primal_leaves = len(jax.tree.leaves(primals))
+    n_directions = len(_count_vmapped_directions(tangents))
+    if n_directions == 0:
+        function_values, output_tangents = evaluate_jvp_rule(
+            primals, jax.tree.map(lambda x: x[None], tangents)
+        )
+        return function_values, jax.tree.map(lambda x: x[0], output_tangents)
+    output_structure: Any = None
+
+    def evaluate_batched_jvp_rule(leaves: Any, axes: Any) -> tuple[list, list]:
+        nonlocal output_structure
+        if any(leaf_axis is not None for leaf_axis in axes[:n_primal_leaves]):
+            raise NotImplementedError(
+                "jax.vmap around a derivative of lanes maps its directions only: put batches of "
+                "values on the lanes' axis, the last one."
+            )
+        leaves_and_axes = zip(leaves[n_primal_leaves:], axes[n_primal_leaves:], strict=True)
+        direction_leaves = [
+            x[None] if leaf_axis is None else jnp.moveaxis(x, leaf_axis, 0)
+            for x, leaf_axis in leaves_and_axes
+        ]
+        function_values, output_tangents = evaluate_jvp_rule(
+            *jax.tree.unflatten(tree_structure, [*leaves[:n_primal_leaves], *direction_leaves])
+        )
+        output_tangents = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (n_directions, *x.shape[1:])), output_tangents
+        )
+        flat_results, output_structure = jax.tree.flatten((function_values, output_tangents))
+        n_function_values = len(jax.tree.leaves(function_values))
+        return flat_results, [None] * n_function_values + [0] * (
+            len(flat_results) - n_function_values
+        )
+
+    flat_results = _HOIST_OUT_OF_VMAP_PRIMITIVE.bind(
+        *leaves, map_over_axes=evaluate_batched_jvp_rule
+    )
+    return jax.tree.unflatten(output_structure, flat_results)
+
+
+@custom_vmap
+def _count_vmapped_directions(_: Any) -> Array:
+    """Return zeros whose length is the number of directions in an enclosing `jax.vmap`.
+
+    Without such a vmap, the array is empty.
+    """
+    return jnp.zeros(0)
+
+
+@_count_vmapped_directions.def_vmap
+@with_default_jax_settings
+def _count_vmapped_directions_rule(n_directions: int, _: list, _tangent: Any) -> tuple[Array, bool]:
+    return jnp.zeros(n_directions), False
+
+
+_HOIST_OUT_OF_VMAP_PRIMITIVE = Primitive("beyond")
+
+
+_HOIST_OUT_OF_VMAP_PRIMITIVE.multiple_results = True
+
+
+batching.primitive_batchers[_HOIST_OUT_OF_VMAP_PRIMITIVE] = lambda values, axes, map_over_axes: (
+    map_over_axes(values, axes)
+)
+"""Primitive whose function is traced outside of the enclosing `jax.vmap`, which would trace its
+loops again.
+"""
+
+
+def map_directions(
+    evaluate_for_direction: Callable[[Any], Any], directions: Any, is_unrolled: bool = False
+) -> Any:
+    """Return the results of a function for all directions.
+
+    They are computed in a loop, which makes the values for one direction fit into registers. With
+    `is_unrolled` there is no loop, so that the compiler removes entries that are known to be zero.
+    """
+    varying_tangents, shared_tangents = eqx.partition(directions, lambda x: len(x) > 1)
+    shared_tangents = jax.tree.map(lambda x: x[0], shared_tangents)
+    evaluate_varying = lambda tangents: evaluate_for_direction(
+        eqx.combine(tangents, shared_tangents)
+    )
+    if not jax.tree.leaves(varying_tangents):
+        return jax.tree.map(lambda x: x[None], evaluate_varying(varying_tangents))
+    if is_unrolled:
+        return jax.vmap(evaluate_varying)(varying_tangents)
+    return lax.map(evaluate_varying, varying_tangents)
+
+
+def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: tuple) -> Any:
+    """Return the tangents of a function's result for all directions, computed with `jax.jvp`.
+
+    The program is as short as for one direction.
+    """
+    return map_directions(lambda direction: jax.jvp(function, primals, direction)[1], directions)
+
+
+def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function` with a JVP rule that computes the tangents of all directions together.
+
+    The rule differentiates with respect to all floating-point arrays among the arguments.
+    """
+
+    def call_with_batched_jvp(*arguments: Any) -> Any:
+        float_arguments, nonfloat_arguments = eqx.partition(arguments, eqx.is_inexact_array)
+        evaluate_with_float_arguments = lambda *float_arguments: function(
+            *eqx.combine(float_arguments, nonfloat_arguments)
+        )
+        evaluate_float_results = lambda *float_arguments: eqx.filter(
+            evaluate_with_float_arguments(*float_arguments), eqx.is_inexact_array
+        )
+        differentiable_function = jax.custom_jvp(evaluate_with_float_arguments)
+
+        @differentiable_function.defjvp
+        @with_default_jax_settings
+        def evaluate_float_jvp(primals: tuple, tangent: tuple) -> tuple:
+            evaluate_with_tangents = lambda primals, directions: (
+                evaluate_with_float_arguments(*primals),
+                compute_each_jvp(evaluate_float_results, primals, directions),
+            )
+            function_outputs, float_tangents = apply_batched_jvp_rule(
+                evaluate_with_tangents, primals, tangent
+            )
+            return function_outputs, eqx.combine(
+                float_tangents, make_zero_tangent(function_outputs)
+            )
+
+        return differentiable_function(*float_arguments)
+
+    return call_with_batched_jvp

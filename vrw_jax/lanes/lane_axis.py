@@ -16,11 +16,15 @@ import jax.numpy as jnp
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Literal
 
-from vrw_jax.lanes.arithmetic import ELEMENTWISE_RULES
+from vrw_jax.lanes.array_rules import COMBINING_PRIMITIVE_BY_REDUCTION
 from vrw_jax.lanes.decompositions import DECOMPOSITIONS
-from vrw_jax.lanes.loops import count_scan_arguments
-from vrw_jax.lanes.lowering import CALLED_JAXPR_PARAMETERS, NOINLINE_FUNCTION_NAME, mark_noinline
-from vrw_jax.lanes.reductions import COMBINING_PRIMITIVE_BY_REDUCTION
+from vrw_jax.lanes.lowering import (
+    CALLED_JAXPR_PARAMETERS,
+    NOINLINE_FUNCTION_NAME,
+    count_scan_arguments,
+    mark_noinline,
+)
+from vrw_jax.lanes.value_emitter import ELEMENTWISE_RULES
 
 MAX_SELECTED_ENTRIES = 64
 """Largest length of an axis that each lane indexes by itself, because every entry is read."""

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from vrw_jax.lanes import disk_cache, fallback
+from vrw_jax.lanes import disk_cache, program
 from vrw_jax.lanes.array_emitter import MAX_UNROLLED_ENTRIES, LaneAxisError
 from vrw_jax.lanes.autodiff import enable_all_ad_modes
 from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
@@ -211,10 +211,10 @@ class CompiledBatchFunction:
                 _keys_without_machine_code.add(key)
             name = getattr(self._function, "__qualname__", "a function")
             warnings.warn(f"XLA computes {name}, more slowly: {compilation_error}", stacklevel=4)
-        elif fallback.is_tested_jax_release():
+        elif program.is_tested_jax_release():
             raise compilation_error
         else:
-            fallback.disable_machine_code(compilation_error)
+            program.disable_machine_code(compilation_error)
 
 
 class _NoMachineCodeError(Exception):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vrw_jax.lanes.llvm_library import ir
+from vrw_jax.lanes.machine import ir
 from vrw_jax.lanes.value_emitter import LlvmValue
 
 EntryIndex = tuple[Any, ...]

@@ -1,17 +1,20 @@
-"""Machine code that runs: on NumPy arrays by all cores, or called by saved JAX programs."""
+"""Machine code that runs: on NumPy arrays by all cores, or called by its name in JAX programs."""
 
 import ctypes
 import functools
-import os
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from threading import Lock
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
-from vrw_jax.lanes import fallback
 from vrw_jax.lanes.array_emitter import LANE_AXIS_SENTINEL, MAX_UNROLLED_ENTRIES
 from vrw_jax.lanes.code_cache import (
     LaneProgram,
@@ -20,19 +23,135 @@ from vrw_jax.lanes.code_cache import (
     load_machine_code,
     trace_for_machine_code,
 )
-from vrw_jax.lanes.ffi_primitive import (
-    LOADED_CODE_BY_FFI_TARGET,
-    MACHINE_CODE_PRIMITIVE,
-    LaneCall,
-    register_machine_code,
-)
-from vrw_jax.lanes.kernel import LANE_KERNEL_NAME, write_llvm_kernel
-from vrw_jax.lanes.llvm_library import is_llvmlite_installed
+from vrw_jax.lanes.kernel import FFI_HANDLER_NAME, LANE_KERNEL_NAME, write_llvm_kernel
 from vrw_jax.lanes.machine import (
     LoadedMachineCode,
     compile_llvm_for_webassembly,
     has_512_bit_vectors,
+    is_llvmlite_installed,
 )
+from vrw_jax.lanes.settings import count_available_cores
+
+LOADED_CODE_BY_FFI_TARGET: dict[str, LoadedMachineCode] = {}
+"""Loaded machine code by the name under which JAX programs call it.
+
+The code stays loaded, because XLA never releases a registered function.
+"""
+_loaded_code_lock = Lock()
+
+
+def register_machine_code(machine_code: MachineCode) -> None:
+    """Load machine code, and make it callable by its name in JAX programs."""
+    object_code = machine_code.object_code_future.result()  # waits until LLVM has compiled it
+    with _loaded_code_lock:
+        if machine_code.ffi_target_name not in LOADED_CODE_BY_FFI_TARGET:
+            loaded_code = LoadedMachineCode(object_code)
+            jax.ffi.register_ffi_target(
+                machine_code.ffi_target_name,
+                jax.ffi.pycapsule(loaded_code.find_function_address(FFI_HANDLER_NAME)),
+                platform="cpu",
+            )
+            LOADED_CODE_BY_FFI_TARGET[machine_code.ffi_target_name] = loaded_code
+
+
+@dataclass(frozen=True)
+class LaneCall:
+    """Program that JAX calls, and what it calls if the program has no machine code."""
+
+    lane_program: LaneProgram
+    # function of the error, which it raises, or returns the function of the leaves for XLA
+    replace_code: Callable[[Exception], Callable] = field(compare=False)
+
+    def lower(self, lowering_context: Any, *call_arguments: Any) -> Any:
+        """Register the machine code with XLA, and return the lowering of its call."""
+        try:
+            machine_code = self.lane_program.machine_code
+        except Exception as compilation_error:
+            evaluate_by_xla = self.replace_code(compilation_error)
+            return mlir.lower_fun(evaluate_by_xla, multiple_results=True)(
+                lowering_context, *call_arguments
+            )
+        register_machine_code(machine_code)
+        return jax.ffi.ffi_lowering(machine_code.ffi_target_name)(lowering_context, *call_arguments)
+
+
+MACHINE_CODE_PRIMITIVE = Primitive("machine_code")
+"""JAX primitive that calls machine code from JAX programs.
+
+Only the compilation of the JAX program needs the code, so LLVM can compile the code before it.
+"""
+MACHINE_CODE_PRIMITIVE.multiple_results = True
+
+
+@MACHINE_CODE_PRIMITIVE.def_abstract_eval
+def _make_abstract_results(
+    *call_arguments: Any, result_shapes: Sequence[jax.ShapeDtypeStruct], **_: Any
+) -> list[Any]:
+    """Return the abstract values (shapes and dtypes) of the results that a machine code call
+    returns.
+    """
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
+
+
+_calling_program = jax.jit(
+    MACHINE_CODE_PRIMITIVE.bind, static_argnames=("lane_call", "result_shapes")
+)
+"""Compiled JAX program that only calls machine code."""
+
+
+@MACHINE_CODE_PRIMITIVE.def_impl
+def _call_machine_code(*call_arguments: Any, **static_arguments: Any) -> Any:
+    """Return the results of a machine code call outside of `jax.jit`."""
+    with jax.disable_jit(False):  # Only a compiled program can call machine code.
+        return _calling_program(*call_arguments, **static_arguments)
+
+
+def _raise_unsupported_transform(*_: Any, **__: Any) -> Any:
+    """Raise a NotImplementedError for a JAX transform that machine code does not support."""
+    raise NotImplementedError(
+        "Machine code can neither be mapped by `jax.vmap` nor differentiated from outside: give "
+        "all lanes at once, on the last axis, and for derivatives the function that returns them."
+    )
+
+
+mlir.register_lowering(
+    MACHINE_CODE_PRIMITIVE,
+    lambda context, *arguments, lane_call, **_: lane_call.lower(context, *arguments),
+    platform="cpu",
+)
+batching.primitive_batchers[MACHINE_CODE_PRIMITIVE] = ad.primitive_jvps[MACHINE_CODE_PRIMITIVE] = (
+    _raise_unsupported_transform
+)
+
+
+LATEST_TESTED_JAX_RELEASE = (0, 12)
+"""Latest release of JAX (major, minor) with which all tests of machine code pass."""
+
+_machine_code_failure_reasons: list[str] = []
+"""Reasons why this process uses XLA instead of machine code. The list is empty as long as machine
+code works.
+"""
+
+
+def is_tested_jax_release() -> bool:
+    """Return whether machine code has been tested with the installed release of JAX."""
+    return jax.__version_info__[:2] <= LATEST_TESTED_JAX_RELEASE
+
+
+def disable_machine_code(failure_reason: object) -> None:
+    """Disable machine code in this process, so that XLA computes instead. Issue a warning the first
+    time.
+    """
+    _machine_code_failure_reasons.append(str(failure_reason))
+    if len(_machine_code_failure_reasons) == 1:
+        latest_tested_release = ".".join(map(str, LATEST_TESTED_JAX_RELEASE))
+        warnings.warn(
+            f"machine code does not work with JAX {jax.__version__} ({failure_reason}); XLA "
+            "computes instead, which is slower. Machine code is tested up to JAX "
+            f"{latest_tested_release}.",
+            stacklevel=2,
+        )
+
 
 LANES_PER_256_BITS = {8: 4, 4: 8}
 """Number of lanes in 256 bits by the size of a number in bytes.
@@ -68,10 +187,10 @@ def is_machine_code_available() -> bool:
     if (
         not is_llvmlite_installed
         or jax.default_backend() != "cpu"
-        or fallback.is_machine_code_disabled()
+        or bool(_machine_code_failure_reasons)
     ):
         return False
-    return fallback.is_tested_jax_release() or _can_xla_call_machine_code()
+    return is_tested_jax_release() or _can_xla_call_machine_code()
 
 
 @functools.cache
@@ -89,10 +208,10 @@ def _can_xla_call_machine_code() -> bool:
         try:
             test_program_results = jax.jit(increment)(jnp.arange(3.0))
         except Exception as call_error:  # XLA and LLVM may raise any exception.
-            fallback.disable_machine_code(call_error)
+            disable_machine_code(call_error)
             return False
         if test_program_results.tolist() != [1.0, 2.0, 3.0]:
-            fallback.disable_machine_code("XLA calls it in another way")
+            disable_machine_code("XLA calls it in another way")
             return False
     return True
 
@@ -284,10 +403,3 @@ def load_saved_machine_code(code_names: Sequence[str]) -> bool:
         if machine_code is not None:
             register_machine_code(machine_code)
     return LOADED_CODE_BY_FFI_TARGET.keys() >= set(code_names)
-
-
-def count_available_cores() -> int:
-    """Return the number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

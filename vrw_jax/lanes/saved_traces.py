@@ -26,10 +26,13 @@ from jax.sharding import SingleDeviceSharding
 
 from vrw_jax.lanes import disk_cache as store
 from vrw_jax.lanes.batching import is_inside_jit
-from vrw_jax.lanes.ffi_primitive import MACHINE_CODE_PRIMITIVE
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.lanes.machine import describe_processor
-from vrw_jax.lanes.program import is_machine_code_available, load_saved_machine_code
+from vrw_jax.lanes.program import (
+    MACHINE_CODE_PRIMITIVE,
+    is_machine_code_available,
+    load_saved_machine_code,
+)
 from vrw_jax.lanes.settings import make_fusion_emitter_options
 
 

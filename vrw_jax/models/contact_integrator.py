@@ -21,14 +21,14 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS, has_guard_crossed
 from vrw_jax.flow.integrate import PhaseEnd
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
-from vrw_jax.flow.tableaus import (
+from vrw_jax.flow.solver_steps import (
     STEP_LENGTH_SAFETY_FACTOR,
+    BatchPhase,
     ButcherTableau,
     StageAccelerations,
     StageState,
     compute_real_stability_limit,
 )
-from vrw_jax.flow.tangents import BatchPhase
 from vrw_jax.models.contact_mechanics import (
     WheelMotion,
     make_opaque_one,

@@ -28,7 +28,7 @@ from vrw_jax.flow.integrate import (
     integrate_to_event,
     make_idle_state,
 )
-from vrw_jax.flow.tableaus import ButcherTableau
+from vrw_jax.flow.solver_steps import ButcherTableau
 from vrw_jax.lanes.batching import make_zeros_like_output
 from vrw_jax.models.contact_impacts import (
     ContactEventResult,

@@ -20,9 +20,14 @@ from jaxtyping import Array
 from vrw_jax import lanes
 from vrw_jax.base.elementwise import make_opaque_loop_condition
 from vrw_jax.base.options import StepOptions
-from vrw_jax.flow.integrate import divide_equally, sample_between_intervals
 from vrw_jax.flow.phase_integration import sample_phase
-from vrw_jax.flow.tableaus import ButcherTableau, StageState, load_explicit_tableau
+from vrw_jax.flow.solver_steps import (
+    ButcherTableau,
+    StageState,
+    divide_equally,
+    load_explicit_tableau,
+    sample_between_intervals,
+)
 from vrw_jax.models.contact_integrator import make_contact_phase
 from vrw_jax.models.contact_kernel import (
     BatchWalkResult,

@@ -18,8 +18,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.elementwise import run_if_any_element_active
 from vrw_jax.flow.integrate import compute_phase_end_jvp
-from vrw_jax.flow.tableaus import ButcherTableau, StageState
-from vrw_jax.flow.tangents import BatchPhase
+from vrw_jax.flow.solver_steps import BatchPhase, ButcherTableau, StageState
 from vrw_jax.models.contact_integrator import compute_stage_coordinates, make_contact_phase
 from vrw_jax.models.contact_kernel import (
     N_HEIGHT_COLUMNS,

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
-from vrw_jax.flow.tableaus import load_explicit_tableau
+from vrw_jax.flow.solver_steps import load_explicit_tableau
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
 from vrw_jax.models.contact_impacts import project_motion
 from vrw_jax.models.contact_kernel import BatchWalkSettings, run_walks

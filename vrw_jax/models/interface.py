@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 
 from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.measures import Measure
-from vrw_jax.base.options import StepOptions
-from vrw_jax.base.parameters import ParameterDomain
+from vrw_jax.base.options import ParameterDomain, StepOptions
 from vrw_jax.base.printing import format_quantity
 from vrw_jax.base.types import Elementwise
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult

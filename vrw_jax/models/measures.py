@@ -14,8 +14,8 @@ import numpy as np
 
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
+from vrw_jax.base.options import ParameterDomain
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import ParameterDomain
 from vrw_jax.wheel.params import PARAMETER_DOMAINS
 from vrw_jax.wheel.phases import PAPER_PHASES
 

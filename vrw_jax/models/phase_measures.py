@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.checks import require_known_name
 from vrw_jax.base.measures import Measure
-from vrw_jax.flow.smooth_parts import (
+from vrw_jax.flow.kinks import (
     SmoothParts,
     StepForceExtrema,
     find_extrema,

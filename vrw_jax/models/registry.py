@@ -9,8 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from vrw_jax.base.options import StepOptions
-from vrw_jax.base.parameters import list_tree_parameters
+from vrw_jax.base.options import StepOptions, list_tree_parameters
 from vrw_jax.lanes.disk_cache import find_library_version
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import LadderWheel

@@ -42,7 +42,7 @@ from vrw_jax.base.walker import (
     name_section,
     step_batch_of_walker,
 )
-from vrw_jax.flow.tableaus import compute_real_stability_limit, load_explicit_tableau
+from vrw_jax.flow.solver_steps import compute_real_stability_limit, load_explicit_tableau
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function

@@ -23,8 +23,7 @@ from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import check_parameters, is_own_walker, propose_starts
-from vrw_jax.flow.hybrid_system import HybridSystem
-from vrw_jax.flow.hybrid_trajectory import sample_walk_of_system
+from vrw_jax.flow.hybrid_system import HybridSystem, sample_walk_of_system
 from vrw_jax.models.contact_mechanics import (
     compute_foot_heights,
     compute_foot_positions,

@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_choice, check_int, check_reals, check_type
-from vrw_jax.base.options import StepOptions
-from vrw_jax.base.parameters import ParameterDomain
+from vrw_jax.base.options import ParameterDomain, StepOptions
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.models.contact_record import UnilateralStep

@@ -29,13 +29,8 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.flow.integrate import (
-    PhaseEnd,
-    divide_equally,
-    integrate_batch_phase,
-    sample_batch_phase,
-)
-from vrw_jax.flow.kinks import find_sides
+from vrw_jax.flow.integrate import PhaseEnd, integrate_batch_phase
+from vrw_jax.flow.kinks import NODE_FRACTIONS, SmoothParts, find_sides
 from vrw_jax.flow.phase_integration import (
     GuardsAndMargins,
     PhaseKinks,
@@ -44,14 +39,17 @@ from vrw_jax.flow.phase_integration import (
     integrate_phase,
     sample_phase,
 )
-from vrw_jax.flow.smooth_parts import NODE_FRACTIONS, SmoothParts
-from vrw_jax.flow.tableaus import (
+from vrw_jax.flow.solver_steps import (
+    BatchPhase,
     ButcherTableau,
+    ImplicitDynamics,
     StageAccelerations,
     StageState,
+    divide_equally,
     load_explicit_tableau,
+    sample_batch_phase,
 )
-from vrw_jax.flow.tangents import BatchPhase, ImplicitDynamics, with_batched_jvp
+from vrw_jax.lanes.autodiff import with_batched_jvp
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.phase_measures import evaluate_own_measure, measure_forces
 from vrw_jax.models.phase_sequence import (

@@ -24,9 +24,8 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.options import StepOptions
+from vrw_jax.base.options import StepOptions, list_parameters, parameter
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import list_parameters, parameter
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import is_own_walker, propose_starts
 from vrw_jax.gaits.finder_selection import resolve_finder

@@ -20,9 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.base.options import StepOptions
+from vrw_jax.base.options import StepOptions, find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.parameters import find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.progress import report_progress
 from vrw_jax.lanes.batching import replace_rows
 from vrw_jax.models.step_batch import step_batch

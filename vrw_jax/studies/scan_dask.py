@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import jax
 
 from vrw_jax import lanes
-from vrw_jax.base.start import start_jax
+from vrw_jax.base.progress import start_jax
 from vrw_jax.studies.measure_catalog import ValuesByVariable
 from vrw_jax.studies.scan_design import ParameterSamples
 from vrw_jax.studies.scan_engines import SampleEvaluator, make_scan_engine

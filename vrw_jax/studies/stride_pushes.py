@@ -24,7 +24,8 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AdvanceResult, compile_step
-from vrw_jax.flow.hybrid_system import HybridStep, HybridSystem, compile_finish
+from vrw_jax.flow.hybrid_simulation import HybridStep
+from vrw_jax.flow.hybrid_system import HybridSystem, compile_finish
 from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows

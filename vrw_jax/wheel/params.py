@@ -14,8 +14,13 @@ from jaxtyping import Array, Bool
 
 from vrw_jax.base.checks import check_int, check_reals, format_value, require_known_name
 from vrw_jax.base.elementwise import compute_sine_cosine
-from vrw_jax.base.options import StepOptions, make_real_field
-from vrw_jax.base.parameters import ModuleParameter, ParameterDomain, list_parameters
+from vrw_jax.base.options import (
+    ModuleParameter,
+    ParameterDomain,
+    StepOptions,
+    list_parameters,
+    make_real_field,
+)
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
 

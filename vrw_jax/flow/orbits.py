@@ -1,6 +1,7 @@
-"""Multipliers of a periodic orbit from the Jacobians of its segments, without their product.
+"""Return maps and multipliers of periodic orbits of hybrid systems, and errors of event times.
 
-In a product of matrices, growing directions stay accurate and decaying directions do not. If one
+Multipliers are computed from the Jacobians of an orbit's segments, without their product. In a
+product of matrices, growing directions stay accurate and decaying directions do not. If one
 multiplier is 1 and another 1e-20, the product has no correct digit of the small multiplier. An
 orthogonal iteration around the period makes every factor triangular (a periodic Schur form). Each
 multiplier is then a product of diagonal entries, all of which are accurate.
@@ -9,6 +10,7 @@ The determinant of the flow's Jacobian over modes and events, by Liouville's for
 matrices, is the product of all multipliers.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -18,15 +20,28 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_reals
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Scalar
-from vrw_jax.flow.hybrid_simulation import Guard, HybridSolution, Mode, convert_modes_to_tuple
-from vrw_jax.flow.phase_integration import VectorField, is_machine_code_better, sample_phase
-from vrw_jax.flow.tangents import forbid_reverse_mode
+from vrw_jax.flow.hybrid_simulation import (
+    Guard,
+    HybridSolution,
+    Mode,
+    Termination,
+    convert_modes_to_tuple,
+    forbid_reverse_mode,
+    simulate_hybrid,
+    simulate_modes,
+)
+from vrw_jax.flow.phase_integration import (
+    StateArray,
+    VectorField,
+    is_machine_code_better,
+    sample_phase,
+)
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
@@ -390,3 +405,136 @@ def _compute_event_determinant(
     return jnp.where(
         has_reached_end, jnp.exp(end_state[-2]) * jnp.linalg.det(saltation_matrix), jnp.nan
     )
+
+
+def time_errors(
+    modes: Sequence[Mode] | Mode,
+    start: ArrayLike | Sequence,
+    solution: HybridSolution,
+    options: StepOptions | None = None,
+) -> Float[Array, " events"]:
+    """Return estimated errors of the event times, s, shape (events,).
+
+    The simulation is repeated with tolerances that are ten and a hundred times as large. The change
+    of each event's time is divided by the `time_tolerance` of that event. Ratios below 1 are
+    replaced by 1. The estimate for an event is twice its `time_tolerance` times the largest ratio
+    for this and all earlier events. The estimate is at least the sum of the round-off of all states
+    and of the time.
+
+    Unlike `time_tolerance`, the estimate includes the accumulated errors of solver steps and of
+    earlier events. It also includes errors that the error estimate of an implicit solver omits in a
+    stiff field. The estimate is infinite from the first event that the simulation at ten times the
+    tolerance does not reach. The estimate is no proven bound.
+
+    Args:
+        modes: modes of the system, as in `simulate_hybrid`.
+        start: state at which `solution` begins, shape (dim,).
+        solution: result of `simulate_hybrid`.
+        options: options with which `solution` was computed.
+    """
+    options = StepOptions() if options is None else options
+    modes = convert_modes_to_tuple(modes)
+    start, solution = lax.stop_gradient((check_reals("start", start), solution))
+    return call_compiled_program(_estimate_time_errors, modes, start, solution, options)
+
+
+def _estimate_time_errors(
+    modes: tuple[Mode, ...], start: Array, solution: HybridSolution, options: StepOptions
+) -> Float[Array, " events"]:
+    """Return the result of `time_errors` for a tuple of modes whose guards are tuples."""
+    event_indices = jnp.arange(len(solution.times))
+
+    def compute_time_change(tolerance_factor: Array) -> Array:
+        looser_options = options.with_tightened_tolerances(tolerance_factor)
+        modes_and_max_events = (modes, len(event_indices))
+        looser_solution = simulate_modes(
+            modes_and_max_events, looser_options, start, solution.modes[0]
+        )
+        is_same_event = (looser_solution.guards == solution.guards) & (
+            looser_solution.modes == solution.modes
+        )
+        is_same_event = jnp.cumprod(is_same_event & (event_indices < looser_solution.n_events)) > 0
+        return jnp.where(is_same_event, jnp.abs(looser_solution.times - solution.times), jnp.inf)
+
+    # Each event adds the round-off of its state, and the time has its own.
+    accumulated_roundoff = jnp.cumsum(
+        jnp.where(jnp.isfinite(solution.time_roundoff), solution.time_roundoff, 0.0)
+    )
+    accumulated_roundoff = accumulated_roundoff + jnp.finfo(start.dtype).eps * jnp.abs(
+        solution.times
+    )
+    changes_at_tenfold_tolerance, changes_at_hundredfold_tolerance = lax.stop_gradient(
+        lax.map(compute_time_change, jnp.asarray([0.1, 0.01], start.dtype))
+    )
+    largest_time_change = (
+        jnp.maximum(
+            changes_at_tenfold_tolerance,
+            jnp.where(
+                jnp.isinf(changes_at_hundredfold_tolerance), 0.0, changes_at_hundredfold_tolerance
+            ),
+        )
+        / solution.time_tolerance
+    )
+    largest_time_change = lax.cummax(
+        jnp.where(jnp.isnan(largest_time_change), jnp.inf, jnp.maximum(largest_time_change, 1.0))
+    )
+    time_errors = jnp.maximum(
+        2.0 * largest_time_change * solution.time_tolerance, accumulated_roundoff
+    )
+    return jnp.where(event_indices < solution.n_events, time_errors, 0.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ReturnMap:
+    """Map from section coordinates to the section coordinates after `events` events.
+
+    The map returns NaN if the simulation ends early, so that its last state is not taken for a
+    return. `solve_fixed_point` reports the termination of the simulation in addition to the fixed
+    point.
+
+    - `modes`: modes of the system, as in `simulate_hybrid`;
+    - `embed`: function from section coordinates to the state in which the simulation begins;
+    - `project`: function from the state after the last event to its section coordinates;
+    - `events`: number of events per return;
+    - `mode`: index of the mode in which the simulation begins;
+    - `options`: options of the simulation.
+    """
+
+    modes: Sequence[Mode] | Mode
+    embed: Callable[[Float[Array, " n"]], StateArray]
+    project: Callable[[StateArray], Float[Array, " n"]]
+    events: int = 1
+    mode: int = 0
+    options: StepOptions | None = None
+
+    def simulate(self, x: Float[Array, " n"]) -> HybridSolution:
+        """Return the simulation that begins at section coordinates `x`, shape (n,)."""
+        return simulate_hybrid(
+            self.modes, self.embed(x), events=self.events, mode=self.mode, options=self.options
+        )
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the section coordinates after one return from `x`, shape (n,).
+
+        The result is NaN if the simulation ends early.
+        """
+        hybrid_solution = self.simulate(x)
+        section_coordinates = self.project(hybrid_solution.state)
+        return section_coordinates * jnp.where(
+            hybrid_solution.termination == Termination.MAX_EVENTS_REACHED, 1.0, jnp.nan
+        ).astype(section_coordinates.dtype)
+
+    def find_termination(self, x: Float[Array, " n"], period_n: int = 1) -> Int[Array, ""]:
+        """Return the `Termination` of the first of `period_n` returns from `x` that ends early.
+
+        If no return ends early, the result is the termination of the last return.
+        """
+        x = lax.stop_gradient(x)
+        termination = jnp.full((), Termination.MAX_EVENTS_REACHED, jnp.int32)
+        for _ in range(period_n):
+            solution = self.simulate(x)
+            termination = jnp.where(
+                termination == Termination.MAX_EVENTS_REACHED, solution.termination, termination
+            )
+            x = self.project(solution.state)
+        return termination

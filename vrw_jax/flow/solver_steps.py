@@ -1,4 +1,4 @@
-"""Take one explicit Runge-Kutta step for a batch, with a separate array for each coordinate.
+"""Phases of a batch, and explicit Runge-Kutta steps in them, with an array for each coordinate.
 
 The equations of motion are of second order, q'' = f(q, q'), so a solver step stores only the
 accelerations at its stages. The tableau's matrix converts these accelerations to rates, and its
@@ -20,7 +20,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base.elementwise import approximate_power, run_if_any_element_active
+from vrw_jax.base.elementwise import (
+    approximate_power,
+    run_if_any_element_active,
+    select_trees_by_condition,
+)
+from vrw_jax.base.options import StepOptions
 from vrw_jax.base.types import Vector
 
 
@@ -392,3 +397,257 @@ def _sum_weighted_terms(
         weights_and_terms.sort(key=lambda weight_and_term: abs(weight_and_term[0]))
     weighted_terms = [lax.mul(x.dtype.type(w), x) for w, x in weights_and_terms]
     return functools.reduce(lax.add, weighted_terms) if weighted_terms else None
+
+
+class ImplicitDynamics(NamedTuple):
+    """Implicit form of the equations of motion near a state."""
+
+    evaluate_residual: Callable[[StageState], Vector]
+    """Function that returns the left minus the right side of the equations of motion."""
+    solve_for_accelerations: Callable[[StageState, Vector], Vector]
+    """Function that returns accelerations for which the left side equals the second argument."""
+
+
+class BatchPhase(NamedTuple):
+    """Functions that define a phase, elementwise for all batch elements.
+
+    The function `evaluate_acceleration` returns the accelerations at a state. The guards are
+    positive inside the phase, and an event occurs when a guard falls through zero. The earliest
+    event ends the phase. If two guards are zero at the same time, the first in the list ends the
+    phase.
+    """
+
+    evaluate_acceleration: EvaluateAcceleration
+    evaluate_guards: Callable[[StageState], Array]
+    """Function that returns all guards as one array (guards, batch)."""
+    evaluate_margins: Callable[[StageState], Vector] = lambda stage_state: ()
+    """Function that returns the margins whose minima are computed."""
+    margins_include_start: tuple[bool, ...] = ()
+    """Whether each margin counts at the phase's start, see `hybrid.GuardsAndMargins`."""
+    implicit_dynamics: ImplicitDynamics = None  # type: ignore[assignment]
+    """Equations of motion in implicit form. Only derivatives need them."""
+    is_compiled_separately: bool = False
+    """Whether machine code calls the phase's functions instead of inlining them at each use.
+
+    With calls, the code compiles in half of the time and runs a sixth slower than with inlining.
+    """
+    state_units: Vector | None = None
+    """Units of the coordinates `q` and of their rates `v` for the absolute tolerance.
+
+    The default is SI units.
+    """
+    take_solver_step: SolverStepFunction | None = None
+    """Solver step of the phase; by default, a step of the tableau."""
+    take_last_step: Callable[[StageState, Array], list[StageState]] | None = None
+    """Function that returns the stages of the same solver step by shorter and slower code, for the
+    search for events."""
+    has_exact_events: bool = False
+    """Whether an event is located to round-off, and not to the tolerances."""
+    max_event_correction: Array | None = None
+    """Largest last correction of an exact event's time, as a fraction of the solver step.
+
+    The state is extrapolated linearly over the correction, with an error of its square. By default,
+    that error is round-off.
+    """
+    guards_rising_at_start: Array | None = None
+    """Whether each guard rises from its round-off at the start of the phase.
+
+    Such a guard has no minimum in the first solver step. If it grows as the cube of the time, the
+    errors of inner stages are as large as its values. By default, such guards start at zero.
+    """
+    guard_scales: Array | None = None
+    """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
+    guards_met_at_start: Array | None = None
+    """Whether each guard ends the phase at its start; by default, its value and rate decide."""
+    evaluate_kinks: Callable[[StageState], Vector] | None = None
+    """Function that returns the values of functions at whose zeros the equations have kinks."""
+    on_sides: Callable[[Vector], "BatchPhase"] = lambda sides: NotImplemented
+    """Function that returns the phase with equations that are smooth, for the signs of the values
+    of `evaluate_kinks`. Each kink adds a guard, which triggers where its sign changes.
+    """
+    sides: Vector = ()
+    """Signs for which the equations are smooth; empty without kinks."""
+    n_logged_kinks: int = 0
+    """Largest number of kinks that the end of the phase lists, see `kinks.KinkLog`."""
+
+    def make_state(self, q: Any, v: Any) -> StageState:
+        """Return the state with positions `q`, rates `v` and the accelerations there."""
+        return StageState(q, v, self.evaluate_acceleration(q, v))
+
+    def evaluate_with_rates(
+        self, evaluate_functions: Callable[[StageState], Any], state: StageState
+    ) -> tuple[Any, Any]:
+        """Return the values of `evaluate_functions` at a state, and their time derivatives."""
+        return jax.jvp(
+            lambda q, v: evaluate_functions(self.make_state(q, v)),
+            (state.q, state.v),
+            (state.v[: len(state.q)], state.acceleration.acceleration[: len(state.v)]),
+        )
+
+
+MakeBatchPhase = Callable[[Any, Vector], BatchPhase]
+"""Function that returns the `BatchPhase` for two kinds of constants.
+
+The first argument is a tree of arrays with few tangent directions. The second argument contains the
+held constants. These are arrays that are constant during the phase and have arbitrary tangents,
+such as the state at its start.
+"""
+
+
+def make_solver_step_function(
+    phase: BatchPhase, tableau: ButcherTableau, options: StepOptions
+) -> SolverStepFunction:
+    """Return a function of state and length that takes one solver step in the phase.
+
+    The function is traced once for all its calls.
+    """
+
+    def take_step(state: StageState, h: Array) -> tuple[list[StageState], Array]:
+        stage_states = take_rk_step(tableau, phase.evaluate_acceleration, state, h)
+        return stage_states, _compute_mean_squared_error(
+            tableau, stage_states, h, options, phase.state_units
+        )
+
+    return jax.jit(phase.take_solver_step or take_step)
+
+
+def _compute_mean_squared_error(
+    tableau: ButcherTableau,
+    stage_states: list[StageState],
+    step_length: Array,
+    options: StepOptions,
+    state_units: Vector | None,
+) -> Array:
+    """Return the mean square of the error of a solver step, divided by the tolerance.
+
+    The result is infinite for a solver step whose end is not finite. The mean is computed in
+    float32, because an error estimate needs no higher precision.
+
+    - `state_units`: units of the coordinates and rates for the absolute tolerance; None for SI
+      units.
+    """
+    start_state, end_state = stage_states[0], stage_states[-1]
+    start_state_components = (*start_state.q, *start_state.v)
+    convert_to_float32 = lambda x: x.astype(jnp.float32)
+    sum_of_squares: Any = 0.0
+    component_units: Any = (
+        (1.0,) * len(start_state_components) if state_units is None else state_units
+    )
+    for component_error, start_component, end_component, component_unit in zip(
+        estimate_step_error(tableau, stage_states, step_length),
+        start_state_components,
+        (*end_state.q, *end_state.v),
+        component_units,
+        strict=True,
+    ):
+        error_tolerance = options.atol * component_unit + options.rtol * jnp.maximum(
+            jnp.abs(start_component), jnp.abs(end_component)
+        )
+        relative_error = convert_to_float32(component_error) / convert_to_float32(error_tolerance)
+        sum_of_squares = sum_of_squares + relative_error * relative_error
+    return jnp.where(
+        jnp.isfinite(sum_of_squares), sum_of_squares / len(start_state_components), jnp.inf
+    )
+
+
+def sample_batch_phase(
+    phase: BatchPhase,
+    tableau: ButcherTableau,
+    q: Vector,
+    v: Vector,
+    interval_lengths: Array,
+    options: StepOptions,
+) -> Array:
+    """Return positions and rates at the start of a phase and after each interval of time.
+
+    The result has the shape (samples, 2 coordinates, batch), with the positions before the rates.
+
+    - `interval_lengths`: see `sample_between_intervals`.
+    """
+
+    take_solver_step = make_solver_step_function(phase, tableau, options)
+
+    def solver_step_function(state: StageState, step_length: Array) -> tuple[StageState, Array]:
+        stage_states, mean_squared_error = take_solver_step(state, step_length)
+        return stage_states[-1], mean_squared_error
+
+    pack_sample = lambda phase_state: jnp.stack([*phase_state.q, *phase_state.v])
+    return sample_between_intervals(
+        solver_step_function,
+        pack_sample,
+        phase.make_state(q, v),
+        tableau,
+        interval_lengths,
+        options,
+    )
+
+
+def divide_equally(duration: Array, n_samples: int) -> Array:
+    """Return the lengths of the intervals between `n_samples` equally spaced times, s."""
+    return jnp.broadcast_to(duration / (n_samples - 1), (n_samples - 1, *duration.shape))
+
+
+def sample_between_intervals(
+    solver_step_function: Callable[[Any, Array], tuple[Any, Array]],
+    pack_sample: Callable[[Any], Array],
+    start_state: Any,
+    tableau: ButcherTableau,
+    interval_lengths: Array,
+    options: StepOptions,
+) -> Array:
+    """Return samples at the start of a motion and after each interval of time.
+
+    - `solver_step_function`: function of state and step length, s, that returns the state at the
+      end of a solver step and the squared ratio of its error to the tolerance;
+    - `pack_sample`: function that returns the sample for a state. The first axis of the result
+      contains the samples;
+    - `interval_lengths`: lengths of the intervals between samples, on the first axis, s.
+    """
+    initial_count = jnp.zeros((), jnp.int32)
+
+    def take_solver_step_to_sample(loop_carry: tuple) -> tuple:
+        sample_state, previous_h, remaining_time_to_sample, n_tried_steps = loop_carry
+        h = previous_h
+        sampled_step_length = jnp.where(h < remaining_time_to_sample, h, remaining_time_to_sample)
+        step_end, mean_squared_error = solver_step_function(sample_state, sampled_step_length)
+        step_length_factor = compute_step_size_factor(
+            tableau, mean_squared_error, sampled_step_length.dtype
+        )
+        is_within_tolerance = mean_squared_error <= 1.0
+        # A step that was shortened to end at a sample does not reduce the next step's length.
+        h = jnp.where(
+            is_within_tolerance & (sampled_step_length < h),
+            jnp.maximum(h, sampled_step_length * step_length_factor),
+            sampled_step_length * step_length_factor,
+        )
+        is_running = remaining_time_to_sample > 0.0
+        return (
+            select_trees_by_condition(is_running & is_within_tolerance, step_end, sample_state),
+            lax.stop_gradient(jnp.where(is_running, h, previous_h)),
+            jnp.where(
+                is_running & is_within_tolerance,
+                jnp.where(
+                    sampled_step_length == remaining_time_to_sample,
+                    0.0,
+                    remaining_time_to_sample - sampled_step_length,
+                ),
+                remaining_time_to_sample,
+            ),
+            n_tried_steps + 1,
+        )
+
+    def integrate_to_next_sample(loop_carry: tuple, length: Array) -> tuple[tuple, Array]:
+        needs_step = lambda loop_carry: (
+            jnp.any(loop_carry[2] > 0.0) & (loop_carry[3] < options.max_solver_steps)
+        )
+        initial_loop_carry = (*loop_carry, length, initial_count)
+        sample_state, h, _, _ = lax.while_loop(
+            needs_step, take_solver_step_to_sample, initial_loop_carry
+        )
+        return (sample_state, h), pack_sample(sample_state)
+
+    initial_loop_carry = start_state, options.dt0 + jnp.zeros_like(interval_lengths[0])
+    samples_after_start = lax.scan(integrate_to_next_sample, initial_loop_carry, interval_lengths)[
+        1
+    ]
+    return jnp.concatenate([pack_sample(start_state)[None], samples_after_start])
