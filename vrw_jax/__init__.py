@@ -18,13 +18,10 @@ from vrw_jax.branches.map_branch import continue_map
 from vrw_jax.branches.special_point_curves import continue_special_point
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point
-from vrw_jax.gaits.force_peaks import force_peaks
-from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles
+from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, sensitivities
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
-from vrw_jax.gaits.margin_defaults import default_margins
-from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.options import CycleOptions, default_margins
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
-from vrw_jax.gaits.sensitivity import sensitivities
 from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel
@@ -40,7 +37,7 @@ from vrw_jax.models.step_results import (
     StepResult,
 )
 from vrw_jax.models.stepping import Walk, choose_model, paper_start, return_map, step, walk
-from vrw_jax.models.trajectory import simulate
+from vrw_jax.models.trajectory import force_peaks, simulate
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.models.walk_batch import StepBatchResult
@@ -48,8 +45,6 @@ from vrw_jax.studies.basins import BasinShare, basin, basin_share
 from vrw_jax.studies.first_passage import FirstPassage, first_passage
 from vrw_jax.studies.fit import compare_laws, fit
 from vrw_jax.studies.fit_result import FitResult
-from vrw_jax.studies.multifidelity import MultifidelityMean, multifidelity_mean
-from vrw_jax.studies.optimum_curve import ActiveSetChange, OptimumCurve
 from vrw_jax.studies.robustness import (
     GaitSensitivity,
     gait_sensitivity,
@@ -65,10 +60,14 @@ from vrw_jax.studies.stride_pushes import (
     phase_response,
     smallest_disturbance,
 )
-from vrw_jax.studies.tolerance_request import MeasureResult, measure_to_tolerance
-from vrw_jax.studies.tune_objective import WheelObjective
-from vrw_jax.studies.tune_problem import tune
-from vrw_jax.studies.tune_result import TuneResult
+from vrw_jax.studies.tolerances import (
+    MeasureResult,
+    MultifidelityMean,
+    measure_to_tolerance,
+    multifidelity_mean,
+)
+from vrw_jax.studies.tune_problem import WheelObjective
+from vrw_jax.studies.tuning import ActiveSetChange, OptimumCurve, TuneResult, tune
 from vrw_jax.wheel.laws import AlternatingLegs, SpringDamper
 from vrw_jax.wheel.parameter_sets import ParameterSet, parameter_sets
 from vrw_jax.wheel.params import WheelParams

@@ -18,7 +18,7 @@ from experiments.shared.timing import measure_cpu_seconds
 from experiments.speed import peers
 from vrw_jax import Outcome
 from vrw_jax.hybrid import GuardsAndMargins, integrate_phase
-from vrw_jax.models.viscoelastic import make_element_phase
+from vrw_jax.models.phase_sequence import make_element_phase
 from vrw_jax.wheel import (
     Motion,
     Symbols,

@@ -18,7 +18,7 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from vrw_jax.gaits import N_GAUSS_NODES, CollocationSolution
 from vrw_jax.gaits import collocation_search as search
-from vrw_jax.gaits import gait_surface as surface
+from vrw_jax.gaits import phase_sequence as surface
 from vrw_jax.lanes import apply_function_in_blocks
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters, stack_parameters
 

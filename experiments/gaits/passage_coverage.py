@@ -22,7 +22,8 @@ from experiments.shared import tables
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.failure_counts import NORMAL_QUANTILE, count_failures
 from vrw_jax.studies.first_passage import PassageStatus
-from vrw_jax.studies.sampled_passage import WalkerGroups, sample_passage
+from vrw_jax.studies.sampled_passage import sample_passage
+from vrw_jax.studies.walker_groups import WalkerGroups
 
 PAGE = tables.DOCS / "benchmarks" / "first_passage.md"
 DATA = tables.FIGURES / "passage_coverage.csv"

@@ -13,8 +13,10 @@ import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.timing import measure_cpu_seconds, use_one_core
 from vrw_jax.branches.curve_tracing import CurveTracer
-from vrw_jax.branches.special_point_curves import find_seeds_on_parallel_lines
-from vrw_jax.branches.walker_curves import DEFAULT_CURVE_OPTIONS
+from vrw_jax.branches.special_point_curves import (
+    DEFAULT_CURVE_OPTIONS,
+    find_seeds_on_parallel_lines,
+)
 
 BOX = {"damping": (4.0, 240.0), "stiffness": (350.0, 700.0)}
 

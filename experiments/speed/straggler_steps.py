@@ -9,6 +9,7 @@ The experiment prints these figures, and fits of the steps of SLS-I, of which `w
 rounded powers.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -20,7 +21,6 @@ from experiments.shared.command import make_parser, parse_and_start_jax
 from experiments.shared.tables import format_markdown
 from experiments.shared.wheels import draw_wheels_near_gaits, make_wheels
 from experiments.speed.engines_agree import draw_wheels
-from vrw_jax.flow import load_explicit_tableau
 from vrw_jax.models.step_batch import order_wheels_by_work
 from vrw_jax.models.viscoelastic import run_batch_phases
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
@@ -33,11 +33,9 @@ def count_tried_steps(
     rows: jax.Array, states: jax.Array, solver: str, options: vrw.StepOptions
 ) -> jax.Array:
     """Return the solver steps that each lane tries in each phase, shape (3, lanes)."""
-    tableau = load_explicit_tableau(solver)
-    assert tableau is not None
-    walk_result = run_batch_phases(
-        make_wheel_from_parameters(rows.T, N_LEGS), tuple(states.T), options, tableau, True, False
-    )
+    options = dataclasses.replace(options, solver=solver)
+    params = make_wheel_from_parameters(rows.T, N_LEGS)
+    walk_result = run_batch_phases(params, states.T, options, True, False)
     return jnp.stack([end.solver_steps for end in walk_result.phase_end_results])
 
 

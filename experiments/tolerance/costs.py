@@ -24,8 +24,8 @@ from experiments.shared.tables import (
     write_table,
 )
 from experiments.shared.wheels import PARAMETER_BOX
-from vrw_jax.studies.multifidelity import N_STANDARD_ERRORS
-from vrw_jax.studies.tolerance_request import MeasureStatus
+from vrw_jax.studies.refinement import MeasureStatus
+from vrw_jax.studies.tolerances import N_STANDARD_ERRORS
 
 TOL, FRICTION = 1e-3, (15.0, 100.0)
 TABLE = FIGURES / "answers_means.csv"

@@ -39,7 +39,7 @@ from vrw_jax import plot as plots
 from vrw_jax.app.config import load_config
 from vrw_jax.gaits import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.studies import tune
-from vrw_jax.studies.tune_objective import compute_slack_scales
+from vrw_jax.studies.tune_maximization import compute_slack_scales
 from vrw_jax.studies.tune_problem import TuneProblem, make_tune_problem
 from vrw_jax.wheel import make_wheel_from_parameters
 

@@ -32,11 +32,11 @@ from vrw_jax.models.contact_mechanics import (
     compute_potential_energy,
     unpack_motion,
 )
-from vrw_jax.models.contact_section import compute_full_section_size, embed_section_state
+from vrw_jax.models.contact_record import compute_full_section_size, embed_section_state
 from vrw_jax.models.contact_state import N_LOSSES, ContactState
-from vrw_jax.models.contact_step import sample_contact_interval
 from vrw_jax.models.phase_sequence import evaluate_phase_states, make_step_result
 from vrw_jax.models.rigid import RollingMotion
+from vrw_jax.models.unilateral_wheel import sample_contact_interval
 from vrw_jax.models.viscoelastic import make_batch_phase, run_batch_phases
 from vrw_jax.wheel import PARAMETER_NAMES, Symbols, WheelParams, make_wheel_from_parameters
 
@@ -127,7 +127,7 @@ def programs(n_legs: int) -> dict[str, Program]:
         """Return all outputs of the step in the order of `result_of`, and its motion by phase."""
         params, options = wheel(parameters), _options(tolerance)
         walk_result = run_batch_phases(
-            params, tuple(x), options, load_explicit_tableau(SOLVER), True, records_margins=True
+            params, x, options, stop_at_lift_off=True, records_margins=True
         )
         step = make_step_result(walk_result, friction, "lanes")
         motion = []
@@ -332,9 +332,7 @@ def _numbers_of(step: StepResult) -> Array:
 def _advance(
     params: WheelParams, x: tuple[Array, ...], options: StepOptions
 ) -> tuple[tuple, tuple]:
-    step, _ = advance_gait_step(
-        params, x, options, load_explicit_tableau(SOLVER), stop_at_lift_off=True
-    )
+    step, _ = advance_gait_step(params, x, options, stop_at_lift_off=True)
     return (*step.section_state, *step.durations), (step.outcome, step.solver_steps)
 
 

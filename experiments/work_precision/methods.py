@@ -26,7 +26,7 @@ import vrw_jax as vrw
 from experiments.shared.wheels import PARAMETER_BOX, make_wheels
 from experiments.speed import peers
 from vrw_jax.flow import load_explicit_tableau
-from vrw_jax.models.viscoelastic import make_element_phase
+from vrw_jax.models.phase_sequence import make_element_phase
 from vrw_jax.wheel import make_paper_phases, transitions
 
 VARIED_PARAMETERS = tuple(PARAMETER_BOX)

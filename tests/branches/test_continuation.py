@@ -14,9 +14,8 @@ from vrw_jax import lanes
 from vrw_jax.app._gait_figures import branch_figure
 from vrw_jax.app.config import FigureConfig
 from vrw_jax.app.reports import write_branch_report
-from vrw_jax.branches.arclength import ArclengthDriver, run_together
+from vrw_jax.branches.arclength import ArclengthDriver, MapProblem, run_together
 from vrw_jax.branches.branch_location import locate_function_roots
-from vrw_jax.branches.continuation_problems import MapProblem
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
@@ -343,11 +342,11 @@ def test_a_zero_is_located_to_its_width_even_at_a_jump():
     functions = lambda x, which: np.array([kinds[k](y) for k, y in zip(which, x, strict=True)])
     every = np.arange(3)
     ends = np.array([-0.3, -1.0, -19.0]), np.array([0.7, 1e-3, 128.4])
-    solution = locate_function_roots(functions, ends, np.full(3, 1e-12))
+    best, left_ends, right_ends = locate_function_roots(functions, ends, np.full(3, 1e-12))
     exact = np.array([0.3 ** (1 / 3), 0.777, np.log(20.0) / 5.0])
-    np.testing.assert_allclose(solution.best_locations, exact, atol=1e-12)
-    assert np.all(functions(solution.left_bracket_ends, every) <= 0.0)
-    assert not np.any(functions(solution.right_bracket_ends, every) < 0.0)
+    np.testing.assert_allclose(best, exact, atol=1e-12)
+    assert np.all(functions(left_ends, every) <= 0.0)
+    assert not np.any(functions(right_ends, every) < 0.0)
 
 
 # A model that is not ours: the simplest walking model (Garcia et al. 1998) ------------------------

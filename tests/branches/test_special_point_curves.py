@@ -20,8 +20,7 @@ from vrw_jax.branches.curve_problems import (
     AbstractCurveProblem,
     TwoParameterStep,
 )
-from vrw_jax.branches.special_point_curves import continue_special_points
-from vrw_jax.branches.walker_curves import check_curve_arguments
+from vrw_jax.branches.special_point_curves import check_curve_arguments, continue_special_points
 
 CURVE_OPTIONS = ArclengthOptions(max_points=400, max_ds=0.05)
 BATCH_SIZE = 8

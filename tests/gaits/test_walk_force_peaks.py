@@ -6,7 +6,7 @@ from reference_code import complementarity
 from reference_code.contact_force_extrema import find_step_extrema
 
 import vrw_jax as vrw
-from vrw_jax.gaits import SAMPLED_FORCE_PEAK_MEASURES
+from vrw_jax.models import SAMPLED_FORCE_PEAK_MEASURES
 
 TWO_PEAKS = vrw.WheelParams(stiffness=2500.0, damping=100.0, natural_length=1.0, slope=0.075)
 TIGHT = vrw.StepOptions.tight()

@@ -41,17 +41,18 @@ from vrw_jax.gaits.phase_sequence import CollocationSystem
 from vrw_jax.gaits.walker_finder import _find_gaits
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.models.contact_kernel import run_walks
-from vrw_jax.models.contact_section import embed_section_state
-from vrw_jax.models.contact_step import prepare_walk, sample_contact_interval
+from vrw_jax.models.contact_record import embed_section_state
 from vrw_jax.models.contact_walks import (
     _compile_section_function,
     _make_static_walk_settings,
     _run_lane_walks,
+    prepare_walk,
 )
 from vrw_jax.models.phase_sequence import make_step_result
 from vrw_jax.models.step_batch import _compile_lane_step
+from vrw_jax.models.unilateral_wheel import sample_contact_interval
 from vrw_jax.models.viscoelastic import (
-    _finish_lane_steps,
+    _finish_steps,
     _sample_lane_parts,
     _sample_lane_steps,
     take_steps_of_lanes,
@@ -374,7 +375,7 @@ WALK_SETTINGS = _make_static_walk_settings(vrw.UnilateralWheel(), vrw.StepOption
         (make_trial_linearizer, (SYSTEM, (0, 1))),
         (lanes.make_leaf_function, (jax.tree.structure(vrw.StepOptions()), True, 0.7)),
         (take_steps_of_lanes, (True, 0.7)),
-        (_finish_lane_steps, (True, 1)),
+        (_finish_steps, (True, 1, True)),
         (_sample_lane_steps, (True, 40)),
         (_sample_lane_parts, (True, 40)),
         (run_walks, WALK_SETTINGS),
@@ -462,9 +463,8 @@ def test_no_other_function_is_compiled():
         "gaits/fixed_points.py": 1,
         "gaits/force_peaks.py": 1,
         "gaits/walker_finder.py": 1,
-        "models/contact_step.py": 2,
-        "models/contact_walks.py": 2,
+        "models/contact_walks.py": 3,
         "models/step_batch.py": 1,
-        "models/unilateral_wheel.py": 1,
-        "models/viscoelastic.py": 6,
+        "models/unilateral_wheel.py": 2,
+        "models/viscoelastic.py": 3,
     }

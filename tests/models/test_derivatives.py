@@ -8,7 +8,7 @@ from support import reference_values
 
 import vrw_jax as vrw
 from vrw_jax.lanes.autodiff import enable_all_ad_modes
-from vrw_jax.models.viscoelastic import make_element_phase
+from vrw_jax.models.phase_sequence import make_element_phase
 from vrw_jax.wheel import make_paper_phases, transitions
 
 PARAMS = vrw.WheelParams()

@@ -9,6 +9,7 @@ import pytest
 from reference_code import moreau_jean
 
 import vrw_jax as vrw
+from vrw_jax.models.contact_jvp import solve_combination
 from vrw_jax.models.contact_mechanics import (
     WheelMotion,
     compute_free_acceleration,
@@ -22,7 +23,6 @@ from vrw_jax.models.contact_modes import (
     AllowedContactModes,
     ContactSignTolerances,
     choose_combination,
-    solve_combination,
 )
 from vrw_jax.wheel import ContactMode
 

@@ -15,7 +15,7 @@ from vrw_jax.models.contact_mechanics import (
     compute_kinetic_energy,
     compute_potential_energy,
 )
-from vrw_jax.models.contact_section import unpack_section_state
+from vrw_jax.models.contact_record import unpack_section_state
 from vrw_jax.models.contact_state import ContactState, make_guard_layout
 from vrw_jax.wheel import ContactMode
 

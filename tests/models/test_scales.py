@@ -5,7 +5,7 @@ import pytest
 from support.slow_variants import ENGINES, mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.models.unit_scaling import UNIT_SCALING_BY_PARAMETER_INDEX
+from vrw_jax.models.walk_batch import UNIT_SCALING_BY_PARAMETER_INDEX
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES
 
 N = 64

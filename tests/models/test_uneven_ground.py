@@ -12,7 +12,7 @@ from support.slow_variants import ENGINES
 
 import vrw_jax as vrw
 from vrw_jax.models.contact_mechanics import find_contact_slots, select_slot_friction
-from vrw_jax.models.contact_section import pack_section_state, unpack_section_state
+from vrw_jax.models.contact_record import pack_section_state, unpack_section_state
 from vrw_jax.wheel import PARAMETER_NAMES, GroundAhead
 
 START = (0.1, 1.6, -0.1)

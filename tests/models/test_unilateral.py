@@ -23,7 +23,7 @@ from vrw_jax.models.contact_mechanics import (
     compute_leg_directions,
     compute_potential_energy,
 )
-from vrw_jax.models.contact_section import unpack_section_state
+from vrw_jax.models.contact_record import unpack_section_state
 from vrw_jax.models.contact_state import (
     ContactState,
     EnergyLossAccumulators,

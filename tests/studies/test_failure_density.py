@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from vrw_jax.studies.failure_density import GaussianMixture, fit_failure_density
+from vrw_jax.studies.walker_groups import GaussianMixture, fit_failure_density
 
 DIRECTION = np.array([0.1, 0.2, 0.3, 0.6, -0.2])
 DIRECTION = DIRECTION / np.linalg.norm(DIRECTION)

@@ -11,11 +11,11 @@ import vrw_jax as vrw
 from vrw_jax.studies.first_passage import PassageStatus, differentiate_log_mean_steps
 from vrw_jax.studies.sampled_passage import (
     MIN_SAMPLING_ROUNDS,
-    WalkerGroups,
     _estimate_failure_probability,
     _estimate_kappa_2,
     sample_passage,
 )
+from vrw_jax.studies.walker_groups import WalkerGroups
 
 DEGREE = np.pi / 180.0
 BYL = vrw.WheelParams(hub_mass=1.0, leg_mass=1e-15, gravity=1.0, slope=8.0 * DEGREE)

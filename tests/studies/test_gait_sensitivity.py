@@ -8,7 +8,7 @@ from support.slow_variants import mark_slow
 from support.walkers import BALL_PARAMS, GRAVITY, JuggledBall
 
 import vrw_jax as vrw
-from vrw_jax.gaits import compute_sensitivity_norms, make_finder, slope_response
+from vrw_jax.gaits import compute_sensitivity_norms, derivatives, make_finder
 from vrw_jax.models import walk
 
 TABLE_1 = vrw.WheelParams()
@@ -38,7 +38,7 @@ def test_squares_of_the_parts_add_up_to_the_square_of_the_norm(sensitivity):
 def test_collocation_and_event_driven_steps_give_the_same_norms(sensitivity):
     finder = make_finder(None, TABLE_1.n_legs)
     x = vrw.limit_cycle(TABLE_1).section_state
-    response = slope_response.compute_step_slope_response(
+    response = derivatives.compute_step_slope_response(
         finder.model, TABLE_1, x, MEASURES, vrw.StepOptions.tight()
     )
     by_steps = compute_sensitivity_norms(response)
@@ -97,7 +97,7 @@ def test_norms_are_infinite_at_unstable_gaits_of_a_branch():
 def test_the_linear_map_is_that_of_differences_of_walks():
     # Central differences with steps of 1e-4 have errors near 1e-9 of derivatives near 1.
     cycle, h = vrw.limit_cycle(TABLE_1), 1e-4
-    response = slope_response.compute_step_slope_response(
+    response = derivatives.compute_step_slope_response(
         vrw.ViscoelasticWheel(), TABLE_1, cycle.section_state, ("period",), vrw.StepOptions.tight()
     )
     exact = np.concatenate([response.C[0], response.D1, response.D0])
@@ -216,7 +216,7 @@ def test_the_rigid_wheel_has_the_norm_of_its_closed_map():
 
 
 def test_an_unstable_gait_has_an_infinite_norm():
-    response = slope_response.SlopeResponse(
+    response = derivatives.SlopeResponse(
         jnp.diag(jnp.array([1.1, 0.2])), *jnp.ones((2, 2)), jnp.ones((1, 2)), *jnp.ones((2, 1))
     )
     assert float(compute_sensitivity_norms(response).sensitivity_norms[0]) == np.inf

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.studies.multifidelity import _estimate_mean
+from vrw_jax.studies.tolerances import _estimate_mean
 
 TABLE_1 = vrw.WheelParams(damping=150.0)
 WHEELS_NEAR_TABLE_1 = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 24))

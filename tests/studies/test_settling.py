@@ -5,12 +5,13 @@ from unittest.mock import Mock
 import numpy as np
 
 import vrw_jax as vrw
-from vrw_jax.studies.fidelity import ContactWheelBatch, StepQuantities
-from vrw_jax.studies.refinement import (
+from vrw_jax.studies.fidelity import (
     MAX_LEAPS,
     MAX_SETTLED_DRIFT,
     N_STEPS_PER_LEAP,
     N_WARMUP_STEPS,
+    ContactWheelBatch,
+    StepQuantities,
     walk_until_settled,
 )
 

@@ -26,7 +26,6 @@ from vrw_jax.studies import plan_scan, scan_store
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies import scan_execution as running
 from vrw_jax.studies import scan_planning as planning
-from vrw_jax.studies import store_integrity as soundness
 
 
 def list_files(complete_store: Path) -> dict[str, bytes]:
@@ -88,7 +87,7 @@ def test_a_running_scan_can_be_opened(tmp_path: Path, monkeypatch: pytest.Monkey
 
     def and_meanwhile(array: zarr.Array, where: object) -> object:
         result = read(array, where)
-        if array.path == soundness.CHECKSUM_ARRAY_NAME:
+        if array.path == scan_store.CHECKSUM_ARRAY_NAME:
             with monkeypatch.context() as as_before:
                 as_before.setattr(zarr.Array, "__getitem__", read)
                 with pytest.raises(KeyboardInterrupt):
@@ -208,7 +207,7 @@ def test_a_misspelled_solver_is_refused_before_a_store_is_created(tmp_path: Path
 def test_a_second_scan_on_the_same_store_is_refused(complete_store: Path) -> None:
     (complete_store / "speed" / CHUNK_FILE).unlink()
     with (
-        soundness.lock_store(complete_store),
+        scan_store.lock_store(complete_store),
         pytest.warns(UserWarning, match="damaged"),
         pytest.raises(ValueError, match="another scan is at work"),
     ):

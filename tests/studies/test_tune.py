@@ -15,14 +15,17 @@ from vrw_jax.app.reports import format_tuning_summary
 from vrw_jax.gaits import make_finder
 from vrw_jax.models import MARGIN_MEASURES
 from vrw_jax.studies import TrialKind
-from vrw_jax.studies.tune_maximization import ACTIVE_BOUND_TOLERANCE
-from vrw_jax.studies.tune_objective import (
+from vrw_jax.studies.tune_maximization import (
+    ACTIVE_BOUND_TOLERANCE,
     compute_max_violation,
     compute_slack_scales,
+)
+from vrw_jax.studies.tune_problem import (
+    TuneProblem,
+    make_tune_problem,
     parse_constraint_margins,
     restore_sign_of_bound,
 )
-from vrw_jax.studies.tune_problem import TuneProblem, make_tune_problem
 from vrw_jax.wheel import PARAMETER_NAMES
 
 PARAMETER_BOX = {

@@ -11,7 +11,7 @@ from vrw_jax.gaits import PhasePoint
 from vrw_jax.gaits import phase_sequence as sequence
 from vrw_jax.hybrid import integrate_phase
 from vrw_jax.models import viscoelastic as lane_step
-from vrw_jax.models.viscoelastic import make_element_phase
+from vrw_jax.models.phase_sequence import make_element_phase
 from vrw_jax.wheel import (
     PAPER_PHASES,
     Outcome,

@@ -26,7 +26,7 @@ from vrw_jax.app.figure_style import (
     format_axis_label,
 )
 from vrw_jax.models.measures import CONTACT_MODE_NAMES, PHASE_NAMES
-from vrw_jax.wheel.outcomes import ContactMode
+from vrw_jax.wheel.transitions import ContactMode
 
 CONTACT_MODE_COLORS = ("white", OKABE_ITO_GREEN, OKABE_ITO_AMBER, OKABE_ITO_PINK)
 """Colors of the contact modes, by contact code."""

@@ -38,6 +38,7 @@ from vrw_jax.app.figure_style import (
     find_width_inches,
     format_axis_label,
     format_value_label,
+    label_lowest_panels,
     make_bar_panels,
     make_outcome_patches,
     make_panel_grid,
@@ -50,8 +51,8 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import Branch, SpecialPoint
 from vrw_jax.models.measures import MEASURES, describe_violation
 from vrw_jax.studies.tune_maximization import ACTIVE_BOUND_TOLERANCE, TrialKind
-from vrw_jax.studies.tune_objective import UPPER_BOUND_PREFIX, restore_sign_of_bound
-from vrw_jax.studies.tune_result import TuneResult
+from vrw_jax.studies.tune_problem import UPPER_BOUND_PREFIX, restore_sign_of_bound
+from vrw_jax.studies.tuning import TuneResult
 from vrw_jax.wheel.params import check_parameter_name
 
 BRANCH_END_COLOR = OKABE_ITO_PINK
@@ -134,109 +135,105 @@ def branch_figure(branch: Branch, *, width: FigureWidth = None) -> Figure:
         raise ValueError(
             f"the branch has no point to draw: {branch.ending} Start it at a gait or fixed point."
         )
-    parameter_values, branch_dataset = branch.values, branch.dataset
+    dataset, is_map = branch.dataset, "x" in branch.dataset
     special_points = sorted(branch.special_points, key=lambda special_point: special_point.value)
-    has_dls_indicators = "lambda_2_plus" in branch_dataset
-    drawn_panels: tuple[tuple[str, dict[str, str]], ...] = (
-        PAPER_BRANCH_PANELS if has_dls_indicators else OTHER_MODEL_BRANCH_PANELS
-    )
-    if "x" in branch_dataset:  # fixed points of a map
-        components = {
-            _label_component(values, number): values
-            for number, values in enumerate(branch_dataset.x.transpose("component", "point"), 1)
-        }
-        has_names = "component" in branch_dataset.coords
-        branch_dataset = branch_dataset.drop_vars("component_unit", errors="ignore").assign(
-            {label: ("point", values.values) for label, values in components.items()}
-        )
-        component_colors = dict(zip(components, itertools.cycle(COMPONENT_COLORS), strict=False))
-        further_names = [
-            str(name)
-            for name in branch.dataset.data_vars
-            if branch.dataset[name].dims == ("point",) and name not in STABILITY_MEASURES
-        ]
-        drawn_panels = (
-            (
-                next(iter(components))
-                if len(components) == 1
-                else "section coordinates"
-                if has_names
-                else "fixed point",
-                component_colors,
-            ),
-            MULTIPLIER_PANEL,
-            *(
-                (format_axis_label(name, "{symbol}", branch_dataset), {name: "black"})
-                for name in further_names[:MAX_FURTHER_BRANCH_PANELS]
-            ),
-        )
-    legend_height = 0.32 + 0.16 * -(-len(special_points) // 2)
-    figure, panel_axes = make_panel_grid(
-        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
-        len(drawn_panels),
-        1.84,
-        legend_height,
-        2,
-        sharex=True,
-    )
-    stability_changes = (np.flatnonzero(np.diff(branch.stable.astype(int))) + 1).tolist()
-    # A piece of equal stability ends at the point where the next piece starts.
-    pieces_of_equal_stability = [
-        slice(piece_start, next_start + 1)
-        for piece_start, next_start in zip(
-            [0, *stability_changes], [*stability_changes, branch.values.size], strict=True
-        )
-    ]
-    for axes, (panel_label, panel_measure_names), panel_letter in zip(
-        panel_axes, drawn_panels, "abcdefgh", strict=False
-    ):
-        draw_panel_letter(axes, panel_letter)
-        for measure_name, line_color in panel_measure_names.items():
-            plotted_values = branch_dataset[measure_name].values
-            if measure_name == "clearance_sls1":
-                # The clearance is in mm. The line has a gap where the clearance jumps because a
-                # local minimum vanishes.
-                plotted_values = 1e3 * plotted_values
-                plotted_values[1:][plotted_values[:-1] * plotted_values[1:] < 0.0] = np.nan
-            if measure_name == "spectral_radius":
-                plotted_values = np.abs(branch.multipliers)
-            for piece in pieces_of_equal_stability:
-                axes.plot(
-                    parameter_values[piece],
-                    plotted_values[piece],
-                    "-" if branch.stable[piece.start] else "--",
-                    color=line_color,
-                )
-        _draw_special_points(axes, special_points, draws_numbers=panel_letter in "ab")
-        axes.set_ylabel(panel_label)
-    panel_axes[1].axhline(1.0, color=DARK_GRAY_COLOR, linewidth=0.5)
-    panel_axes[1].set_ylim(0.0, None)
-    if "x" in branch_dataset:
-        _limit_multiplier_axis(panel_axes[1], float(np.nanmax(np.abs(branch.multipliers))))
-        for axes, name in zip(panel_axes[2:], further_names, strict=False):
-            if np.ptp(np.sign(branch_dataset[name].values)) > 1.0:  # margins, for example
-                axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.5)
+    has_dls_indicators = "lambda_2_plus" in dataset
+    panels: tuple[BranchPanel, ...] = OTHER_MODEL_BRANCH_PANELS
     if has_dls_indicators:
-        force_axes, clearance_axes = panel_axes[2:]
-        for axes in panel_axes[2:]:
-            axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.5)
-        for measure_name, line_color in PAPER_BRANCH_PANELS[2][1].items():
-            force_axes.plot([], [], color=line_color, label=f"${MEASURES[measure_name].mathtext}$")
+        panels = PAPER_BRANCH_PANELS
+    elif is_map:
+        dataset, panels = _describe_map_panels(branch)
+    legend_height = 0.32 + 0.16 * -(-len(special_points) // 2)
+    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
+    figure, panel_axes = make_panel_grid(
+        width_inches, len(panels), 1.84, legend_height, 2, sharex=True
+    )
+    for axes, panel, letter in zip(panel_axes, panels, "abcdefgh", strict=False):
+        draw_panel_letter(axes, letter)
+        _draw_branch_panel(axes, panel, branch, dataset)
+        _draw_special_points(axes, special_points, draws_numbers=letter in "ab")
+    draw_line = lambda axes, y: axes.axhline(y, color=DARK_GRAY_COLOR, linewidth=0.5)
+    first_axes, multiplier_axes, *other_axes = panel_axes
+    draw_line(multiplier_axes, 1.0)
+    multiplier_axes.set_ylim(0.0, None)
+    if is_map:
+        _limit_multiplier_axis(multiplier_axes, float(np.nanmax(np.abs(branch.multipliers))))
+        for axes, (_, colors) in zip(other_axes, panels[2:], strict=False):
+            if np.ptp(np.sign(dataset[next(iter(colors))].values)) > 1.0:  # margins, for example
+                draw_line(axes, 0.0)
+        component_colors = panels[0][1]
+        if 1 < len(component_colors) <= len(COMPONENT_COLORS):
+            for name, color in component_colors.items():
+                first_axes.plot([], [], color=color, label=name)
+            first_axes.legend()
+    if has_dls_indicators:
+        force_axes, clearance_axes = other_axes
+        for axes in other_axes:
+            draw_line(axes, 0.0)
+        for name, color in PAPER_BRANCH_PANELS[2][1].items():
+            force_axes.plot([], [], color=color, label=f"${MEASURES[name].mathtext}$")
         force_axes.legend(loc="center left")
-        clearance_mm = 1e3 * branch_dataset.clearance_sls1.values
+        clearance_mm = 1e3 * dataset.clearance_sls1.values
         clearance_axes.set_yscale("symlog", linthresh=0.1)
         clearance_axes.set_ylim(
             2.0 * min(clearance_mm.min(), -0.1), 2.0 * max(clearance_mm.max(), 0.1)
         )
-    if "x" in branch_dataset and 1 < len(component_colors) <= len(COMPONENT_COLORS):
-        for component_name, line_color in component_colors.items():
-            panel_axes[0].plot([], [], color=line_color, label=component_name)
-        panel_axes[0].legend()
-    for axes in panel_axes[-panel_axes[0].get_gridspec().ncols :]:
-        axes.tick_params(labelbottom=True)
-        axes.set_xlabel(format_axis_label(branch.parameter, dataset=branch_dataset))
+    label_lowest_panels(panel_axes, format_axis_label(branch.parameter, dataset=dataset))
     _add_branch_legend(figure, special_points, branch)
     return figure
+
+
+BranchPanel = tuple[str, dict[str, str]]
+"""Label of a panel of a branch figure, and the color of each measure in the panel."""
+
+
+def _describe_map_panels(branch: Branch) -> tuple[xr.Dataset, tuple[BranchPanel, ...]]:
+    """Return the panels of a branch of fixed points, and its dataset with the labels of their
+    components as names.
+    """
+    dataset = branch.dataset
+    further_names = [
+        str(name)
+        for name in dataset.data_vars
+        if dataset[name].dims == ("point",) and name not in STABILITY_MEASURES
+    ]
+    components = {
+        _label_component(values, number): ("point", values.values)
+        for number, values in enumerate(dataset.x.transpose("component", "point"), 1)
+    }
+    label = "section coordinates" if "component" in dataset.coords else "fixed point"
+    if len(components) == 1:
+        (label,) = components
+    dataset = dataset.drop_vars("component_unit", errors="ignore").assign(components)
+    return dataset, (
+        (label, dict(zip(components, itertools.cycle(COMPONENT_COLORS), strict=False))),
+        MULTIPLIER_PANEL,
+        *(
+            (format_axis_label(name, "{symbol}", dataset), {name: "black"})
+            for name in further_names[:MAX_FURTHER_BRANCH_PANELS]
+        ),
+    )
+
+
+def _draw_branch_panel(axes: Axes, panel: BranchPanel, branch: Branch, dataset: xr.Dataset) -> None:
+    """Draw curves that are solid where gaits are stable, and dashed where they are unstable."""
+    label, color_by_name = panel
+    changes = (np.flatnonzero(np.diff(branch.stable.astype(int))) + 1).tolist()
+    for name, color in color_by_name.items():
+        values = dataset[name].values
+        if name == "clearance_sls1":
+            # The clearance is in mm. The line has a gap where the clearance jumps because a local
+            # minimum vanishes.
+            values = 1e3 * values
+            values[1:][values[:-1] * values[1:] < 0.0] = np.nan
+        if name == "spectral_radius":
+            values = np.abs(branch.multipliers)
+        # A piece of equal stability ends at the point where the next piece starts.
+        for start, next_start in itertools.pairwise([0, *changes, branch.values.size]):
+            piece = slice(start, next_start + 1)
+            style = "-" if branch.stable[start] else "--"
+            axes.plot(branch.values[piece], values[piece], style, color=color)
+    axes.set_ylabel(label)
 
 
 def _limit_multiplier_axis(axes: Axes, largest_modulus: float) -> None:
@@ -658,13 +655,8 @@ def tornado_figure(
             check_parameter_name(parameter_name, known_parameter_names, "parameter of this table")
         if not spreads:
             raise ValueError('spreads is empty, but bars need one: give {"damping": 10.0}, say.')
-        parameter_changes = [
-            check_positive(f"spreads[{parameter_name!r}]", parameter_change)
-            for parameter_name, parameter_change in spreads.items()
-        ]
-        measure_changes = table.derivative.sel(parameter=list(spreads)) * np.array(
-            parameter_changes
-        )
+        changes = [check_positive(f"spreads[{name!r}]", x) for name, x in spreads.items()]
+        measure_changes = table.derivative.sel(parameter=list(spreads)) * np.array(changes)
     panel_height = PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8
     width_fraction = 0.6 if len(measure_names) == 1 else 1.0
     width_inches = find_width_inches(width, width_fraction * PAGE_FIGURE_WIDTH_INCHES)

@@ -35,6 +35,7 @@ from vrw_jax.app.figure_style import (
     find_width_inches,
     format_axis_label,
     format_value_label,
+    label_lowest_panels,
     make_bar_panels,
     make_outcome_patches,
     make_panel_grid,
@@ -47,8 +48,12 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.models.measures import LAW_PREFIXES, MARGIN_MEASURES, describe_violation
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
-from vrw_jax.studies.scan_design import SALTELLI_DESIGN_KIND, SWEEPABLE_PARAMETERS, sobol_indices
-from vrw_jax.studies.store_integrity import read_scan_manifest
+from vrw_jax.studies.scan_design import (
+    SALTELLI_DESIGN_KIND,
+    SWEEPABLE_PARAMETERS,
+    read_scan_manifest,
+    sobol_indices,
+)
 
 PARAMETER_AXIS_ORDER = dict.fromkeys(
     ("damping", "slope", "stiffness", "natural_length", *SWEEPABLE_PARAMETERS)
@@ -476,9 +481,7 @@ def draw_sobol_indices(indices: xr.Dataset, scan: xr.Dataset, width: FigureWidth
         )
         axes.set_xlim(0.0, 1.05)
     panel_axes[0].invert_yaxis()
-    for axes in panel_axes[-panel_axes[0].get_gridspec().ncols :]:
-        axes.set_xlabel("share of the variance")
-        axes.tick_params(labelbottom=True)
+    label_lowest_panels(panel_axes, "share of the variance")
     add_figure_legend(figure, panel_axes[0].get_legend_handles_labels()[0], 2)
     omitted_samples_percent = 100.0 * indices.attrs["left_out"]
     omitted_rows_note = (
@@ -666,56 +669,42 @@ def map_figure(
         "scan", scan, ("outcome", measure), "give vrw.scan of two parameters and the measure"
     )
     scan = _take_least_over_legs(scan)
-    x, y = (
-        curves[0].parameters
-        if curves
-        else _list_swept_parameters(scan, scan.dims, SWEEPABLE_PARAMETERS)
-    )
+    names = _list_swept_parameters(scan, scan.dims, SWEEPABLE_PARAMETERS)
+    x, y = curves[0].parameters if curves else names
     width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
     figure = StyledFigure(figsize=(width_inches, 0.62 * width_inches))
     axes = figure.subplots()
     axes.set_facecolor(LIGHT_GRAY_COLOR)
-    measure_values = scan[measure].where(scan.outcome == 0).transpose(y, x).values
-    measure_image = axes.pcolormesh(
-        scan[x].values,
-        scan[y].values,
-        measure_values,
-        shading="nearest",
-        cmap="cividis",
-        rasterized=True,
+    values = scan[measure].where(scan.outcome == 0).transpose(y, x).values
+    image_settings: dict[str, Any] = {"cmap": "cividis", "rasterized": True}
+    image = axes.pcolormesh(
+        scan[x].values, scan[y].values, values, shading="nearest", **image_settings
     )
-    figure.colorbar(measure_image, ax=axes, aspect=30, pad=0.01).set_label(
+    figure.colorbar(image, ax=axes, aspect=30, pad=0.01).set_label(
         format_axis_label(measure, dataset=scan)
     )
-    labeled_special_points = set()
-    for special_point_curve in curves:
-        curve_color, line_style = select_special_point_style(special_point_curve.name)
-        is_stable = special_point_curve.dataset.spectral_radius.values < 1.0
-        for is_point_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
+    labeled = set()
+    for curve in curves:
+        color, line_style = select_special_point_style(curve.name)
+        is_stable = curve.dataset.spectral_radius.values < 1.0
+        for is_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
             # Each piece includes the first point of the next piece. The curve has one legend entry.
-            is_point_or_next_drawn = is_point_drawn | np.append(False, is_point_drawn[:-1])
-            curve_points = np.where(
-                is_point_or_next_drawn[:, None], special_point_curve.values, np.nan
-            )
-            legend_text = None
-            if is_point_drawn.any() and special_point_curve.name not in labeled_special_points:
-                labeled_special_points.add(special_point_curve.name)
-                legend_text = typeset_greek_symbols(describe_violation(special_point_curve.name))
+            is_drawn_or_next = is_drawn | np.append(False, is_drawn[:-1])
+            points = np.where(is_drawn_or_next[:, None], curve.values, np.nan)
+            label = None
+            if is_drawn.any() and curve.name not in labeled:
+                labeled.add(curve.name)
+                label = typeset_greek_symbols(describe_violation(curve.name))
             axes.plot(
-                *curve_points.T,
-                color=curve_color,
+                *points.T,
+                color=color,
                 linestyle=line_style,
                 linewidth=line_width,
-                label=legend_text,
+                label=label,
                 path_effects=[Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()],
             )
-    codim2_points = [
-        codim2_point.values
-        for special_point_curve in curves
-        for codim2_point in special_point_curve.codim2_points
-    ]
     axes.plot(
-        *np.reshape(codim2_points, (-1, 2)).T,
+        *np.reshape([point.values for curve in curves for point in curve.codim2_points], (-1, 2)).T,
         "o",
         color="black",
         markersize=2.5,

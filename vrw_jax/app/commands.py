@@ -42,16 +42,15 @@ from vrw_jax.base.progress import PROGRESS_VARIABLE, start_jax
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.continuation import continue_branch
 from vrw_jax.branches.special_point_curves import SPECIAL_POINT_MEASURES
-from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.gait_search import limit_cycle, resolve_model_with_reason
+from vrw_jax.gaits.gait_search import limit_cycle, make_finder, resolve_model_with_reason
 from vrw_jax.lanes.disk_cache import find_library_version
+from vrw_jax.models.ladder import list_model_config_names
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES
-from vrw_jax.models.registry import list_model_config_names
 from vrw_jax.models.stepping import step
 from vrw_jax.studies.first_passage import first_passage
 from vrw_jax.studies.robustness import gait_sensitivity
 from vrw_jax.studies.scan_execution import follow_special_points, forecast_scan, require_map_grid
-from vrw_jax.studies.tune_problem import tune
+from vrw_jax.studies.tuning import tune
 from vrw_jax.wheel.params import WheelParams
 
 MAX_OPTION_INTEGER = 10**9

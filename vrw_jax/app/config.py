@@ -36,7 +36,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.registry import MODEL_CLASSES, list_model_config_names
+from vrw_jax.models.ladder import MODEL_CLASSES, list_model_config_names
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies.measure_catalog import check_measure_names, select_measure_catalog
 from vrw_jax.studies.scan_design import MAX_LISTED_SAMPLES
@@ -126,8 +126,7 @@ Whole = Annotated[int, *_limit(1)]
 Range = Annotated[tuple[Finite, Finite], _must_be("a range of two numbers: write [lower, upper]")]
 Values = Annotated[tuple[Finite, ...], _must_be("a list of numbers")]
 AxisValues = Annotated[
-    tuple[Finite, ...],
-    _must_be("a list of numbers or { from = ..., to = ..., count = ... }"),
+    tuple[Finite, ...], _must_be("a list of numbers or { from = ..., to = ..., count = ... }")
 ]
 Measures = Annotated[tuple[str, ...], _must_be('a list of names: write ["dls_fraction", "speed"]')]
 MeshIntervals = Annotated[
@@ -292,11 +291,7 @@ class FigureConfig:
         _must_be('a list of "svg", "png" and "pdf"'),
     ] = ("svg", "png")
     file: (
-        Annotated[
-            Path,
-            AfterValidator(_check_figure_file),
-            _must_be('a path, such as "fig3.pdf"'),
-        ]
+        Annotated[Path, AfterValidator(_check_figure_file), _must_be('a path, such as "fig3.pdf"')]
         | None
     ) = None
 
@@ -634,10 +629,7 @@ def _read_axis(name: str, axis: Any) -> Any:
 
 
 def _require_known_keys(
-    config_table: ConfigTable,
-    allowed_keys: Iterable[str],
-    table_location: str,
-    key_kind: str,
+    config_table: ConfigTable, allowed_keys: Iterable[str], table_location: str, key_kind: str
 ) -> None:
     """Raise a ValueError for an unknown key, with a similar name or the name for a symbol."""
     allowed_keys = tuple(allowed_keys)

@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 import numpy as np
 
 from vrw_jax.base.checks import check_choice, check_int, check_type, require_untraced_arguments
-from vrw_jax.models.registry import list_model_config_names
+from vrw_jax.models.ladder import list_model_config_names
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_DOMAINS,

@@ -453,6 +453,13 @@ def make_bar_panels(
     return figure, panel_axes
 
 
+def label_lowest_panels(panel_axes: np.ndarray, label: str) -> None:
+    """Label the horizontal axes of the last rows of a grid of panels that share these axes."""
+    for axes in panel_axes[-panel_axes[0].get_gridspec().ncols :]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel(label)
+
+
 def add_wrapped_legend(
     owner: Figure | Axes, max_n_columns: int, max_width_inches: float, **legend_settings: Any
 ) -> float:

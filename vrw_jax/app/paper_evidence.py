@@ -26,6 +26,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.models.ladder import collect_provenance_attributes
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     PHASE_NAMES,
@@ -34,7 +35,6 @@ from vrw_jax.models.measures import (
     make_locked_leg_coordinate,
     make_measure_attributes,
 )
-from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.step_results import SectionState
 from vrw_jax.models.stepping import step, walk
 from vrw_jax.models.viscoelastic import ViscoelasticWheel

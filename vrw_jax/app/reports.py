@@ -19,7 +19,7 @@ from vrw_jax.branches.branch import Branch
 from vrw_jax.models.measures import MEASURES, describe_violation, get_measure
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
 from vrw_jax.studies.scan_execution import SpecialPointMap
-from vrw_jax.studies.tune_result import TuneResult
+from vrw_jax.studies.tuning import TuneResult
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, PARAMETER_NAMES
 
 
@@ -76,10 +76,7 @@ def write_tuning_report(
         folder,
         "path.zarr",
         tune_result.path,
-        {
-            "wheel.toml": "\n".join(toml_lines),
-            "tuning.md": format_tuning_summary(tune_result),
-        },
+        {"wheel.toml": "\n".join(toml_lines), "tuning.md": format_tuning_summary(tune_result)},
     )
     if draws_figure:
         figure = plot.tuning_figure(tune_result, width=config.figures.width)

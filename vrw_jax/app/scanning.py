@@ -22,7 +22,7 @@ from vrw_jax.studies.scan_execution import (
     run_scan,
 )
 from vrw_jax.studies.scan_planning import ScanPlan, plan_scan
-from vrw_jax.studies.store_integrity import compute_store_digest, read_metadata_file
+from vrw_jax.studies.scan_store import compute_store_digest, read_metadata_file
 
 FIGURE_RECORD_NAME = "figures.json"
 """Name of the file that states from which results and with which code figures were drawn."""

@@ -8,20 +8,25 @@ length is measured in the section state and in the parameter as a fraction of it
 
 import abc
 import dataclasses
+import functools
 from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_positive
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
 from vrw_jax.branches.branch import BIFURCATIONS, TestFunction, is_multiplier_change_explained
 from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE
-from vrw_jax.lanes.batching import select_tree_rows
+from vrw_jax.lanes.autodiff import evaluate_with_jacobian
+from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 
 Unknowns = Float[np.ndarray, " unknowns"]
 
@@ -222,6 +227,103 @@ class ContinuationPoint(NamedTuple):
         return self._replace(
             arclength_tangent=-self.arclength_tangent, fraction_rate=-self.fraction_rate
         )
+
+
+POINT_BATCH_SIZES = (batch_sizes.LOCATION_BATCH_SIZES[-1],)
+"""Number of points that one call of an XLA program computes, one size so that it compiles once."""
+
+
+@eqx.filter_jit
+def _linearize_map(
+    function: Callable, units: tuple[float, ...], args: Any, z: Array, p: Array
+) -> NewtonStep:
+    """Return the Newton steps of fixed points of a map at many points, see `MapProblem`."""
+    n_continuous = len(units)
+    scale = jnp.asarray([*units, *[1.0] * (z.shape[1] - n_continuous)])
+
+    def linearize(args: Any, z: Array, p: Array) -> NewtonStep:
+        codes = z[n_continuous:]
+        evaluate = lambda x, p: function(args, jnp.concatenate([x, codes]) * scale, p) / scale
+        image, jacobians = evaluate_with_jacobian(evaluate, z[:n_continuous], p)
+        by_z, by_p = (jacobian[:n_continuous] for jacobian in jacobians)
+        defect = image - z
+        right_sides = jnp.column_stack([defect[:n_continuous], by_p])
+        solutions = jnp.linalg.solve(jnp.eye(n_continuous) - by_z, right_sides).T
+        tangents = jnp.pad(solutions[1:], ((0, 0), (0, len(codes))))
+        return NewtonStep(
+            jnp.concatenate([solutions[0], defect[n_continuous:]]),
+            tangents if p.ndim else tangents[0],
+            by_z,
+        )
+
+    return jax.vmap(linearize)(args, z, p)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class AbstractStateProblem(AbstractContinuationProblem):
+    """Base class of problems whose unknowns are section states in units, fixed points of a map.
+
+    Components without a unit are discrete codes, which Newton's method copies from the image under
+    the map. It converges only if state and image have equal codes.
+    """
+
+    units: tuple[float, ...]
+
+    @property
+    def section_units(self) -> np.ndarray:
+        return np.array(self.units)
+
+    @property
+    @abc.abstractmethod
+    def function(self) -> Callable[[Any, Array, Array], Array]:
+        """Return the map x -> `function(args, x, p)`, which is NaN where it is undefined.
+
+        If p is a vector, there is a tangent for each entry.
+        """
+
+    def linearize(self, args: Any, z: np.ndarray, p: np.ndarray) -> NewtonStep:
+        linearize = functools.partial(_linearize_map, self.function, self.units)
+        return map_in_numpy_batches(linearize, POINT_BATCH_SIZES, args, z, p)
+
+    def section_state(self, z: np.ndarray) -> np.ndarray:
+        return z[..., : len(self.units)]
+
+    def interpolate(self, left: np.ndarray, right: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+        """Interpolate the coordinates; the discrete codes are those of the nearer state."""
+        nearer = np.where(fraction[:, None] < 0.5, left, right)
+        between, n = super().interpolate(left, right, fraction), len(self.units)
+        return np.concatenate([between[:, :n], nearer[:, n:]], 1)
+
+    def is_smooth_between(self, left: np.ndarray, right: np.ndarray) -> bool:
+        return bool(np.all(left[len(self.units) :] == right[len(self.units) :]))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapProblem(AbstractStateProblem):
+    """Continuation problem for the fixed points of any map, which JAX differentiates."""
+
+    iterated_map: Callable[[Any, Array, Array], Array]
+    period_n: int = 1  # number of iterates
+
+    may_start_singular: ClassVar[bool] = True
+
+    @property
+    def function(self) -> Callable[[Any, Array, Array], Array]:
+        if self.period_n == 1:
+            return self.iterated_map
+
+        def iterate(args: Any, x: Array, p: Array) -> Array:
+            for _ in range(self.period_n):
+                x = self.iterated_map(args, x, p)
+            return x
+
+        return iterate
+
+    def measure(self, args: Any, points: ContinuationPoint) -> QuantitiesByName:
+        return {"x": self.section_units * points.z}
+
+    def label(self, quantities: QuantitiesByName) -> tuple[dict, dict]:
+        return {"x": (("point", "component"), quantities["x"])}, {}
 
 
 class Track(NamedTuple):
@@ -444,6 +546,18 @@ class ArclengthDriver:
         offset = offset - position * chord
         return bool(0.0 <= position <= 1.0 and offset @ offset < 0.01 * (chord @ chord))
 
+    def find_end_status(
+        self, points: list[ContinuationPoint], is_at_end: bool
+    ) -> ContinuationStatus | None:
+        """Return why a branch ends at its last point, or None if it continues."""
+        has_ended = {
+            ContinuationStatus.CURVE_CLOSED: len(points) > 3 and self.is_closed_by(points),
+            ContinuationStatus.POINT_NOT_ADMISSIBLE: not points[-1].is_admissible,
+            ContinuationStatus.RANGE_END_REACHED: is_at_end,
+            ContinuationStatus.MAX_POINTS_REACHED: len(points) >= self.options.max_points,
+        }
+        return next(filter(has_ended.get, has_ended), None)
+
     def trace(self, args: Any, z: Unknowns, p: float, direction_sign: float) -> PointRequests:
         """Continue a branch from the point near (z, p), and return its `Track`.
 
@@ -458,34 +572,25 @@ class ArclengthDriver:
             z, fraction, (self.coordinates(z, fraction), along_parameter)
         )
         if self.problem.may_start_vertical and not correction.has_converged:
-            along_unknown = np.eye(len(along_parameter))[0]
-            start_plane = self.coordinates(z, fraction), along_unknown
+            start_plane = self.coordinates(z, fraction), np.eye(len(along_parameter))[0]
             correction = yield from self.correct(z, fraction, start_plane, options.initial_ds)
             fraction = correction.fraction
         if not correction.has_converged:
             return Track([], ContinuationStatus.START_NOT_FOUND)
         points = [self.make_point(args, correction, direction_sign * along_parameter, fraction)]
-        previous, ds, is_range_end, is_kink = points[0], options.initial_ds, False, False
+        previous, ds, is_range_end, takes_other_plane = points[0], options.initial_ds, False, False
         # A suspicious step may have reached another branch; shorter steps then avoid the jump. If
         # they do not, the next step is accepted with any multipliers.
         suspicious_ds, accepts_any_multipliers, is_point_new = 0.0, False, True
-        takes_other_plane = False
         while True:
             trial_z, trial_fraction, plane, length_to_end, is_next_range_end = self.predict(
                 previous, points[-1], ds, takes_other_plane
             )
-            if is_point_new:
-                has_ended = {
-                    ContinuationStatus.CURVE_CLOSED: len(points) > 3 and self.is_closed_by(points),
-                    ContinuationStatus.POINT_NOT_ADMISSIBLE: not points[-1].is_admissible,
-                    ContinuationStatus.RANGE_END_REACHED: is_range_end
-                    or length_to_end <= MAX_RANGE_EXCESS,
-                    ContinuationStatus.MAX_POINTS_REACHED: len(points) >= options.max_points,
-                }
-                for status in filter(has_ended.get, has_ended):
-                    if status == ContinuationStatus.CURVE_CLOSED:
-                        points[-1] = points[0]
-                    return Track(points, status)
+            is_at_end = is_range_end or bool(length_to_end <= MAX_RANGE_EXCESS)
+            if is_point_new and (status := self.find_end_status(points, is_at_end)) is not None:
+                if status == ContinuationStatus.CURVE_CLOSED:
+                    points[-1] = points[0]
+                return Track(points, status)
             if ds < options.min_ds:
                 return Track(points, ContinuationStatus.STEP_SIZE_UNDERFLOW)
             is_range_end = is_next_range_end
@@ -493,9 +598,8 @@ class ArclengthDriver:
             current = points[-1]
             tangent = self.coordinates(current.arclength_tangent, current.fraction_rate)
             new_tangent = self.coordinates(correction.fraction_tangent, 1.0)
-            is_kink = abs(tangent @ new_tangent) < np.cos(options.max_turn_angle) * np.linalg.norm(
-                new_tangent
-            )
+            min_projection = np.cos(options.max_turn_angle) * np.linalg.norm(new_tangent)
+            is_kink = abs(tangent @ new_tangent) < min_projection
             is_within = abs(correction.fraction - 0.5) <= 0.5 + MAX_RANGE_EXCESS
             is_short = ds < options.kink_step_factor * options.min_ds
             # A branch that turns back at the end of the range only touches the plane there. A step
@@ -535,9 +639,8 @@ class ArclengthDriver:
                 ds *= 0.5
             if is_suspicious and suspicious_ds == 0.0:
                 suspicious_ds = trial_ds
-            has_no_shorter_step = (
-                suspicious_ds > 0.0 and not accepts_any_multipliers and ds < options.min_ds
-            )
+            has_no_shorter_step = not accepts_any_multipliers and ds < options.min_ds
+            has_no_shorter_step = has_no_shorter_step and suspicious_ds > 0.0
             if has_no_shorter_step:
                 ds = suspicious_ds
             if is_point_new and (accepts_any_multipliers or ds >= suspicious_ds):

@@ -81,22 +81,11 @@ class Root(NamedTuple):
         return not beside > MAX_VALUE_BESIDE_ROOT * at_ends
 
 
-class RootLocations(NamedTuple):
-    """Locations of roots in [0, 1], and the ends of the brackets that enclose them.
-
-    Each array has the shape (brackets,).
-    """
-
-    best_locations: np.ndarray  # bracket end with the smaller absolute value
-    left_bracket_ends: np.ndarray  # bracket end with the sign of location 0
-    right_bracket_ends: np.ndarray  # bracket end with the sign of location 1
-
-
 def locate_function_roots(
     function: Callable[[np.ndarray, np.ndarray], np.ndarray],
     bracket_end_values: tuple[np.ndarray, np.ndarray],
     max_bracket_width: np.ndarray,
-) -> RootLocations:
+) -> np.ndarray:
     """Locate the roots of functions that have opposite signs at 0 and 1, by Chandrupatla's method.
 
     `function` maps locations and the indices of their brackets to function values. Each round
@@ -104,6 +93,9 @@ def locate_function_roots(
     at 1. The search ends when every bracket is narrower than `max_bracket_width` or has an exact
     root. If the function is NaN at a location, that location is treated as having the sign of
     location 1.
+
+    Return three locations of each root, shape (3, brackets): the bracket end with the smaller
+    absolute value, that with the sign of location 0, and that with the sign of location 1.
     """
     from scipy.optimize import elementwise  # its import takes longer than that of the library
 
@@ -129,7 +121,7 @@ def locate_function_roots(
     is_left_better = np.abs(result.f_bracket[0]) <= np.abs(result.f_bracket[1])
     best = np.where(is_left_better, left, right)
     is_exact = np.any(np.stack(result.f_bracket) == 0.0, 0)
-    return RootLocations(best, *np.where(is_exact, best, [left, right]))
+    return np.stack([best, *np.where(is_exact, best, [left, right])])
 
 
 AdmissibleRange = tuple[int, np.ndarray, dict[int, tuple[int, int]]]
@@ -277,20 +269,19 @@ class _SpecialPointLocator(NamedTuple):
         accuracy = LOCATION_PARAMETER_ACCURACY * self.continuation.location_unit
         distances = np.maximum(np.abs(right.points.p - left.points.p), accuracy)
         tolerances = np.minimum(accuracy / distances, MIN_BRACKET_FRACTION)
-        locations = locate_function_roots(
+        fractions, left_ends, _ = locate_function_roots(
             lambda fractions, indices: evaluate(solve(fractions, indices), indices),
             (evaluate(left, every), evaluate(right, every)),
             tolerances,
         )
         # Even for an exact root, the point next to it lies to the left, where the gaits are
         # admissible.
-        beside = solve(np.maximum(locations.left_bracket_ends - tolerances, 0.0), every)
+        beside = solve(np.maximum(left_ends - tolerances, 0.0), every)
         for retry_fraction in RETRY_CHORD_FRACTIONS:
             failed = np.flatnonzero(~(beside.tests[ADMISSIBILITY] > 0.0))
             if len(failed):
-                retried = solve(retry_fraction * locations.left_bracket_ends[failed], failed)
+                retried = solve(retry_fraction * left_ends[failed], failed)
                 beside = replace_rows(beside, failed, retried)
-        fractions = locations.best_locations
         roots = np.array([parameters[i, x] for i, x in enumerate(fractions)])
         crossings = np.array([i for i in every if requests[i].name == BRANCH_POINT], int)
         for offset in CROSSING_OFFSETS:
@@ -313,13 +304,11 @@ class _SpecialPointLocator(NamedTuple):
             crossings = crossings[~(is_monotonic & has_sign_change)]
         return [
             request._replace(
-                parameter=float(parameter),
-                fraction=float(fraction),
+                parameter=float(roots[i]),
+                fraction=float(fractions[i]),
                 beside=select_tree_rows(beside, slice(i, i + 1)),
             )
-            for i, (request, fraction, parameter) in enumerate(
-                zip(requests, fractions, roots, strict=True)
-            )
+            for i, request in enumerate(requests)
         ]
 
     def find_crossed_ends(self, pair: tuple[int, int]) -> list[str]:
@@ -365,9 +354,7 @@ class _SpecialPointLocator(NamedTuple):
         return located_ends
 
     def extrapolate_stalled_ends(
-        self,
-        ranges: list[AdmissibleRange],
-        statuses: Mapping[int, Sequence[ContinuationStatus]],
+        self, ranges: list[AdmissibleRange], statuses: Mapping[int, Sequence[ContinuationStatus]]
     ) -> dict[tuple[int, int], Root]:
         """Return the zeros of margins just beyond ends at which no step is short enough.
 
@@ -375,9 +362,8 @@ class _SpecialPointLocator(NamedTuple):
         margin is smooth on the other side, up to the last point of the branch.
         """
         p, located_ends = self.table.points.p, {}
-        max_distance = (
-            MAX_EXTRAPOLATED_STEPS * self.continuation.options.min_ds
-        ) * self.continuation.parameter_range
+        max_distance = MAX_EXTRAPOLATED_STEPS * self.continuation.options.min_ds
+        max_distance = max_distance * self.continuation.parameter_range
         stalled = [
             (owner, end, indices[2::-1] if end == 0 else indices[-3:])
             for owner, indices, end_pairs in ranges
@@ -539,10 +525,10 @@ class _SpecialPointLocator(NamedTuple):
             else:
                 groups.append([root])
         multiple: list[Root] = []
-        mean_requests = []
-        for group in groups:
-            first = group[0].ranks.start
-            mean_requests.append(Root.of_moduli(group[0].pair, range(first, first + len(group))))
+        mean_requests = [
+            Root.of_moduli(group[0].pair, range(first := group[0].ranks.start, first + len(group)))
+            for group in groups
+        ]
         for group, mean_root in zip(groups, self.locate_roots(mean_requests), strict=True):
             moduli_beside = mean_root.beside.tests[MODULI][0, list(mean_root.ranks)]
             cross_together = (
@@ -563,6 +549,26 @@ class _SpecialPointLocator(NamedTuple):
             root.n_multipliers > 0 and any(map(root.is_between, replaced_pairs))
         )
         return [root for root in roots if not is_replaced(root)] + multiple
+
+    def make_special_point(self, root: Root, ends_branch: bool) -> SpecialPoint:
+        """Return the special point at a located root. The name of an end is found in this table."""
+        beside, name = select_tree_rows(root.beside.points, 0), root.name
+        continuation, problem = self.continuation, self.continuation.problem
+        if name == ADMISSIBILITY:
+            name = continuation.name_branch_end(self.table.quantities, root.pair[1])
+        test = continuation.find_test_function(name)
+        kinds = {BRANCH_POINT, *(test.kind for test in problem.test_functions.values())}
+        return SpecialPoint(
+            name if name in kinds else test.kind if test else "lost",
+            name,
+            root.parameter,
+            continuation.make_fixed_point(beside),
+            ends_branch,
+            problem.make_point_reader(
+                select_tree_rows(continuation.wheels, root.beside.owners[0]), beside
+            ),
+            root.n_multipliers,
+        )
 
 
 class BranchData(NamedTuple):
@@ -620,43 +626,22 @@ def continue_and_locate_special_points(
     if not admissible_ranges:
         return branches
     located_ends = locator.locate_branch_ends(admissible_ranges)
-    stalled_ends = locator.extrapolate_stalled_ends(admissible_ranges, statuses)
     joined = locator.join_located_ends(admissible_ranges, located_ends)
     inner_roots = _SpecialPointLocator(continuation, joined).locate_inner_special_points()
-
-    problem = continuation.problem
-    kinds = {BRANCH_POINT, *(test.kind for test in problem.test_functions.values())}
-
-    def make_special_point(root: Root, ends_branch: bool) -> SpecialPoint:
-        beside, name = select_tree_rows(root.beside.points, 0), root.name
-        if name == ADMISSIBILITY:
-            name = continuation.name_branch_end(table.quantities, root.pair[1])
-        test = continuation.find_test_function(name)
-        return SpecialPoint(
-            name if name in kinds else test.kind if test else "lost",
-            name,
-            root.parameter,
-            continuation.make_fixed_point(beside),
-            ends_branch,
-            problem.make_point_reader(
-                select_tree_rows(continuation.wheels, root.beside.owners[0]), beside
-            ),
-            root.n_multipliers,
-        )
-
+    located_ends = locator.extrapolate_stalled_ends(admissible_ranges, statuses) | located_ends
     for owner, _, _ in admissible_ranges:
         roots = [root for root in inner_roots if root.beside.owners[0] == owner]
         roots.sort(key=lambda root: root.pair[0] + root.fraction * np.ptp(root.pair))
-        special_points = [make_special_point(root, False) for root in roots]
-        end_reasons = []
-        for end, status in enumerate(statuses[owner]):
-            located_end = located_ends.get((owner, end), stalled_ends.get((owner, end)))
-            if located_end is None:
-                end_reasons.append(status.meaning)
+        special_points = [locator.make_special_point(root, False) for root in roots]
+        end_reasons = [status.meaning for status in statuses[owner]]
+        for end in (0, 1):
+            if (located_end := located_ends.get((owner, end))) is None:
                 continue
-            end_point = make_special_point(located_end, True)
-            special_points.insert(0 if end == 0 else len(special_points), end_point)
-            end_reasons.append(problem.describe_branch_end(end_point.name, end_point.value))
+            end_point = locator.make_special_point(located_end, True)
+            special_points.insert(end * len(special_points), end_point)
+            end_reasons[end] = continuation.problem.describe_branch_end(
+                end_point.name, end_point.value
+            )
         rows = select_tree_rows(joined, joined.owners == owner)
         end_names = [point.name for point in special_points if point.ends_branch]
         branches[owner] = BranchData(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -43,27 +42,19 @@ from vrw_jax.branches.continuation_problems import (
 )
 from vrw_jax.branches.map_branch import (
     check_arclength_options,
+    continue_walker_branch,
     make_branch,
-    make_walker_problem,
     parse_switch_point,
-    trace_fixed_points,
 )
 from vrw_jax.gaits.cycle import AbstractCycle
-from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_model
+from vrw_jax.gaits.gait_search import limit_cycles, make_finder, resolve_model
+from vrw_jax.gaits.gauss import CollocationSolution
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.return_map_finder import ReturnMapCycle
-from vrw_jax.gaits.walker_finder import HybridGait
-from vrw_jax.lanes.batching import (
-    select_rows_on_device,
-)
-from vrw_jax.models.measures import (
-    FORCE_PEAK_MEASURES,
-    MEASURES,
-)
-from vrw_jax.models.registry import collect_provenance_attributes
+from vrw_jax.lanes.batching import select_rows_on_device
+from vrw_jax.models.ladder import collect_provenance_attributes
+from vrw_jax.models.measures import FORCE_PEAK_MEASURES, MEASURES
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -281,21 +272,9 @@ def continue_branch(
                 "cycle_options or force_peaks is given for a wheel, but the model is a walker of "
                 "yours: give step_options=vrw.StepOptions(...), and measures= for peaks."
             )
-        if cycle is None:
-            cycle = limit_cycle(params, model=model, period_n=period_n, options=step_options)
-        check_type("cycle", cycle, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
-        period_n = math.lcm(check_int("period_n", period_n), int(cycle.period_n))
-        problem, wheel = make_walker_problem(
-            model, params, (name,), cycle, period_n, step_options, margins, measures
-        )
-        if not cycle.found:
-            outcome = Outcome(int(cycle.outcome))
-            return make_branch(problem, None, name, params, outcome, cycle.why)
-        value = float(wheel.values[problem.parameter_indices[0]])
-        params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
-        return trace_fixed_points(
-            problem, cycle.section_state, value, bounds, wheel, name, options, switch_at,
-            params=params,
+        return continue_walker_branch(
+            model, params, name, bounds, cycle, period_n, options, step_options, margins, measures,
+            switch_at,
         )  # fmt: skip
     if margins:
         raise ValueError(
@@ -365,10 +344,8 @@ def continue_branches(
     """
     require_untraced_arguments("vrw.continue_branches", DIFFERENTIATION_ADVICE, params, cycle)
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    model, step_options = (
-        convert_model_argument(model),
-        convert_step_options(step_options or StepOptions.tight()),
-    )
+    model = convert_model_argument(model)
+    step_options = convert_step_options(step_options or StepOptions.tight())
     params = model.attach_laws(params)
     problem_fields = {
         "model": model,
@@ -390,23 +367,9 @@ def continue_branches(
         if n_wheels > 1:
             raise ValueError("switch_at is for one wheel, but the batch has more: give one wheel.")
         cycle = select_rows_on_device(switch_at.cycle, None)
-    # The batch is padded to a power of two, because each size compiles programs.
-    indices = np.minimum(np.arange(1 << (n_wheels - 1).bit_length()), n_wheels - 1)
-    pad = lambda x: np.broadcast_to(np.asarray(x), (n_wheels,))[indices]
     value = model.get_parameter(params, name) if switch_at is None else switch_at.value
-    parameter_values = np.clip(pad(value), *limits)
-    params, parameter_values = jax.device_put((jax.tree.map(pad, params), parameter_values))
-    if isinstance(cycle, AbstractCycle) and len(indices) > n_wheels:
-        cycle = select_rows_on_device(cycle, indices)
-    if name != FRICTION_NAME:
-        _, params = model.with_parameter(params, name, parameter_values)
-    start, branch_data = _continue_gait_branches(
-        params, parameter_values, cycle, cycle_options, problem_fields, options, limits, n_wheels,
-        tangent,
-    )  # fmt: skip
-    return tuple(
-        _make_gait_branch(start, i, data, select_rows_on_device(params, i))
-        for i, data in enumerate(branch_data[:n_wheels])
+    return _continue_gait_branches(
+        params, value, cycle, cycle_options, problem_fields, options, limits, n_wheels, tangent
     )
 
 
@@ -459,7 +422,7 @@ def _check_branches(
 
 def _continue_gait_branches(
     params: WheelParams,
-    parameter_values: Array,
+    value: Any,
     cycle: Any,
     cycle_options: CycleOptions | None,
     problem_fields: Mapping[str, Any],
@@ -467,12 +430,21 @@ def _continue_gait_branches(
     bounds: np.ndarray,
     n_wheels: int,
     crossed_tangent: np.ndarray | None,
-) -> tuple[BranchStart, list[BranchData | None]]:
-    """Continue the branches of the first `n_wheels` wheels from their start gaits.
+) -> tuple[Branch, ...]:
+    """Return the branches of wheels from their start gaits, see `find_branch_starts`.
 
-    Return the starts, and the data of the branches. Any further wheels only pad the
-    batch. See `find_branch_starts`.
+    - `value`: value of the continued parameter at the start of each branch.
     """
+    model, (name,) = problem_fields["model"], problem_fields["continued_names"]
+    # The batch is padded to a power of two, because each size compiles programs.
+    indices = np.minimum(np.arange(1 << (n_wheels - 1).bit_length()), n_wheels - 1)
+    pad = lambda x: np.broadcast_to(np.asarray(x), (n_wheels,))[indices]
+    parameter_values = np.clip(pad(value), *bounds)
+    params, parameter_values = jax.device_put((jax.tree.map(pad, params), parameter_values))
+    if isinstance(cycle, AbstractCycle) and len(indices) > n_wheels:
+        cycle = select_rows_on_device(cycle, indices)
+    if name != FRICTION_NAME:
+        _, params = model.with_parameter(params, name, parameter_values)
     can_refine_mesh = cycle_options is None
     # Without cycle options, the mesh is refined until it limits no branch.
     for n_refinements_left in range(MAX_BRANCH_MESH_REFINEMENTS, -1, -1):
@@ -497,7 +469,10 @@ def _continue_gait_branches(
         if is_finest_mesh or not any(needs_finer_mesh):
             break
         cycle_options, cycle = start.finer_cycle_options, start.cycles
-    return start, branch_data
+    return tuple(
+        _make_gait_branch(start, i, data, select_rows_on_device(params, i))
+        for i, data in enumerate(branch_data[:n_wheels])
+    )
 
 
 def _make_gait_branch(

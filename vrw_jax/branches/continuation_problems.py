@@ -6,7 +6,6 @@ of gait steps with unilateral contact. `ReturnMapProblem` applies to every walke
 gait step of the walker and differentiates it in forward mode.
 """
 
-import abc
 import functools
 import zlib
 from collections.abc import Callable, Mapping
@@ -27,24 +26,22 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.walker import make_return_map
 from vrw_jax.branches.arclength import (
+    POINT_BATCH_SIZES,
     AbstractContinuationProblem,
+    AbstractStateProblem,
     ContinuationPoint,
     NewtonStep,
     QuantitiesByName,
 )
 from vrw_jax.branches.branch import BIFURCATIONS, TestFunction
 from vrw_jax.branches.branch_continuation import BORDER_COLLISION, EVENT_ORDER, EVENT_ORDER_CHANGE
-from vrw_jax.gaits.finder_selection import make_finder
 from vrw_jax.gaits.force_peaks import locate_force_peaks
+from vrw_jax.gaits.gait_search import make_finder
+from vrw_jax.gaits.gauss import CollocationSolution
 from vrw_jax.gaits.limit_cycle_result import evaluate_own_measure, land_foot
-from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
-from vrw_jax.gaits.return_map_finder import (
-    measure_return_map_cycle,
-    measure_return_map_force_peaks,
-)
+from vrw_jax.gaits.return_map_finder import measure_return_map_cycle, measure_return_map_force_peaks
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
-from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.models.measures import (
@@ -133,9 +130,6 @@ every speed repeat.
 MEASURES_OUTSIDE_BRANCHES = ("outcome", "solver_steps")
 """Names of measures of the event-driven step that the dataset of a branch does not contain."""
 
-POINT_BATCH_SIZES = (batch_sizes.LOCATION_BATCH_SIZES[-1],)
-"""Number of points that one call of an XLA program computes, one size so that it compiles once."""
-
 
 class BranchWheel(NamedTuple):
     """Wheels whose gaits are continued, with a leading axis over wheels.
@@ -148,103 +142,10 @@ class BranchWheel(NamedTuple):
     is_phase_active: Any = ()
 
 
-@eqx.filter_jit
-def _linearize_map(
-    function: Callable, units: tuple[float, ...], args: Any, z: Array, p: Array
-) -> NewtonStep:
-    """Return the Newton steps of fixed points of a map at many points, see `MapProblem`."""
-    n_continuous = len(units)
-    scale = jnp.asarray([*units, *[1.0] * (z.shape[1] - n_continuous)])
-
-    def linearize(args: Any, z: Array, p: Array) -> NewtonStep:
-        codes = z[n_continuous:]
-        evaluate = lambda x, p: function(args, jnp.concatenate([x, codes]) * scale, p) / scale
-        image, jacobians = evaluate_with_jacobian(evaluate, z[:n_continuous], p)
-        by_z, by_p = (jacobian[:n_continuous] for jacobian in jacobians)
-        defect = image - z
-        right_sides = jnp.column_stack([defect[:n_continuous], by_p])
-        solutions = jnp.linalg.solve(jnp.eye(n_continuous) - by_z, right_sides).T
-        tangents = jnp.pad(solutions[1:], ((0, 0), (0, len(codes))))
-        return NewtonStep(
-            jnp.concatenate([solutions[0], defect[n_continuous:]]),
-            tangents if p.ndim else tangents[0],
-            by_z,
-        )
-
-    return jax.vmap(linearize)(args, z, p)
-
-
 def make_walker(model: Any, values: Any, n_legs: int) -> tuple[Any, Any]:
     """Return a walker, of a user or a wheel, and its parameters with the given values."""
     model, params = model.from_parameter_values(values, n_legs)
     return getattr(model, "walker", model), params
-
-
-@dataclass(frozen=True, eq=False)
-class AbstractStateProblem(AbstractContinuationProblem):
-    """Base class of problems whose unknowns are section states in units, fixed points of a map.
-
-    Components without a unit are discrete codes, which Newton's method copies from the image under
-    the map. It converges only if state and image have equal codes.
-    """
-
-    units: tuple[float, ...]
-
-    @property
-    def section_units(self) -> np.ndarray:
-        return np.array(self.units)
-
-    @property
-    @abc.abstractmethod
-    def function(self) -> Callable[[Any, Array, Array], Array]:
-        """Return the map x -> `function(args, x, p)`, which is NaN where it is undefined.
-
-        If p is a vector, there is a tangent for each entry.
-        """
-
-    def linearize(self, args: Any, z: np.ndarray, p: np.ndarray) -> NewtonStep:
-        linearize = functools.partial(_linearize_map, self.function, self.units)
-        return map_in_numpy_batches(linearize, POINT_BATCH_SIZES, args, z, p)
-
-    def section_state(self, z: np.ndarray) -> np.ndarray:
-        return z[..., : len(self.units)]
-
-    def interpolate(self, left: np.ndarray, right: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-        """Interpolate the coordinates; the discrete codes are those of the nearer state."""
-        nearer = np.where(fraction[:, None] < 0.5, left, right)
-        between, n = super().interpolate(left, right, fraction), len(self.units)
-        return np.concatenate([between[:, :n], nearer[:, n:]], 1)
-
-    def is_smooth_between(self, left: np.ndarray, right: np.ndarray) -> bool:
-        return bool(np.all(left[len(self.units) :] == right[len(self.units) :]))
-
-
-@dataclass(frozen=True, eq=False)
-class MapProblem(AbstractStateProblem):
-    """Continuation problem for the fixed points of any map, which JAX differentiates."""
-
-    iterated_map: Callable[[Any, Array, Array], Array]
-    period_n: int = 1  # number of iterates
-
-    may_start_singular: ClassVar[bool] = True
-
-    @property
-    def function(self) -> Callable[[Any, Array, Array], Array]:
-        if self.period_n == 1:
-            return self.iterated_map
-
-        def iterate(args: Any, x: Array, p: Array) -> Array:
-            for _ in range(self.period_n):
-                x = self.iterated_map(args, x, p)
-            return x
-
-        return iterate
-
-    def measure(self, args: Any, points: ContinuationPoint) -> QuantitiesByName:
-        return {"x": self.section_units * points.z}
-
-    def label(self, quantities: QuantitiesByName) -> tuple[dict, dict]:
-        return {"x": (("point", "component"), quantities["x"])}, {}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -480,14 +381,10 @@ class CollocationProblem(AbstractGaitProblem):
     def correction_norm(self, z: np.ndarray, correction: np.ndarray) -> float:
         """Return the largest component; accelerations count by their effect on positions."""
         durations = np.max(np.abs(self.unpack(z).durations), 0)
-        changes = self.unpack(correction)
+        changes = jax.tree.map(lambda x: np.max(np.abs(x)), self.unpack(correction))
+        effects = zip(changes.accelerations, durations, strict=True)
         return max(
-            np.max(np.abs(changes.section_state)),
-            np.max(np.abs(changes.durations)),
-            *(
-                np.max(np.abs(change)) * duration**2
-                for change, duration in zip(changes.accelerations, durations, strict=True)
-            ),
+            changes.section_state, changes.durations, *(x * duration**2 for x, duration in effects)
         )
 
     def is_admissible(self, wheel: BranchWheel, z: np.ndarray, p: float) -> bool:
@@ -507,23 +404,19 @@ class CollocationProblem(AbstractGaitProblem):
         `takeoff_acceleration`, m/s^2. The latter is the lowest acceleration of the rear foot at
         take-off over the gait steps.
         """
+        system, shapes = self.collocation_system, self.shapes
+        read = functools.partial(
+            _read_collocated_gaits,
+            system,
+            shapes,
+            self.additional_quantity_function,
+            self.measures_force_peaks,
+        )
         states, quantities = map_in_numpy_batches(
-            functools.partial(
-                _read_collocated_gaits,
-                self.collocation_system,
-                self.shapes,
-                self.additional_quantity_function,
-                self.measures_force_peaks,
-            ),
-            POINT_BATCH_SIZES,
-            values,
-            wheels.is_phase_active,
-            z,
+            read, POINT_BATCH_SIZES, values, wheels.is_phase_active, z
         )
         for measure in self.own_measures:
-            evaluate = functools.partial(
-                _measure_solutions, measure, self.collocation_system, self.model, self.shapes
-            )
+            evaluate = functools.partial(_measure_solutions, measure, system, self.model, shapes)
             quantities[measure.name] = map_in_numpy_batches(
                 evaluate, POINT_BATCH_SIZES, values, z, states
             )
@@ -565,10 +458,8 @@ def _read_collocated_gaits(
     """Return the result of `CollocationProblem.read_gaits` for one gait."""
     solution = unpack_solution(shapes, z)
     phase_points_by_step = system.evaluate_phase_points(parameters, solution)
-    end_point, durations = (
-        phase_points_by_step[-1][-1].phase_end_point,
-        jnp.min(solution.durations, 0),
-    )
+    end_point = phase_points_by_step[-1][-1].phase_end_point
+    durations = jnp.min(solution.durations, 0)
     quantities = {
         "duration_dls": jnp.where(is_phase_active[0, 0] > 0.5, durations[0], jnp.nan),
         "duration_sls1": durations[1],
@@ -608,40 +499,23 @@ def make_trial_linearizer(
     """
 
     def linearize_trial(parameters: Array, is_phase_active: Array, z: CollocationSolution) -> tuple:
-        cycle_linearization = collocation_system.linearize_at(
-            parameters, z, is_phase_active, parameter_indices
-        )
-        newton_results = (
-            cycle_linearization.newton_correction,
-            cycle_linearization.parameter_tangents,
-            cycle_linearization.monodromy,
-        )
+        cycle = collocation_system.linearize_at(parameters, z, is_phase_active, parameter_indices)
+        correction, tangents = cycle.newton_correction, cycle.parameter_tangents
+        newton_results = correction, tangents, cycle.monodromy
         if gait_quantity_function is None:
             return newton_results
         # The parameters do not change in the direction of the correction.
-        parameter_tangents = np.zeros((1 + len(parameter_indices), len(parameters), 1))
-        parameter_tangents[range(1, len(parameter_tangents)), parameter_indices] = 1.0
-        tangent_directions = (
-            jnp.broadcast_to(
-                parameter_tangents.astype(parameters.dtype),
-                (len(parameter_tangents), *parameters.shape),
-            ),
-            jax.tree.map(
-                lambda correction, tangents: jnp.concatenate([correction[None], tangents]),
-                *newton_results[:2],
-            ),
+        changes = np.zeros((1 + len(parameter_indices), len(parameters), 1))
+        changes[range(1, len(changes)), parameter_indices] = 1.0
+        directions = (
+            jnp.broadcast_to(changes.astype(parameters.dtype), (len(changes), *parameters.shape)),
+            jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), correction, tangents),
         )
-        evaluate_quantities = lambda parameters, z: gait_quantity_function(
+        evaluate = lambda parameters, z: gait_quantity_function(
             collocation_system, parameters, is_phase_active, z
         )
-        compute_quantity_tangent = lambda tangent_direction: jax.jvp(
-            evaluate_quantities, (parameters, z), tangent_direction
-        )[1]
-        return (
-            *newton_results,
-            evaluate_quantities(parameters, z),
-            lax.map(compute_quantity_tangent, tangent_directions),
-        )
+        differentiate = lambda direction: jax.jvp(evaluate, (parameters, z), direction)[1]
+        return *newton_results, evaluate(parameters, z), lax.map(differentiate, directions)
 
     compiled = compile_batch_function(linearize_trial, collocation_system.cycle_options.batch_size)
 
@@ -785,16 +659,10 @@ def compute_contact_order_numbers(gait_steps_of_period: Any, n_legs: int) -> np.
     The number is a checksum of the contact modes that occur, the event counts and the final contact
     modes.
     """
-    has_contact_mode_occurred = np.asarray(gait_steps_of_period.mode_durations) > 0.0
-    contact_codes = np.asarray(gait_steps_of_period.section_state)[..., -n_legs:]
-    event_and_impact_counts = np.stack(
-        [np.asarray(gait_steps_of_period.events), np.asarray(gait_steps_of_period.impacts)], -1
-    )
-    integer_arrays_by_period = [
-        x.reshape(len(x), -1).astype(np.int64)
-        for x in (has_contact_mode_occurred, contact_codes, event_and_impact_counts)
-    ]
-    return number_rows(np.concatenate(integer_arrays_by_period, 1))
+    steps = jax.tree.map(np.asarray, gait_steps_of_period)
+    counts = np.stack([steps.events, steps.impacts], -1)
+    arrays = steps.mode_durations > 0.0, steps.section_state[..., -n_legs:], counts
+    return number_rows(np.concatenate([x.reshape(len(x), -1).astype(np.int64) for x in arrays], 1))
 
 
 def number_rows(rows: np.ndarray) -> np.ndarray:
@@ -816,8 +684,7 @@ def _combine_period_measures(step_results: AbstractStep, section_states: Array) 
     first_failure = jnp.argmax(step_measures["outcome"] != Outcome.STEPPED)
 
     def combine(name: str, values: Array) -> Array:
-        margins = MARGIN_MEASURES | STOPPER_MARGIN_MEASURES
-        if name in margins or name.startswith("lambda_"):
+        if name in MARGIN_MEASURES | STOPPER_MARGIN_MEASURES or name.startswith("lambda_"):
             return jnp.min(values, 0)
         for suffix, index in (("_touchdown", -1), ("_post_impact", 0), ("outcome", first_failure)):
             if name.endswith(suffix):
@@ -826,9 +693,10 @@ def _combine_period_measures(step_results: AbstractStep, section_states: Array) 
             return jnp.mean(values, 0)
         return (jnp.max if MEASURES[name].is_largest_over_steps else jnp.sum)(values, 0)
 
-    period_measures = {name: combine(name, values) for name, values in step_measures.items()}
-    positive_period = jnp.where(period_measures["period"] > 0.0, period_measures["period"], 1.0)
-    period_measures["dls_fraction"] = period_measures["duration_dls"] / positive_period
-    period_measures["speed"] = period_measures["step_length"] / positive_period
-    closure = jnp.max(jnp.abs(step_results.section_state[-1] - section_states))
-    return period_measures | {"closure": closure}
+    measures = {name: combine(name, values) for name, values in step_measures.items()}
+    period = jnp.where(measures["period"] > 0.0, measures["period"], 1.0)
+    return measures | {
+        "dls_fraction": measures["duration_dls"] / period,
+        "speed": measures["step_length"] / period,
+        "closure": jnp.max(jnp.abs(step_results.section_state[-1] - section_states)),
+    }

@@ -31,9 +31,8 @@ from vrw_jax.branches.continuation_problems import (
     SECOND_PEAK_RATE_NAME,
     BranchWheel,
 )
-from vrw_jax.gaits.margin_defaults import compute_takeoff_acceleration
-from vrw_jax.gaits.phase_collocation import CollocationSolution
-from vrw_jax.gaits.phase_sequence import CollocationSystem
+from vrw_jax.gaits.gauss import CollocationSolution
+from vrw_jax.gaits.phase_sequence import CollocationSystem, compute_takeoff_acceleration
 from vrw_jax.models.measures import MARGIN_MEASURES
 from vrw_jax.wheel import transitions
 from vrw_jax.wheel.params import Symbols
@@ -233,33 +232,22 @@ def select_test_quantity(special_point_name: str, has_double_support: bool) -> s
     """
     if special_point_name == "lambda_4_plus" and has_double_support:
         return MEAN_FORCE_FALL_NAME
-    return (
-        "lambda_4_plus"
-        if special_point_name == DLS_VANISHING_NAME
-        else LINEAR_MARGIN_SUBSTITUTES.get(special_point_name, special_point_name)
-    )
+    substitutes = {**LINEAR_MARGIN_SUBSTITUTES, DLS_VANISHING_NAME: "lambda_4_plus"}
+    return substitutes.get(special_point_name, special_point_name)
 
 
 def find_test_quantity_group(quantity_name: str, n_legs: int) -> tuple[str, ...]:
     """Return the names of all quantities that are evaluated together with `quantity_name`."""
-    leg_suffixes = [f"[{leg_number}]" for leg_number in range(3, n_legs + 1)]
+    suffixes = [f"[{leg}]" for leg in range(3, n_legs + 1)]
     step_quantity_names = tuple(
-        margin_name + leg_suffix
-        for margin_name, margin_measure in MARGIN_MEASURES.items()
-        for leg_suffix in (leg_suffixes if margin_measure.leg_dimension else [""])
-        if margin_name not in CONTINUED_QUANTITIES
+        name + suffix
+        for name, margin in MARGIN_MEASURES.items()
+        for suffix in (suffixes if margin.leg_dimension else [""])
+        if name not in CONTINUED_QUANTITIES
     )
-    quantity_groups = (
-        tuple(BIFURCATIONS),
-        CONTINUED_QUANTITIES,
-        FORCE_QUANTITY_NAMES,
-        step_quantity_names,
-    )
-    return next(
-        quantity_group
-        for quantity_group in quantity_groups
-        if select_test_quantity(quantity_name, True) in quantity_group
-    )
+    groups = tuple(BIFURCATIONS), CONTINUED_QUANTITIES, FORCE_QUANTITY_NAMES, step_quantity_names
+    name = select_test_quantity(quantity_name, True)
+    return next(group for group in groups if name in group)
 
 
 class CurveWheel(NamedTuple):
@@ -294,10 +282,9 @@ class GaitCurveProblem(AbstractCurveProblem):
     def linearize_in_two_parameters(
         self, wheels: CurveWheel, z: np.ndarray, p: np.ndarray
     ) -> TwoParameterStep:
-        step, quantities = self.gaits.linearize_with_quantities(
+        (correction, tangents, jacobian), quantities = self.gaits.linearize_with_quantities(
             wheels.branch_wheel, z, p, QUANTITY_FUNCTION_BY_GROUP.get(self.quantity_names)
         )
-        correction, tangents, jacobian = step
         if quantities:
             values, rates = quantities  # The first rate is along the correction.
             if self.quantity_names == tuple(BIFURCATIONS):
@@ -397,32 +384,26 @@ class CollocationCurveProblem(GaitCurveProblem):
         """Replace each quantity that is zero or undefined on the whole curve by NaN."""
         special_point_names = np.array(self.special_point_names)[owners]
         is_dls_vanishing = special_point_names == DLS_VANISHING_NAME
-        is_step_discontinuous = np.isin(
-            special_point_names, (*DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME)
+        is_step_discontinuous = is_dls_vanishing | np.isin(
+            special_point_names, DISCONTINUOUS_QUANTITIES
         )
 
-        def is_undefined(quantity_name: str) -> np.ndarray:
-            if quantity_name == INITIAL_FORCE_FALL_NAME:
+        def is_undefined(name: str) -> np.ndarray:
+            if name == INITIAL_FORCE_FALL_NAME:
                 return ~is_dls_vanishing
-            is_step_margin = quantity_name.partition("[")[0] in MARGIN_MEASURES
-            substituted_names = [
-                margin_name
-                for margin_name, substitute_name in LINEAR_MARGIN_SUBSTITUTES.items()
-                if substitute_name == quantity_name
-            ]
-            is_zero_on_curve = np.isin(special_point_names, [quantity_name, *substituted_names])
-            if quantity_name == "lambda_4_plus":
+            substituted = [x for x, y in LINEAR_MARGIN_SUBSTITUTES.items() if y == name]
+            is_zero_on_curve = np.isin(special_point_names, [name, *substituted])
+            if name == "lambda_4_plus":
                 return is_zero_on_curve | is_dls_vanishing
-            if is_step_margin and quantity_name not in CONTINUED_QUANTITIES:
+            if name.partition("[")[0] in MARGIN_MEASURES and name not in CONTINUED_QUANTITIES:
                 return is_zero_on_curve | is_step_discontinuous
             return is_zero_on_curve
 
         # A transposed array has its points on the last axis.
-        masked_quantities = {
-            quantity_name: np.where(is_undefined(quantity_name), np.nan, quantity_values.T).T
-            for quantity_name, quantity_values in quantities.items()
+        masked = {
+            name: np.where(is_undefined(name), np.nan, x.T).T for name, x in quantities.items()
         }
-        return masked_quantities | {
+        return masked | {
             "outcome": np.where(is_step_discontinuous, Outcome.STEPPED, quantities["outcome"]),
             "closure": np.where(is_step_discontinuous, 0.0, quantities["closure"]),
         }
@@ -471,15 +452,11 @@ def locate_jump_onset(
 
 
 def _stack_continued_quantities(
-    collocation_system: CollocationSystem,
-    parameters: Array,
-    is_phase_active: Array,
-    z: CollocationSolution,
+    system: CollocationSystem, parameters: Array, _: Array, z: CollocationSolution
 ) -> Array:
-    """Return the values of `CONTINUED_QUANTITIES` for a collocated gait, in their order."""
-    wheel_symbols = collocation_system.make_wheel(parameters).symbols()
-    (phase_points,) = collocation_system.evaluate_phase_points(parameters, z)
-    return jnp.stack(list(compute_continued_quantities(wheel_symbols, phase_points, z).values()))
+    wheel_symbols = system.make_wheel(parameters).symbols()
+    (phase_points,) = system.evaluate_phase_points(parameters, z)
+    return jnp.stack([*compute_continued_quantities(wheel_symbols, phase_points, z).values()])
 
 
 def compute_continued_quantities(
@@ -488,43 +465,33 @@ def compute_continued_quantities(
     """Return the `CONTINUED_QUANTITIES` of a gait step by name, computed from the points of its
     phases.
     """
-    (dls_start, _, dls_end), sls1_phase_points, (_, _, sls2_end) = phase_points
-    landing_result = transitions.resolve_landing(wheel_symbols, sls2_end.q[0], *sls2_end.v)
-    fore_force, rear_force = transitions.compute_landing_forces(wheel_symbols, landing_result)
-    takeoff_acceleration = compute_takeoff_acceleration(wheel_symbols, sls1_phase_points)
+    s, ((start, _, end), sls1_points, (_, _, sls2_end)) = wheel_symbols, phase_points
+    landing = transitions.resolve_landing(s, sls2_end.q[0], *sls2_end.v)
+    fore_force, rear_force = transitions.compute_landing_forces(s, landing)
     dls_duration, *single_support_durations = z.durations[0]
-    dls_phase, *_ = make_paper_phases(
-        wheel_symbols, dls_start.held_constants[0], stop_at_lift_off=False
-    )
-
-    def make_dls_instant(theta: Array, dtheta: Array) -> PhaseInstant:
-        return PhaseInstant(dls_phase, dls_phase.compute_motion((theta,), (dtheta,)))
-
-    compute_rear_force = lambda *dls_state: dls_phase.compute_end_guard(
-        make_dls_instant(*dls_state)
-    )
-    start_state = *dls_start.q, *dls_start.v
-    dls_state_rates = start_state[1], make_dls_instant(*start_state).acceleration.ddtheta
-    initial_rear_force, rear_force_rate = jax.jvp(compute_rear_force, start_state, dls_state_rates)
-    mean_decrease_rate = (
-        initial_rear_force - compute_rear_force(*dls_end.q, *dls_end.v)
-    ) / jnp.where(dls_duration == 0.0, 1.0, dls_duration)
-    quantity_values = (
-        landing_result.rear_impulse.normal,
+    dls, *_ = make_paper_phases(s, start.held_constants[0], stop_at_lift_off=False)
+    make_instant = lambda theta, dtheta: PhaseInstant(dls, dls.compute_motion((theta,), (dtheta,)))
+    compute_rear_force = lambda *state: dls.compute_end_guard(make_instant(*state))
+    start_state = *start.q, *start.v
+    rates = start_state[1], make_instant(*start_state).acceleration.ddtheta
+    first_force, force_rate = jax.jvp(compute_rear_force, start_state, rates)
+    force_fall = first_force - compute_rear_force(*end.q, *end.v)
+    quantities = (
+        landing.rear_impulse.normal,
         fore_force.normal,
         rear_force.normal,
         *single_support_durations,
-        takeoff_acceleration,
-        -rear_force_rate,
-        mean_decrease_rate,
+        compute_takeoff_acceleration(s, sls1_points),
+        -force_rate,
+        force_fall / jnp.where(dls_duration == 0.0, 1.0, dls_duration),
     )
-    return dict(zip(CONTINUED_QUANTITIES, quantity_values, strict=True))
+    return dict(zip(CONTINUED_QUANTITIES, quantities, strict=True))
 
 
 QUANTITY_FUNCTION_BY_GROUP = {
     CONTINUED_QUANTITIES: _stack_continued_quantities,
-    tuple(BIFURCATIONS): lambda collocation_system, parameters, is_phase_active, z: (
-        collocation_system.linearize_at(parameters, z, is_phase_active).monodromy
+    tuple(BIFURCATIONS): lambda system, parameters, is_phase_active, z: (
+        system.linearize_at(parameters, z, is_phase_active).monodromy
     ),
 }
 """Function that computes a group of quantities without an event-driven step, by the names in the

@@ -18,13 +18,7 @@ from vrw_jax.base import batch_sizes
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
 from vrw_jax.branches.arclength import ArclengthOptions
-from vrw_jax.branches.branch import (
-    BIFURCATIONS,
-    BRANCH_POINT,
-    FOLD,
-    Codim2Point,
-    SpecialPointCurve,
-)
+from vrw_jax.branches.branch import BIFURCATIONS, BRANCH_POINT, FOLD, Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation import MAX_BRANCH_MESH_REFINEMENTS, continue_branches
@@ -43,11 +37,11 @@ from vrw_jax.branches.curve_problems import (
     locate_jump_onset,
     select_test_quantity,
 )
+from vrw_jax.gaits.gauss import CollocationSolution
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
-from vrw_jax.gaits.phase_collocation import CollocationSolution
 from vrw_jax.gaits.phase_sequence import CollocationSystem
+from vrw_jax.models.ladder import collect_provenance_attributes
 from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
-from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.params import WheelParams
 
@@ -160,11 +154,11 @@ class CurveTracer(NamedTuple):
             parameters, state = jax.tree.map(
                 np.asarray, (cycle.parameters, cycle.collocation_state)
             )
-            branch_wheel, z = BranchWheel(parameters, state.is_phase_active), state.solution
-            name = choose_continued_special_point_name(special_point.name, branch_wheel, z)
+            wheel, z = BranchWheel(parameters, state.is_phase_active), state.solution
+            name = choose_continued_special_point_name(special_point.name, wheel, z)
             indices = map(self.model.parameter_names.index, self.parameter_names)
             values = tuple(float(parameters[index]) for index in indices)
-            seeds.append(CurveSeed(name, values, cycle.system, branch_wheel, z))
+            seeds.append(CurveSeed(name, values, cycle.system, wheel, z))
         return seeds
 
     def trace_curves(
@@ -293,11 +287,8 @@ class CurveTracer(NamedTuple):
             if special_point.name == RANGE_EDGE:
                 continue
             beside = special_point.cycle
-            z, second = (
-                gaits.unpack(beside.z[1:]),
-                float(problem.compute_second_parameter(beside.z)),
-            )
-            meeting: Any = special_point.value, second
+            z, second = gaits.unpack(beside.z[1:]), problem.compute_second_parameter(beside.z)
+            meeting: Any = special_point.value, float(second)
             name = choose_continued_special_point_name(special_point.name, seed.branch_wheel, z)
             if {name, seed.special_point_name} == {"lambda_4_plus", DLS_VANISHING_NAME}:
                 onset, last_change = locate_jump_onset(
@@ -305,13 +296,10 @@ class CurveTracer(NamedTuple):
                 )
                 if last_change < RELATIVE_CODIM2_TOLERANCE:
                     meeting = tuple(onset.tolist())
+                renamed = seed._replace(special_point_name=name)
                 new_seeds.append(
                     self._seed_beyond_meeting(
-                        seed._replace(special_point_name=name),
-                        vertices,
-                        parameter_points,
-                        gaits.unpack(rows),
-                        meeting,
+                        renamed, vertices, parameter_points, gaits.unpack(rows), meeting
                     )
                 )
                 first_reason, last_reason = (
@@ -320,7 +308,7 @@ class CurveTracer(NamedTuple):
                 )
                 end_reasons = first_reason, last_reason
             elif can_continue_special_point(name):
-                values = float(beside.p), second
+                values = float(beside.p), meeting[1]
                 new_seeds.append(
                     seed._replace(special_point_name=name, parameter_values=values, z=z)
                 )
@@ -364,8 +352,7 @@ class CurveTracer(NamedTuple):
         """
         distances = abs(parameter_points[[0, -1]] - meeting).max(-1)
         vertices, parameter_points, z = jax.tree.map(
-            lambda x: x if distances[0] < distances[1] else x[::-1],
-            (vertices, parameter_points, z),
+            lambda x: x if distances[0] < distances[1] else x[::-1], (vertices, parameter_points, z)
         )
         distances = np.linalg.norm(vertices - vertices[0], axis=1)
         index = int(np.argmax(distances >= min(CODIM2_OVERRUN_DISTANCE, distances[-1])))
@@ -386,16 +373,12 @@ def compute_distances_to_polyline(
 
     Each row of `polyline_vertices` is a vertex of the polyline.
     """
-    segment_starts, segment_vectors = polyline_vertices[:-1], np.diff(polyline_vertices, axis=0)
-    squared_segment_lengths = np.maximum(np.sum(segment_vectors**2, 1), 1e-300)
-    offsets_from_segment_start = query_points[:, None] - segment_starts
-    segment_fractions = np.clip(
-        np.sum(offsets_from_segment_start * segment_vectors, 2) / squared_segment_lengths, 0.0, 1.0
-    )
-    segment_distances = np.linalg.norm(
-        offsets_from_segment_start - segment_fractions[..., None] * segment_vectors, axis=2
-    )
-    return np.min(segment_distances, axis=1, initial=np.inf)
+    segments = np.diff(polyline_vertices, axis=0)
+    offsets = query_points[:, None] - polyline_vertices[:-1]
+    squared_lengths = np.maximum(np.sum(segments**2, 1), 1e-300)
+    fractions = np.clip(np.sum(offsets * segments, 2) / squared_lengths, 0.0, 1.0)
+    distances = np.linalg.norm(offsets - fractions[..., None] * segments, axis=2)
+    return np.min(distances, axis=1, initial=np.inf)
 
 
 # Largest duration of double support that is treated as zero, s. The value is chosen above round-off
@@ -404,9 +387,7 @@ MAX_ZERO_DLS_DURATION_S = 1e-4
 
 
 def choose_continued_special_point_name(
-    special_point_name: str,
-    branch_wheel: BranchWheel,
-    z: CollocationSolution,
+    special_point_name: str, branch_wheel: BranchWheel, z: CollocationSolution
 ) -> str:
     """Return the name under which a special point of a gait is continued as a curve.
 
@@ -416,27 +397,15 @@ def choose_continued_special_point_name(
     # A curve of folds may continue in one direction at its special points.
     if special_point_name == BRANCH_POINT:
         return FOLD
-    if (
-        special_point_name not in ("lambda_4_plus", DLS_VANISHING_NAME, INITIAL_FORCE_FALL_NAME)
-        or branch_wheel.is_phase_active[0, 0] < 0.5
-    ):
-        return special_point_name
-    dls_vanishes = (
-        special_point_name != INITIAL_FORCE_FALL_NAME
-        and z.durations[0, 0] < MAX_ZERO_DLS_DURATION_S
-    )
-    return DLS_VANISHING_NAME if dls_vanishes else "lambda_4_plus"
+    ends_by_rear_force = special_point_name in ("lambda_4_plus", DLS_VANISHING_NAME)
+    has_double_support = branch_wheel.is_phase_active[0, 0] >= 0.5
+    if has_double_support and ends_by_rear_force and z.durations[0, 0] < MAX_ZERO_DLS_DURATION_S:
+        return DLS_VANISHING_NAME
+    is_of_rear_force = ends_by_rear_force or special_point_name == INITIAL_FORCE_FALL_NAME
+    return "lambda_4_plus" if has_double_support and is_of_rear_force else special_point_name
 
 
 def can_continue_special_point(special_point_name: str) -> bool:
     """Return whether the named special point can be continued as a curve."""
-    continued_special_point_names = (
-        *BIFURCATIONS,
-        *DISCONTINUOUS_QUANTITIES,
-        DLS_VANISHING_NAME,
-        *FORCE_QUANTITY_NAMES,
-    )
-    return (
-        special_point_name in continued_special_point_names
-        or special_point_name.partition("[")[0] in MARGIN_MEASURES
-    )
+    names = *BIFURCATIONS, *DISCONTINUOUS_QUANTITIES, DLS_VANISHING_NAME, *FORCE_QUANTITY_NAMES
+    return special_point_name.partition("[")[0] in (*names, *MARGIN_MEASURES)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -28,10 +29,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure, measure, select_measures
-from vrw_jax.base.options import (
-    StepOptions,
-    find_tree_parameter,
-)
+from vrw_jax.base.options import StepOptions, find_tree_parameter
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
@@ -40,7 +38,13 @@ from vrw_jax.base.walker import (
     name_coordinates,
     step_batch_of_walker,
 )
-from vrw_jax.branches.arclength import ArclengthOptions, ContinuationPoint, QuantitiesByName
+from vrw_jax.branches.arclength import (
+    POINT_BATCH_SIZES,
+    ArclengthOptions,
+    ContinuationPoint,
+    MapProblem,
+    QuantitiesByName,
+)
 from vrw_jax.branches.branch import (
     BIFURCATIONS,
     BRANCH_POINT,
@@ -57,13 +61,7 @@ from vrw_jax.branches.branch_continuation import (
     Continuation,
 )
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
-from vrw_jax.branches.continuation_problems import (
-    POINT_BATCH_SIZES,
-    BranchWheel,
-    MapProblem,
-    ReturnMapProblem,
-    number_rows,
-)
+from vrw_jax.branches.continuation_problems import BranchWheel, ReturnMapProblem, number_rows
 from vrw_jax.flow.hybrid_system import HybridSystem
 from vrw_jax.gaits.fixed_points import (
     UNIT_MULTIPLIER_ADVICE,
@@ -73,6 +71,7 @@ from vrw_jax.gaits.fixed_points import (
     estimate_state_units,
 )
 from vrw_jax.gaits.floquet import compute_multipliers
+from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits, parameterize_walker
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 from vrw_jax.models.measures import make_labeled_variables
@@ -298,6 +297,36 @@ def trace_fixed_points(
         failure = UNIT_MULTIPLIER_ADVICE if is_singular else NO_START_TEXT
     outcome = Outcome.STEPPED if data else Outcome.NO_CYCLE_FOUND
     return make_branch(problem, data, name, params, outcome, failure)
+
+
+def continue_walker_branch(
+    walker: AbstractWalker,
+    params: Any,
+    name: str,
+    bounds: Any,
+    gait: Any,
+    period_n: int,
+    options: ArclengthOptions | None,
+    step_options: StepOptions | None,
+    margins: Any,
+    measures: Any,
+    switch_at: SpecialPoint | None,
+) -> Branch:
+    """Return the branch of `continue_branch` for a walker of the user."""
+    if gait is None:
+        gait = limit_cycle(params, model=walker, period_n=period_n, options=step_options)
+    check_type("cycle", gait, HybridGait, "give vrw.limit_cycle(params, model=, guess=)")
+    period_n = math.lcm(check_int("period_n", period_n), int(gait.period_n))
+    problem, wheel = make_walker_problem(
+        walker, params, (name,), gait, period_n, step_options, margins, measures
+    )
+    if not gait.found:
+        return make_branch(problem, None, name, params, Outcome(int(gait.outcome)), gait.why)
+    value = float(wheel.values[problem.parameter_indices[0]])
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), params)
+    return trace_fixed_points(
+        problem, gait.section_state, value, bounds, wheel, name, options, switch_at, params=params
+    )
 
 
 MarginFunctions = Mapping[str, Callable[[Array, Any], Array]]

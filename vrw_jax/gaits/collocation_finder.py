@@ -16,7 +16,12 @@ from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.options import StepOptions
 from vrw_jax.gaits.collocation_search import predict_start_from_gait_surface
 from vrw_jax.gaits.cycle import CYCLE_MEASURE_FUNCTIONS, AbstractCycle
-from vrw_jax.gaits.derivatives import SearchMissingCycles, attach_derivatives
+from vrw_jax.gaits.derivatives import (
+    COLLOCATION_RESPONSE_MEASURES,
+    SearchMissingCycles,
+    SlopeResponse,
+    attach_derivatives,
+)
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
     Gait,
@@ -37,7 +42,6 @@ from vrw_jax.gaits.return_map_finder import (
     ReturnMapCycle,
     ReturnMapFinder,
 )
-from vrw_jax.gaits.slope_response import COLLOCATION_RESPONSE_MEASURES, SlopeResponse
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.measures import (

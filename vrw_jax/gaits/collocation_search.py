@@ -18,10 +18,8 @@ from jaxtyping import Array, Bool, Int
 
 from vrw_jax.base.elementwise import LaneArray, select_trees_by_condition
 from vrw_jax.base.types import Vector
-from vrw_jax.gaits.gait_surface import predict_gait
-from vrw_jax.gaits.gauss import N_GAUSS_NODES
-from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.gaits.phase_collocation import (
+from vrw_jax.gaits.gauss import (
+    N_GAUSS_NODES,
     CollocationPhase,
     CollocationSolution,
     PhaseConstants,
@@ -30,12 +28,14 @@ from vrw_jax.gaits.phase_collocation import (
     estimate_mesh_error,
     reconstruct_gait_step,
 )
+from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_sequence import (
     ADMISSIBILITY_CHECKS,
     N_LAW_SCALES,
     CollocationState,
     CollocationSystem,
     LaneParameters,
+    predict_gait,
 )
 from vrw_jax.lanes.batching import BatchFunction
 from vrw_jax.wheel.params import (
@@ -181,14 +181,13 @@ def run_newton_iterations(
             initial_parameters + homotopy_fraction * (parameters - initial_parameters),
         )
         collocation_state = search_result.collocation_state
-        cycle_linearization = collocation_system.linearize_at(
-            current_parameters, collocation_state.solution, collocation_state.is_phase_active
+        solution = collocation_state.solution
+        linearization = collocation_system.linearize_at(
+            current_parameters, solution, collocation_state.is_phase_active
         )
-        newton_correction = cycle_linearization.newton_correction
-        correction_norm = compute_correction_norm(collocation_state.solution, newton_correction)
-        correction_fraction = _compute_correction_fraction(
-            collocation_state.solution, newton_correction
-        )
+        correction = linearization.newton_correction
+        correction_norm = compute_correction_norm(solution, correction)
+        fraction = _compute_correction_fraction(solution, correction)
         is_lane_moving = is_lane_running & jnp.isfinite(correction_norm)
         newton_tolerance = jnp.where(
             2.0 * correction_norm > search_result.correction_norm,
@@ -196,17 +195,12 @@ def run_newton_iterations(
             tight_newton_tolerance,
         )
         has_converged_now = is_lane_moving & is_at_target & (correction_norm < newton_tolerance)
-        corrected_solution = jax.tree.map(
-            lambda unknowns, correction: unknowns + correction_fraction * correction,
-            collocation_state.solution,
-            newton_correction,
-        )
         corrected_result = search_result._replace(
             collocation_state=collocation_state._replace(
-                solution=corrected_solution,
-                gait_step_end_states=cycle_linearization.gait_step_end_states,
+                solution=jax.tree.map(lambda x, dx: x + fraction * dx, solution, correction),
+                gait_step_end_states=linearization.gait_step_end_states,
             ),
-            monodromy_matrix=cycle_linearization.monodromy,
+            monodromy_matrix=linearization.monodromy,
             correction_norm=correction_norm,
         )
         search_result = select_trees_by_condition(is_lane_moving, corrected_result, search_result)
@@ -436,12 +430,10 @@ def _run_search_attempt(
     is_before_target = is_on_segment & (search_attempt.homotopy_segment < N_HOMOTOPY_SEGMENTS)
     is_second_try = search_attempt.is_second_try == 1
     table_1_parameters = _make_homotopy_start(collocation_system, parameters)
-    homotopy_fraction = (
-        search_attempt.homotopy_segment.astype(parameters.dtype) / N_HOMOTOPY_SEGMENTS
-    )
+    fraction = search_attempt.homotopy_segment.astype(parameters.dtype) / N_HOMOTOPY_SEGMENTS
     target_parameters = jnp.where(
         is_before_target,
-        table_1_parameters + homotopy_fraction * (parameters - table_1_parameters),
+        table_1_parameters + fraction * (parameters - table_1_parameters),
         parameters,
     )
     last_state = search_result.collocation_state
@@ -457,15 +449,10 @@ def _run_search_attempt(
         start_state = select_trees_by_condition(
             search_attempt.starts_from_guess == 1, search_guess, start_state
         )
+    last_check = jnp.where(is_second_try, float(HomotopyFailure.FIRST_TRY_FAILED), 0.0)
     is_lane_pending = _can_attempt_change_result(
         collocation_system, attempt_index, search_result
-    ) & (
-        ~is_on_segment
-        | (
-            last_state.failed_check
-            == jnp.where(is_second_try, float(HomotopyFailure.FIRST_TRY_FAILED), 0.0)
-        )
-    )
+    ) & (~is_on_segment | (last_state.failed_check == last_check))
     attempt_result = run_newton_iterations(
         collocation_system,
         target_parameters,

@@ -392,32 +392,30 @@ FIELDS_ZERO_WITHOUT_GAIT = (
 """Names of the fields of a cycle that are zero if no gait is found."""
 
 
-def _make_duration_reader(phase_index: int) -> Callable[[AbstractCycle], Array]:
-    """Return a function that computes the total duration of one phase over a cycle, s."""
-    return lambda cycle: cycle.reduce_over_steps(cycle.durations[..., phase_index], jnp.sum)
-
-
-def _make_indicator_reader(indicator_name: str) -> Callable[[Any], Array]:
-    """Return a function that computes the minimum of a double-support indicator over a cycle."""
-    return lambda cycle: cycle.reduce_over_steps(getattr(cycle.indicators, indicator_name), jnp.min)
+def _make_step_reader(
+    read_values: Callable[[Any], Array], reduce_values: Callable
+) -> Callable[[Any], Array]:
+    """Return a function of a cycle that reduces a value of each gait step over the cycle."""
+    return lambda cycle: cycle.reduce_over_steps(read_values(cycle), reduce_values)
 
 
 CYCLE_MEASURE_FUNCTIONS: dict[str, Callable[[AbstractCycle], Array]] = {
     "dls_fraction": operator.attrgetter("dls_fraction"),
     "period": operator.attrgetter("period"),
     "speed": operator.attrgetter("speed"),
-    "step_length": lambda cycle: cycle.reduce_over_steps(cycle.step_length, jnp.sum),
-    "duration_dls": _make_duration_reader(0),
-    "duration_sls1": _make_duration_reader(1),
-    "duration_sls2": _make_duration_reader(2),
+    "step_length": _make_step_reader(operator.attrgetter("step_length"), jnp.sum),
+    **{
+        name: _make_step_reader(lambda cycle, i=i: cycle.durations[..., i], jnp.sum)  # type: ignore[misc]
+        for i, name in enumerate(("duration_dls", "duration_sls1", "duration_sls2"))
+    },
     "theta_post_impact": lambda cycle: cycle.post_impact[..., 0],
     "dtheta_post_impact": lambda cycle: cycle.post_impact[..., 1],
     "theta_touchdown": lambda cycle: cycle.section_state[..., 0],
     "dtheta_touchdown": lambda cycle: cycle.section_state[..., 1],
     "dL1_touchdown": lambda cycle: cycle.section_state[..., 2],
-    "lambda_I4": _make_indicator_reader("lambda_I4"),
-    "lambda_2_plus": _make_indicator_reader("lambda_2"),
-    "lambda_4_plus": _make_indicator_reader("lambda_4"),
+    "lambda_I4": _make_step_reader(operator.attrgetter("indicators.lambda_I4"), jnp.min),
+    "lambda_2_plus": _make_step_reader(operator.attrgetter("indicators.lambda_2"), jnp.min),
+    "lambda_4_plus": _make_step_reader(operator.attrgetter("indicators.lambda_4"), jnp.min),
     "spectral_radius": operator.attrgetter("spectral_radius"),
     "spectral_margin": operator.attrgetter("spectral_margin"),
     "stability_margin": operator.attrgetter("stability_margin"),

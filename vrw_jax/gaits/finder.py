@@ -19,7 +19,7 @@ from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.cycle import AbstractCycle
-from vrw_jax.gaits.slope_response import SlopeResponse, compute_step_slope_response
+from vrw_jax.gaits.derivatives import SlopeResponse, compute_step_slope_response
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import select_tree_rows
 from vrw_jax.models.measures import (

@@ -337,10 +337,7 @@ def _run_newton_loop(
     units: Array,
     *closed_over_values: Any,
 ) -> FixedPointResult:
-    """Find the fixed point by Newton's method in a single loop.
-
-    With a single loop the map, which is often a large program, is compiled only once.
-    """
+    """Find the fixed point in a single loop, so that the map is compiled only once."""
 
     def is_newton_searching(correction_norm: Array, n_iterations: Array) -> Array:
         return (
@@ -350,24 +347,21 @@ def _run_newton_loop(
         )
 
     def needs_newton_iteration(loop_state: tuple) -> Array:
-        _, correction_norm, n_iterations, n_final_iterations, *_ = loop_state
-        return is_newton_searching(correction_norm, n_iterations) | (
-            (correction_norm <= tolerance) & (n_final_iterations < N_FINAL_ITERATIONS)
-        )
+        _, norm, n_iterations, n_final_iterations, *_ = loop_state
+        is_final_needed = (norm <= tolerance) & (n_final_iterations < N_FINAL_ITERATIONS)
+        return is_newton_searching(norm, n_iterations) | is_final_needed
 
     def iterate_newton(loop_state: tuple) -> tuple:
         x, last_norm, n_iterations, n_final_iterations, n_stalled, size, *_ = loop_state
-        is_searching_iteration = is_newton_searching(last_norm, n_iterations).astype(
-            n_iterations.dtype
-        )
+        is_searching = is_newton_searching(last_norm, n_iterations).astype(n_iterations.dtype)
         values, jacobian = evaluate_with_jacobian(
             lambda y: closure_converted_map(y, *closed_over_values), x
         )
         defect = values - jnp.pad(x, (0, len(values) - len(x)))
         newton_correction = _solve_fixed_point_equations(jacobian, defect)
         jacobian, residual = jacobian[: len(x)], jnp.max(jnp.abs(defect[: len(x)]))
-        is_at_start = n_iterations == 0
-        size = jnp.where(is_at_start, jnp.max(jnp.maximum(size, jnp.abs(values[: len(x)]))), size)
+        start_size = jnp.max(jnp.maximum(size, jnp.abs(values[: len(x)])))
+        size = jnp.where(n_iterations == 0, start_size, size)
         # The sum of the terms of a component is no more accurate than its largest term.
         component_sizes = jnp.max(
             jnp.abs(jnp.stack([start, x, x + newton_correction, jnp.abs(jacobian) @ jnp.abs(x)])), 0
@@ -388,21 +382,19 @@ def _run_newton_loop(
         return (
             next_x,
             correction_norm,
-            n_iterations + is_searching_iteration,
-            n_final_iterations + 1 - is_searching_iteration,
+            n_iterations + is_searching,
+            n_final_iterations + 1 - is_searching,
             n_stalled,
             size,
             jacobian,
             residual,
         )
 
-    initial_count, initial_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
+    zero, initial_norm = jnp.zeros((), jnp.int32), jnp.ones((), start.dtype)
     initial_loop_state = (
         start,
         initial_norm,
-        initial_count,
-        initial_count,
-        initial_count,
+        *[zero] * 3,
         jnp.max(jnp.maximum(units, jnp.abs(start))),
         jnp.zeros((start.size,) * 2, start.dtype),
         initial_norm,

@@ -1,77 +1,174 @@
-"""Search for limit cycles, with finer meshes and walks as fallbacks.
+"""Find limit cycles of one wheel and of batches, and the sensitivities of their measures."""
 
-The search in `collocation_search` starts from predicted gaits for the paper's parameter ranges, on
-a mesh that suits these gaits. If it fails, batches of walks (`models.step_batch`) begin at starts
-that scale with the wheel. The end of a walk that settles is the start of another search. If the
-mesh is too coarse, it is refined. These fallbacks depend on concrete values. Under a caller's `jit`
-or `vmap`, a Python function runs them.
-"""
+from __future__ import annotations
 
-import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any, Literal, get_args, overload
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import (
     check_choice,
-    check_real,
+    check_int,
+    check_names,
     check_type,
+    format_name_suggestion,
     has_traced_leaf,
     require_untraced_arguments,
 )
+from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.measures import Measure, find_own_measures, name_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.printing import format_numbers
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
-from vrw_jax.gaits.collocation_finder import CollocationFinder
-from vrw_jax.gaits.collocation_search import CycleSearchResult
-from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, RETRY_OUTCOMES, replace_by_nan
-from vrw_jax.gaits.finder_selection import (
-    UserCycleGuess,
-    check_cycle_guess,
-    make_finder,
-    resolve_finder,
-)
-from vrw_jax.gaits.further_search import (
-    MeshSearch,
-    search_further,
-    transfer_to_mesh,
-)
-from vrw_jax.gaits.gait_walks import find_attracting_gaits, find_slowest_gait_indices
-from vrw_jax.gaits.last_gait import describe_last_gait
+from vrw_jax.gaits.collocation_finder import CollocationFinder, KinkedGaitFinder
+from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, AbstractCycle, replace_by_nan
+from vrw_jax.gaits.finder import AbstractGaitFinder, GaitMeasures
+from vrw_jax.gaits.further_search import describe_last_gait, search_with_fallbacks
+from vrw_jax.gaits.gait_walks import GaitChoice, find_attracting_gaits, parse_gait_choice
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
-from vrw_jax.gaits.return_map_finder import ReturnMapCycle
-from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits
+from vrw_jax.gaits.phase_sequence import CollocationState
+from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
+from vrw_jax.gaits.unilateral_finder import UnilateralFinder
+from vrw_jax.gaits.walker_finder import (
+    HybridGait,
+    WalkerFinder,
+    convert_gait_guess,
+    find_walker_gaits,
+    is_known_missing,
+    make_walker_finder,
+)
 from vrw_jax.lanes.batching import (
-    is_inside_jit,
-    map_in_batches,
-    replace_rows,
     select_rows_on_device,
     select_tree_rows,
-    unbatch,
 )
-from vrw_jax.lanes.settings import call_python, can_programs_call_jax, with_default_jax_settings
-from vrw_jax.models.step_batch import step_batch
-from vrw_jax.models.stepping import ModelLike, convert_model_argument
+from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.models.stepping import (
+    ModelLike,
+    convert_model_argument,
+    convert_section_state,
+    convert_step_options,
+    require_legs_in_turn_by_collocation,
+    require_single_wheel,
+)
 from vrw_jax.wheel.params import WheelParams
+
+UserCycleGuess = LimitCycle | ReturnMapCycle | Array | np.ndarray | Sequence[float]
+"""Guess that a user provides: a similar wheel's cycle, or a section state near the gait."""
+
+
+def make_finder(
+    model: ModelLike | None,
+    n_legs: int,
+    *,
+    period_n: int = 1,
+    cycle_options: CycleOptions | None = None,
+    step_options: StepOptions | None = None,
+) -> AbstractGaitFinder:
+    """Return the gait finder for a model."""
+    if cycle_options is not None:
+        check_type("cycle_options", cycle_options, CycleOptions, "give vrw.CycleOptions()")
+    resolved_model = convert_model_argument(model)
+    if period_n % resolved_model.leg_period:
+        raise ValueError(
+            f"period_n is {period_n}, but the legs alternate, so that a gait repeats after an even "
+            "number of steps: give period_n=2 where there is such an argument, or one law for all "
+            "legs."
+        )
+    kernel = resolved_model.batch_kernel
+    finder_class: Any = UnilateralFinder if kernel == "legs" else ReturnMapFinder
+    search_options = {}
+    if kernel == "phases":
+        finder_class = CollocationFinder
+        default_options = CycleOptions()
+        if resolved_model.own_parameters is not None:
+            # With a user's law, the fast mode of the airborne leg may decay at a varying rate. The
+            # default mesh then has errors of 3e-9.
+            default_options = default_options.refine_mesh()
+        search_options = {"cycle_options": cycle_options or default_options}
+        if resolved_model.has_kinks:
+            finder_class = KinkedGaitFinder
+    return finder_class(
+        model=resolved_model,
+        n_legs=n_legs,
+        step_options=convert_step_options(step_options),
+        period_n=period_n,
+        **search_options,
+    )
+
+
+def check_cycle_guess(cycle_guess: Any) -> Any:
+    """Convert a user's guess to a cycle, a `CollocationState` or a finite section state.
+
+    A cycle that was not found is no guess.
+    Raise ValueError if the section state is not finite.
+    """
+    cycle_guess = convert_gait_guess(cycle_guess)
+    if isinstance(cycle_guess, AbstractCycle):
+        return None if is_known_missing(cycle_guess.outcome) else cycle_guess
+    if cycle_guess is None or isinstance(cycle_guess, CollocationState):
+        return cycle_guess
+    section_state = convert_section_state(cycle_guess, "guess")
+    if not has_traced_leaf(section_state) and not np.isfinite(section_state).all():
+        raise ValueError(
+            f"guess is {format_numbers(section_state)}, but a search can begin at finite numbers "
+            "only: give a neighbour's cycle, or a section state near the gait."
+        )
+    return section_state
+
+
+def resolve_finder(
+    params: Any,
+    model: ModelLike | None,
+    options: CycleOptions | StepOptions | None,
+    period_n: int = 1,
+    guess: Any = None,
+) -> AbstractGaitFinder:
+    """Check the arguments of a search, and return the gait finder for a model and options.
+
+    Raise TypeError or ValueError if the arguments do not fit the model.
+    """
+    if is_own_walker(model):
+        step_options: Any = options
+        return make_walker_finder(
+            model, params, convert_step_options(step_options), guess, period_n
+        )
+    require_single_wheel(
+        params, "map over batches with jax.vmap, in_axes=(params.in_axes,), or use vrw.scan"
+    )
+    if options is not None:
+        check_type("options", options, (CycleOptions, StepOptions), "give vrw.CycleOptions()")
+    has_cycle_options = isinstance(options, CycleOptions)
+    gait_finder = make_finder(
+        model,
+        params.n_legs,
+        period_n=check_int("period_n", period_n),
+        cycle_options=options if has_cycle_options else None,  # type: ignore[arg-type]
+        step_options=None if has_cycle_options else options,  # type: ignore[arg-type]
+    )
+    if options is not None and not isinstance(options, gait_finder.options_type):
+        if has_cycle_options:
+            raise TypeError(
+                f"options is a CycleOptions, but {type(gait_finder.model).__name__} is solved on "
+                "its return map: give the vrw.StepOptions of its step."
+            )
+        raise TypeError(
+            "options is a StepOptions, but the paper's wheel is solved by collocation: "
+            "give vrw.CycleOptions(), or CycleOptions.tight()."
+        )
+    gait_finder.search_options.check_tolerances(jnp.result_type(*jax.tree.leaves(params)))
+    return gait_finder
+
 
 FailureFillName = Literal["zeros", "nan"]
 FAILURE_FILLS: tuple[str, ...] = get_args(FailureFillName)
-
-GaitChoice = Literal["slowest", "fastest"] | int
-"""Choice among the attracting gaits of a wheel: the slowest, the fastest, or an index.
-
-Index 0 selects the slowest gait, and speed increases with the index.
-"""
 
 
 @overload
@@ -193,7 +290,7 @@ def limit_cycle(
             f"period_n is {period_n} and there is no guess, but a gait of several steps is one of "
             "many beside the gait of one step: give guess=, a section state near it."
         )
-    cycle = _search_with_fallbacks(gait_finder, params, guess, options is None, which)
+    cycle = search_with_fallbacks(gait_finder, params, guess, options is None, which)
     return cycle.replace_missing_gaits_by_nan(params) if fills_missing_gait_with_nan else cycle
 
 
@@ -274,10 +371,10 @@ def limit_cycles(
     if params.laws is not None:
         model = checked_model.with_laws(first_wheel_params.laws)
     gait_finder = resolve_finder(first_wheel_params, model, options, period_n)
-    return _search_with_fallbacks(gait_finder, params, None, options is None, which)
+    return search_with_fallbacks(gait_finder, params, None, options is None, which)
 
 
-LAST_GAIT_DESCRIBERS[:] = [functools.partial(describe_last_gait, limit_cycles)]
+LAST_GAIT_DESCRIBERS[:] = [functools.partial(describe_last_gait, limit_cycles, make_finder)]
 
 
 def resolve_model(params: WheelParams, model: ModelLike | None) -> ModelLike | None:
@@ -319,333 +416,115 @@ def resolve_model_with_reason(
     return model_choice.model.with_laws(selected_model.laws), model_choice.why
 
 
-def parse_gait_choice(which: GaitChoice) -> int:
-    """Return the index of the chosen gait in a list of gaits that are sorted by
-    increasing speed.
+@announce_wait("the gait with its derivatives", "15 s")
+def sensitivities(
+    params: Any,
+    *,
+    measures: Sequence[str | Measure] | None = None,
+    guess: Any = None,
+    model: ModelLike | None = None,
+    options: CycleOptions | StepOptions | None = None,
+) -> xr.Dataset:
+    """Return the values, derivatives and elasticities of one gait's measures.
+
+    The derivatives and elasticities are with respect to all parameters. An elasticity is the
+    relative change of a measure per relative change of a parameter. It is NaN if the measure is
+    zero. If the stability measures are omitted, compilation takes much less time. With unilateral
+    contact, friction is also a parameter. With model "auto", `attrs` contains the name of the model
+    that was selected for the gait. For a walker of yours, the measures are the period, the section
+    coordinates and its own `measures`, by all its parameters.
+
+    Args:
+        params: the wheel, or the parameters of a walker of yours.
+        measures: names of measures, or measures of your own, see `vrw.measure`; by default all
+            measures of the model's gait.
+        guess: as in `limit_cycle`.
+        model: the model; the paper's, `ViscoelasticWheel()`, by default.
+        options: as in `limit_cycle`.
+
+    Returns:
+        A dataset with `value` (measure), `derivative` and `elasticity` (measure, parameter).
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> table = vrw.sensitivities(vrw.WheelParams(), measures=["dls_fraction", "speed"])
+        >>> round(float(table.elasticity.sel(measure="speed", parameter="slope")), 3)
+        1.887
     """
-    if isinstance(which, str):
-        return 0 if check_choice("which", which, ("slowest", "fastest")) == "slowest" else -1
-    if not check_real("which", which).is_integer():
+    require_untraced_arguments("vrw.sensitivities", "differentiate vrw.limit_cycle", params, guess)
+    guess = check_cycle_guess(guess)
+    if not is_own_walker(model):
+        model = convert_model_argument(resolve_model(params, model))  # type: ignore[arg-type]
+        require_legs_in_turn_by_collocation(model, "vrw.sensitivities")
+    period_n = model.leg_period
+    gait_finder = resolve_finder(params, model, options, period_n, guess)
+    measure_names = (
+        gait_finder.default_measures
+        if measures is None
+        else check_names("measures", name_measures(measures))
+    )
+    own_measures = (
+        find_own_measures(measures, gait_finder.readable_measures)
+        if gait_finder.model.is_wheel
+        else {}
+    )
+    unknown_names = sorted(
+        set(measure_names) - set(gait_finder.differentiable_measures) - own_measures.keys()
+    )
+    if unknown_names or not measure_names:
         raise ValueError(
-            f"which is {which!r}, but it selects one of a wheel's gaits: give 'slowest', "
-            "'fastest' or an index in vrw.limit_cycles(params, model=...)."
+            f"measures holds {', '.join(unknown_names) or 'nothing'}"
+            f"{format_name_suggestion(unknown_names[0], gait_finder.differentiable_measures) if unknown_names else ''}, "  # noqa: E501
+            "but the measures of a cycle are "
+            f"{', '.join(gait_finder.differentiable_measures)}: choose among these."
         )
-    return int(which)
-
-
-def _find_chosen_gaits(gait_finder: Any, params: WheelParams, gait_choice: GaitChoice) -> Any:
-    n_wheels = len(params.damping)
-    gait_rank = parse_gait_choice(gait_choice)
-    gait_wheel_indices, attracting_gaits = find_attracting_gaits(
-        gait_finder, gait_finder.model.collect_batch_parameter_values(params)
+    measure_gait = functools.partial(
+        gait_finder.measure_gait,
+        gait_finder.model.collect_parameter_values(params),
+        measure_names=tuple(own_measures.get(name, name) for name in measure_names),
     )
-    n_gaits_per_wheel = np.bincount(gait_wheel_indices, minlength=n_wheels)
-    # A wheel without a gait has one row, with the code of the failure.
-    has_gait = np.bincount(gait_wheel_indices, attracting_gaits.found, n_wheels) > 0
-    insufficient_gait_counts = n_gaits_per_wheel[
-        has_gait & ((gait_rank >= n_gaits_per_wheel) | (gait_rank < -n_gaits_per_wheel))
-    ]
-    if len(insufficient_gait_counts):
-        n_available_gaits = int(insufficient_gait_counts[0])
-        raise ValueError(
-            f"which is {gait_choice}, but {n_available_gaits} gait{'s' * (n_available_gaits > 1)} "
-            f"of this wheel attract{'s' * (n_available_gaits == 1)}: "
-            "vrw.limit_cycles(params, model=...) returns them."
-        )
-    return select_rows_on_device(
-        attracting_gaits,
-        find_slowest_gait_indices(gait_wheel_indices, n_wheels) + gait_rank % n_gaits_per_wheel,
+    gait_measures = measure_gait(guess)
+    if isinstance(gait_finder, WalkerFinder) and guess is None:
+        has_gait = int(gait_measures.outcome) == Outcome.STEPPED
+        start = None if has_gait else gait_finder.find_gait_by_walk(params)
+        gait_measures = gait_measures if start is None else measure_gait(start)
+    if int(gait_measures.outcome) != Outcome.STEPPED:
+        failure_outcome = Outcome(int(gait_measures.outcome))
+        raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
+    unit_of = lambda name: (own_measures.get(name) or gait_finder.get_measure(name)).unit
+    units = [unit_of(name) for name in measure_names]
+    return _make_sensitivity_table(gait_finder, params, measure_names, units, gait_measures)
+
+
+def _make_sensitivity_table(
+    gait_finder: Any, params: Any, measure_names: Any, units: list[str], gait_measures: GaitMeasures
+) -> xr.Dataset:
+    """Return the result of `sensitivities`, from measures and derivatives of the gait."""
+    model = gait_finder.model
+    parameter_values = np.asarray(model.collect_parameter_values(params))
+    measure_values, measure_derivatives = map(np.asarray, gait_measures[:2])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        elasticities = measure_derivatives * parameter_values / measure_values[:, None]
+    table_axes = ("measure", "parameter")
+    return xr.Dataset(
+        {
+            "value": ("measure", measure_values),
+            "derivative": (
+                table_axes,
+                measure_derivatives,
+                {"long_name": "d(measure)/d(parameter)"},
+            ),
+            "elasticity": (
+                table_axes,
+                np.where(np.isfinite(elasticities), elasticities, np.nan),
+                {"long_name": "relative change of measure per relative change of parameter"},
+            ),
+            "measure_unit": ("measure", units),
+            "parameter_unit": ("parameter", [x.unit for x in model.parameter_domains.values()]),
+            "parameter_value": ("parameter", parameter_values),
+        },
+        coords={"measure": list(measure_names), "parameter": list(model.parameter_names)},
+        attrs={"rung": model.model_name} if model.is_wheel else {},
     )
-
-
-def _search_with_fallbacks(
-    gait_finder: Any,
-    params: WheelParams,
-    cycle_guess: Any,
-    can_refine_mesh: bool,
-    gait_choice: GaitChoice,
-) -> Any:
-    """Find the cycle of one wheel or of each wheel in a batch, by the search and all fallbacks.
-
-    - `can_refine_mesh`: whether a finer mesh may be used;
-    - `gait_choice`: choice among several attracting gaits.
-    """
-    has_batch_axis = params.damping.ndim > 0
-    params_without_tangents = lax.stop_gradient(params)
-    are_params_concrete = not has_traced_leaf(params)
-    add_batch_axis = lambda tree: tree if has_batch_axis else select_rows_on_device(tree, None)
-    drop_added_axis = lambda tree: tree if has_batch_axis else select_rows_on_device(tree, 0)
-    if (
-        gait_finder.is_multistable
-        and cycle_guess is None
-        and not has_traced_leaf(params_without_tangents)
-    ):
-        cycle = drop_added_axis(
-            _find_chosen_gaits(gait_finder, add_batch_axis(params_without_tangents), gait_choice)
-        )
-        return (
-            cycle
-            if are_params_concrete
-            else _search_without_fallbacks(gait_finder, params, cycle.section_state)
-        )
-    # Differentiated arrays also have concrete values.
-    is_traced = is_inside_jit() or has_traced_leaf(params_without_tangents, cycle_guess)
-    search_options: dict[str, Any] = {}
-    if is_traced and can_programs_call_jax():
-        if gait_finder.supports_cold_start:
-            gait_finder = gait_finder.with_second_mesh() if can_refine_mesh else gait_finder
-            search_options = {"search_missing_cycles": _search_missing_cycles}
-        elif gait_finder.is_multistable and cycle_guess is None:
-            cycle_guess = _choose_gait_inside_jit(gait_finder, params_without_tangents, gait_choice)
-    cycle = _search_without_fallbacks(gait_finder, params, cycle_guess, **search_options)
-    if is_traced or not gait_finder.supports_cold_start:
-        return cycle
-    params_and_cycle: tuple[WheelParams, Any] = lax.stop_gradient((params, cycle))
-    params_and_cycle = add_batch_axis(params_and_cycle)
-    section_state = None
-    if cycle_guess is not None:
-        if isinstance(cycle_guess, CollocationState):
-            guess_section_state = cycle_guess.gait_step_end_states[-1][jnp.array([0, 2, 3])]
-        else:
-            guess_section_state = getattr(cycle_guess, "section_state", cycle_guess)
-        section_state = np.asarray(lax.stop_gradient(guess_section_state))[None]
-    finder_and_starts = _collect_starts_on_finest_mesh(
-        gait_finder,
-        params_and_cycle[1],
-        search_further(
-            find_cycles_from_starts,
-            gait_finder,
-            params_and_cycle[0],
-            summarize_search(params_and_cycle[1]),
-            batch_sizes.GAIT_BATCH_SIZES,
-            section_state,
-            can_refine_mesh,
-        ),
-    )
-    has_equal_steps = gait_finder.model.leg_period == 1
-    if gait_finder.period_n > 1 and has_equal_steps and section_state is not None:
-        finder_and_starts = _choose_first_step(
-            gait_finder, *params_and_cycle, section_state, finder_and_starts
-        )
-    if finder_and_starts is None:
-        return cycle
-    finest_finder, starts = finder_and_starts
-    if are_params_concrete:
-        return drop_added_axis(
-            _find_cycles_on_finest_mesh(gait_finder, finest_finder, *params_and_cycle, starts)
-        )
-    retried_cycle = _search_without_fallbacks(
-        finest_finder, params, jax.device_put(drop_added_axis(starts)), starts_only_from_guess=True
-    )
-    return _restore_first_failure_reason(cycle, retried_cycle)
-
-
-def summarize_search(cycle: LimitCycle) -> MeshSearch:
-    """Return the cycles of a batch with their mesh errors, from which a search goes on."""
-    mesh_error = map_in_batches(lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle)
-    return MeshSearch(cycle.outcome, mesh_error, cycle.collocation_state, cycle)
-
-
-def find_cycles_from_starts(
-    gait_finder: CollocationFinder, params: WheelParams, starts: CollocationState
-) -> MeshSearch:
-    """Search for the cycles of a batch from the given starts only."""
-    find_cycles = functools.partial(gait_finder.find_cycles, starts_only_from_guess=True)
-    return summarize_search(
-        map_in_batches(find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, starts)
-    )
-
-
-def _collect_starts_on_finest_mesh(
-    gait_finder: CollocationFinder,
-    cycle: LimitCycle,
-    gaits_by_mesh: list[tuple[CollocationFinder, np.ndarray, MeshSearch]],
-) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return the finder of the finest mesh, and the state of each wheel on this mesh.
-
-    The result is None if there are no further gaits.
-    """
-    collocation_state = cycle.collocation_state
-    for mesh_finder, wheel_indices, mesh_search in gaits_by_mesh:
-        if gait_finder.cycle_options != mesh_finder.cycle_options:
-            collocation_state = transfer_to_mesh(
-                gait_finder, mesh_finder, collocation_state, batch_sizes.GAIT_BATCH_SIZES
-            )
-            gait_finder = mesh_finder
-        collocation_state = replace_rows(
-            collocation_state, wheel_indices, mesh_search.collocation_state
-        )
-    return (gait_finder, collocation_state) if gaits_by_mesh else None
-
-
-def _find_cycles_on_finest_mesh(
-    gait_finder: CollocationFinder,
-    finest_finder: CollocationFinder,
-    params: WheelParams,
-    cycle: LimitCycle,
-    starts: CollocationState,
-) -> LimitCycle:
-    """Return the cycles of a batch on one mesh. Wheels without a gait keep their first result."""
-    wheels_with_gait = np.flatnonzero(np.asarray(starts.has_cycle) > 0.5)
-    cycle_on_finest_mesh = dataclasses.replace(
-        cycle,
-        collocation_state=cycle.collocation_state._replace(solution=starts.solution),
-        system=finest_finder.collocation_system,
-    )
-    mesh_search = find_cycles_from_starts(
-        finest_finder, *select_tree_rows((params, starts), wheels_with_gait)
-    )
-    is_found = np.asarray(mesh_search.outcome) == Outcome.STEPPED
-    return jax.device_put(
-        replace_rows(
-            cycle_on_finest_mesh,
-            wheels_with_gait[is_found],
-            select_tree_rows(mesh_search.gaits, is_found),
-        )
-    )
-
-
-def _restore_first_failure_reason(cycle: LimitCycle, retried_cycle: LimitCycle) -> LimitCycle:
-    """Return the cycles of the second search, with the failure reasons of the first search.
-
-    The reason of the first search replaces that of the second search if no gait exists. All
-    functions therefore report the same reason, whether fallbacks are used or not, and for any
-    batch.
-    """
-    get_failure_reason = lambda cycle: (cycle.outcome, cycle.collocation_state.failed_check)
-    failure_reasons = get_failure_reason(cycle), get_failure_reason(retried_cycle)
-    # NumPy compiles nothing for a new batch size.
-    array_module: Any = jnp if has_traced_leaf(failure_reasons) else np
-    first_reason, last_reason = jax.tree.map(array_module.asarray, failure_reasons)
-    is_gait_missing = (first_reason[0] != Outcome.STEPPED) & (last_reason[0] != Outcome.STEPPED)
-    failure_reason = jax.tree.map(
-        lambda first, last: array_module.where(is_gait_missing, first, last),
-        first_reason,
-        last_reason,
-    )
-    return eqx.tree_at(get_failure_reason, retried_cycle, jax.device_put(failure_reason))
-
-
-def _search_without_fallbacks(
-    gait_finder: Any, params: WheelParams, cycle_guess: Any, **search_options: Any
-) -> Any:
-    if not params.damping.ndim:
-        return gait_finder.find_cycle(params, cycle_guess, **search_options)
-    if cycle_guess is not None or has_traced_leaf(params):
-        return gait_finder.find_cycles(params, cycle_guess, **search_options)
-    return map_in_batches(gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
-
-
-def _search_missing_cycles(
-    collocation_system: CollocationSystem,
-    parameters: Any,
-    search_result: CycleSearchResult,
-    *guess: CollocationState,
-) -> CycleSearchResult:
-    """Return the result of a search with the cycles that all fallbacks find on the fine mesh.
-
-    JAX programs call this function. The last axis of the arrays is that of the wheels.
-    """
-    parameters, search_result, guess = jax.tree.map(np.array, (parameters, search_result, guess))
-    missing = np.flatnonzero(search_result.collocation_state.has_cycle < 0.5)
-    params = collocation_system.make_wheel(jax.device_put(parameters[:, missing]))
-    model: Any = convert_model_argument(None).with_laws(params.laws)
-    gait_finder: Any = make_finder(
-        dataclasses.replace(model, stop_at_lift_off=collocation_system.stop_at_lift_off),
-        collocation_system.n_legs,
-        period_n=collocation_system.period_n,
-        cycle_options=collocation_system.cycle_options,
-    )
-    search = functools.partial(
-        _search_with_fallbacks, gait_finder, can_refine_mesh=False, gait_choice="slowest"
-    )
-    if guess:
-        guesses = jax.tree.map(lambda x: np.moveaxis(x[..., missing], -1, 0), guess[0])
-        if collocation_system.coarse_options is not None:
-            coarse_options = collocation_system.coarse_options
-            coarse_finder = dataclasses.replace(gait_finder, cycle_options=coarse_options)
-            guesses = transfer_to_mesh(
-                coarse_finder, gait_finder, guesses, batch_sizes.GAIT_BATCH_SIZES
-            )
-        rows = [select_tree_rows((params, guesses), i) for i in range(len(missing))]
-        cycles = [search(*jax.device_put(row)) for row in rows]
-        cycle = jax.tree.map(lambda *x: np.stack(x), *cycles)
-    else:
-        cycle = search(params, None)
-    is_found = np.asarray(cycle.found)
-    for result, found in zip(
-        jax.tree.leaves(search_result),
-        jax.tree.leaves(
-            (
-                cycle.collocation_state,
-                cycle.monodromy_value,
-                cycle.residual,
-                cycle.n_newton_iterations,
-            )
-        ),
-        strict=True,
-    ):
-        result[..., missing[is_found]] = np.moveaxis(np.asarray(found)[is_found], 0, -1)
-    return search_result
-
-
-def _choose_gait_inside_jit(
-    gait_finder: Any, params: WheelParams, gait_choice: GaitChoice
-) -> Array:
-    """Return the section state of the chosen gait, which a Python function finds."""
-    section_state = gait_finder.prepare_search(params, None)[1]
-    # The values of all traced numbers are among those of the parameters.
-    concrete_finder = jax.tree.map(
-        lambda x: np.ones(x.shape, x.dtype) if isinstance(x, jax.core.Tracer) else x, gait_finder
-    )
-
-    def find_section_states(parameter_values: Any) -> np.ndarray:
-        columns = tuple(jax.device_put(list(np.asarray(parameter_values))))
-        model, batch = concrete_finder.model.from_parameter_values(columns, gait_finder.n_legs)
-        finder = dataclasses.replace(concrete_finder, model=model)
-        gaits = _find_chosen_gaits(finder, model.attach_laws(batch), gait_choice)
-        return np.asarray(gaits.section_state, section_state.dtype).T
-
-    @unbatch
-    def find_lanes(parameter_values: Array) -> Array:
-        shape = (*section_state.shape, parameter_values.shape[-1])
-        result_type = jax.ShapeDtypeStruct(shape, section_state.dtype)
-        return call_python(find_section_states, result_type, parameter_values)
-
-    return find_lanes(gait_finder.model.collect_parameter_values(params))
-
-
-def _choose_first_step(
-    gait_finder: CollocationFinder,
-    params: WheelParams,
-    cycle: LimitCycle,
-    start_section_states: np.ndarray,
-    finder_and_starts: tuple[CollocationFinder, CollocationState] | None,
-) -> tuple[CollocationFinder, CollocationState] | None:
-    """Return a finder and the same gait of one wheel, with the first step selected by its state.
-
-    The first step is the gait step that starts nearest to `start_section_states`. If no gait is
-    found, the search is repeated with each other gait step as the first step. A guess contains the
-    accelerations of all gait steps, whose errors accumulate. A gait step without double support is
-    the most sensitive step. If it is the first or the last step, the search may fail.
-    """
-    section_states = start_section_states
-    for _ in range(1, gait_finder.period_n):
-        if finder_and_starts is not None or int(cycle.outcome[0]) not in RETRY_OUTCOMES:
-            break
-        section_states = step_batch(params, section_states, model=gait_finder.model).section_state
-        cycle = map_in_batches(
-            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, section_states
-        )
-        if cycle.found[0]:
-            finder_and_starts = gait_finder, cycle.collocation_state
-    gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)
-    end_states = np.asarray(collocation_state.gait_step_end_states)[0][:, [0, 2, 3]]
-    distances_to_start = np.abs(np.roll(end_states, 1, axis=0) - start_section_states).max(-1)
-    first_step_index = int(np.argmin(distances_to_start))
-    if not first_step_index or collocation_state.has_cycle[0] < 0.5:
-        return finder_and_starts
-    shift_to_first_step = jax.vmap(
-        functools.partial(gait_finder.shift_first_step, first_step_index)
-    )
-    return gait_finder, shift_to_first_step(params, jax.device_put(collocation_state))

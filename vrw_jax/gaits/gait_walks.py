@@ -9,13 +9,14 @@ import itertools
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vrw_jax.base.checks import check_choice, check_real
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.walker import is_own_walker
@@ -413,6 +414,27 @@ def find_slowest_gait_indices(gait_wheel_indices: np.ndarray, n_wheels: int) -> 
       The gaits of a wheel are sorted by increasing speed.
     """
     return np.searchsorted(gait_wheel_indices, np.arange(n_wheels))
+
+
+GaitChoice = Literal["slowest", "fastest"] | int
+"""Choice among the attracting gaits of a wheel: the slowest, the fastest, or an index.
+
+Index 0 selects the slowest gait, and speed increases with the index.
+"""
+
+
+def parse_gait_choice(which: GaitChoice) -> int:
+    """Return the index of the chosen gait in a list of gaits that are sorted by
+    increasing speed.
+    """
+    if isinstance(which, str):
+        return 0 if check_choice("which", which, ("slowest", "fastest")) == "slowest" else -1
+    if not check_real("which", which).is_integer():
+        raise ValueError(
+            f"which is {which!r}, but it selects one of a wheel's gaits: give 'slowest', "
+            "'fastest' or an index in vrw.limit_cycles(params, model=...)."
+        )
+    return int(which)
 
 
 class PeriodicWalkEnds(NamedTuple):

@@ -25,20 +25,22 @@ from vrw_jax.gaits import floquet
 from vrw_jax.gaits.collocation_search import FAILED_MESH_CHECK_CODE
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import (
+    COLLOCATION_RESPONSE_MEASURES,
     SearchMissingCycles,
+    SlopeResponse,
     attach_monodromy_derivatives,
+    compute_sensitivity_norms,
+    make_slope_response_function,
     solve_cycle_with_derivatives,
 )
 from vrw_jax.gaits.force_peaks import measure_extremum, measure_force_peaks
-from vrw_jax.gaits.gauss import END_WEIGHTS, N_GAUSS_NODES, transfer_accelerations
-from vrw_jax.gaits.phase_collocation import CollocationSolution
-from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS, CollocationState, CollocationSystem
-from vrw_jax.gaits.slope_response import (
-    COLLOCATION_RESPONSE_MEASURES,
-    SlopeResponse,
-    compute_sensitivity_norms,
-    make_slope_response_function,
+from vrw_jax.gaits.gauss import (
+    END_WEIGHTS,
+    N_GAUSS_NODES,
+    CollocationSolution,
+    transfer_accelerations,
 )
+from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS, CollocationState, CollocationSystem
 from vrw_jax.lanes.batching import is_inside_jit
 from vrw_jax.models.step_results import DoubleSupportIndicators, Margins, SectionState
 from vrw_jax.models.stepping import step

@@ -38,7 +38,7 @@ from vrw_jax.base.elementwise import (
     solve_node_equations,
     sum_with_weights,
 )
-from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.types import Vector
 from vrw_jax.gaits.gauss import (
     DOUBLE_END_WEIGHTS,
     DOUBLE_INTEGRATION_MATRIX,
@@ -46,9 +46,12 @@ from vrw_jax.gaits.gauss import (
     GAUSS_NODES,
     INTEGRATION_MATRIX,
     N_GAUSS_NODES,
+    CollocationPhase,
+    CollocationSolution,
+    PhaseConstants,
     PhaseMesh,
-    build_phase_integration_matrices,
-    compute_lagrange_weights,
+    PhasePoint,
+    PhaseSequence,
 )
 
 MIN_LOOPED_PARAMETERS = 3
@@ -56,85 +59,6 @@ MIN_LOOPED_PARAMETERS = 3
 
 A loop over fewer tangents would shorten the code by less than it adds.
 """
-
-PhaseConstants = tuple[Elementwise, ...]
-"""Constants in the equations of motion of all phases, one array per constant."""
-
-
-class PhasePoint(NamedTuple):
-    """State at one time of a phase: coordinates, rates and held constants.
-
-    The held constants are set at the start of the phase and do not change during the phase.
-    """
-
-    held_constants: Vector
-    q: Vector
-    v: Vector
-
-
-class CollocationPhase(NamedTuple):
-    """One phase of a gait step, described by functions that are elementwise over the batch.
-
-    - `residual_function` maps (constants, point, accelerations) to the residual of the equations of
-      motion. The residual is linear in the accelerations, and its derivatives are far cheaper than
-      those of the solved equations.
-    - `end_event_function` maps (constants, point) to a scalar that is zero at the end of the phase.
-    - `guards_function` maps (constants, point) to guards that are positive during the phase.
-    - `reset_map` maps (constants, end point) to the start point of the next phase. The reset of the
-      last phase returns the section state as `q`.
-    """
-
-    phase_name: str
-    n_coordinates: int
-    residual_function: Callable[[PhaseConstants, PhasePoint, Vector], Vector]
-    end_event_function: Callable[[PhaseConstants, PhasePoint], Elementwise]
-    reset_map: Callable[[PhaseConstants, PhasePoint], PhasePoint]
-    guards_function: Callable[[PhaseConstants, PhasePoint], Vector]
-    # False if the first interval does not resolve a rapidly decaying mode
-    is_motion_smooth: bool = True
-
-
-class PhaseSequence(NamedTuple):
-    """Sequence of the phases between two crossings of the section.
-
-    `section_size` is the number of section coordinates. `step_start_map` maps (constants, section
-    state) to the start point of the first phase. `margins_function` maps (constants, points of all
-    phases, flags of active phases) to the margins, which are positive if the gait is admissible.
-    `constants_of_step` maps (constants, parity) to the constants of a gait step, if they alternate.
-    The parity is 1 for the second of two gait steps, and 0 for the first.
-    """
-
-    section_size: int
-    step_start_map: Callable[[PhaseConstants, Vector], PhasePoint]
-    phases: tuple[CollocationPhase, ...]
-    margins_function: Callable[[PhaseConstants, "tuple[PhasePoints, ...]", Array], Vector]
-    constants_of_step: Callable[[PhaseConstants, Any], PhaseConstants] | None = None
-
-    def list_parities(self, n_gait_steps: int, dtype: Any) -> tuple[Array, ...]:
-        """Return the parity of each gait step as an input of a loop, or nothing."""
-        if self.constants_of_step is None:
-            return ()
-        return (jnp.asarray(np.arange(n_gait_steps) % 2, dtype),)
-
-    def select_constants(
-        self, phase_constants: PhaseConstants, parity: Sequence[Any]
-    ) -> PhaseConstants:
-        """Return the constants of a gait step, whose parity is the only entry if they alternate."""
-        if self.constants_of_step is None:
-            return phase_constants
-        return self.constants_of_step(phase_constants, *parity)
-
-
-class CollocationSolution(NamedTuple):
-    """Unknowns of a cycle that consists of n gait steps. The last axis contains the batch elements.
-
-    Each gait step consists of all phases of the sequence.
-    """
-
-    section_state: LaneArray  # (section_size, batch), at the start of the first gait step
-    durations: LaneArray  # (n, n_phases, batch), s
-    # one array per phase: (n, n_intervals, N_GAUSS_NODES, n_coordinates, batch)
-    accelerations: tuple[LaneArray, ...]
 
 
 class CycleLinearization(NamedTuple):
@@ -166,17 +90,8 @@ def _stack_phase_point(phase_point: PhasePoint, template_component_array: Array)
     A part without components becomes an empty array. Its trailing shape and type are those of
     `template_component_array`.
     """
-    array_without_components = jnp.zeros(
-        (0, *template_component_array.shape[1:]), template_component_array.dtype
-    )
-    return _PhaseState(
-        *(
-            jnp.stack(components_of_point_part)
-            if components_of_point_part
-            else array_without_components
-            for components_of_point_part in phase_point
-        )
-    )
+    empty = jnp.zeros((0, *template_component_array.shape[1:]), template_component_array.dtype)
+    return _PhaseState(*(jnp.stack(part) if part else empty for part in phase_point))
 
 
 class _StateAndTangents(NamedTuple):
@@ -481,12 +396,11 @@ class _LinearizationContext(NamedTuple):
     ) -> tuple[_StateAndTangents, LaneArray]:
         """Return the state at the end of a phase, and the tangents of its node accelerations.
 
-        Both have the directions of `phase_start`, and after them one further direction, that of the
-        phase's duration.
+        After the directions of `phase_start`, both have that of the phase's duration.
         """
         float_dtype = phase_duration.dtype
-        append_duration_tangent = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
-        tangents = jax.tree.map(append_duration_tangent, phase_start.tangents)
+        append_zero = lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])])
+        tangents = jax.tree.map(append_zero, phase_start.tangents)
         parts = self.split_tangents(tangents) if self.has_parameter_loop else (tangents,)
         n_tangents = len(parts[0].q)
         correction_direction, duration_direction = (
@@ -508,31 +422,25 @@ class _LinearizationContext(NamedTuple):
             node_matrix = self.prevent_fusion(self.assemble_node_matrix(h, jacobian))
 
             def propagate_tangents(
-                tangents: _PhaseState,
-                directions: tuple[np.ndarray, np.ndarray],
-                parameter_derivatives: Any,
+                tangents: _PhaseState, directions: tuple, parameter_derivatives: Any
             ) -> tuple[_PhaseState, Array]:
                 correction_direction, duration_direction = directions
+                node_tangents = interval.evaluate_node_tangents(tangents, duration_direction)
                 right_hand_sides = self.assemble_right_hand_sides(
                     (residual, jacobian, parameter_derivatives),
                     tangents.held_constants,
-                    self.prevent_fusion(
-                        interval.evaluate_node_tangents(tangents, duration_direction)
-                    ),
+                    self.prevent_fusion(node_tangents),
                     correction_direction,
                 )
+                right_hand_sides = self.prevent_fusion(right_hand_sides)
                 # Axes: (node, row, tangent, batch).
                 acceleration_tangents = self.prevent_fusion(
-                    solve_node_equations(
-                        node_matrix, self.prevent_fusion(right_hand_sides), self.parameters
-                    )
+                    solve_node_equations(node_matrix, right_hand_sides, self.parameters)
                 )
-                return (
-                    interval.evaluate_end_tangents(
-                        tangents, duration_direction, acceleration_tangents
-                    ),
-                    jnp.moveaxis(acceleration_tangents, 2, 0),
+                end_tangents = interval.evaluate_end_tangents(
+                    tangents, duration_direction, acceleration_tangents
                 )
+                return end_tangents, jnp.moveaxis(acceleration_tangents, 2, 0)
 
             def propagate_parameter_tangent(inputs: tuple) -> tuple[_PhaseState, Array]:
                 tangents, parameter_derivatives = jax.tree.map(lambda x: x[None], inputs)
@@ -542,7 +450,7 @@ class _LinearizationContext(NamedTuple):
                 return jax.tree.map(lambda x: x[0], results)
 
             if self.parameter_indices and not parameter_tangents:
-                padding = ((self.section_tangent_slice.stop, 1), *((0, 0),) * 3)
+                padding = (self.section_tangent_slice.stop, 1), *((0, 0),) * 3
                 parameter_derivatives = jnp.pad(parameter_derivatives, padding)
             results = [
                 propagate_tangents(
@@ -558,13 +466,11 @@ class _LinearizationContext(NamedTuple):
             end_tangents, acceleration_tangents = zip(*results, strict=True)
             return (interval.evaluate_end(), end_tangents), acceleration_tangents
 
-        interval_length_fractions = jnp.asarray(
-            phase_mesh.interval_length_fractions, phase_duration.dtype
-        )
+        length_fractions = jnp.asarray(phase_mesh.interval_length_fractions, float_dtype)
         (state, parts), acceleration_tangents = lax.scan(
             linearize_mesh_interval,
             (phase_start.state, parts),
-            (phase_accelerations, interval_length_fractions),
+            (phase_accelerations, length_fractions),
         )
         # Axes: (tangent, interval, node, row, batch).
         acceleration_tangents = tuple(jnp.swapaxes(x, 0, 1) for x in acceleration_tangents)
@@ -786,104 +692,3 @@ def close_cycle(
         gait_step_end_tangents=step_end_tangents[1:],
         monodromy=monodromy,
     )
-
-
-class PhasePoints(NamedTuple):
-    """Points of one phase: the start point, all node points (on a leading axis) and the
-    end point.
-    """
-
-    phase_start_point: PhasePoint
-    node_points: PhasePoint
-    phase_end_point: PhasePoint
-
-
-def reconstruct_gait_step(
-    system: Any,
-    phase_constants: PhaseConstants,
-    section_state: Vector,
-    phase_durations: Array,
-    accelerations_by_phase: tuple[Array, ...],
-) -> tuple[Vector, tuple[PhasePoints, ...]]:
-    """Reconstruct the motion of a gait step from its phase durations and node accelerations.
-
-    Return the section state at the end of the gait step, and the points of each phase. No equation
-    is solved. Arrays may have additional trailing axes.
-    """
-    phase_start_point = system.phase_sequence.step_start_map(phase_constants, section_state)
-    phase_points = []
-    for i, collocation_phase in enumerate(system.phase_sequence.phases):
-        node_times, rate_integration_matrix, position_integration_matrix = (
-            float64_weights.astype(phase_durations.dtype)
-            for float64_weights in build_phase_integration_matrices(system.phase_meshes[i])
-        )
-        phase_accelerations = accelerations_by_phase[i]
-        phase_accelerations = phase_accelerations.reshape(-1, *phase_accelerations.shape[2:])
-        phase_duration = phase_durations[i]
-        q = jnp.stack(phase_start_point.q)
-        v = jnp.stack(phase_start_point.v)
-        node_times = node_times.reshape(-1, *(1,) * q.ndim)
-        node_q = q + phase_duration * (
-            node_times * v
-            + phase_duration * jnp.tensordot(position_integration_matrix, phase_accelerations, 1)
-        )
-        node_v = v + phase_duration * jnp.tensordot(rate_integration_matrix, phase_accelerations, 1)
-        node_points = PhasePoint(
-            phase_start_point.held_constants,
-            tuple(node_q[:-1].swapaxes(0, 1)),
-            tuple(node_v[:-1].swapaxes(0, 1)),
-        )
-        phase_end_point = PhasePoint(
-            phase_start_point.held_constants, tuple(node_q[-1]), tuple(node_v[-1])
-        )
-        phase_points.append(PhasePoints(phase_start_point, node_points, phase_end_point))
-        phase_start_point = collocation_phase.reset_map(phase_constants, phase_end_point)
-    return phase_start_point.q, tuple(phase_points)
-
-
-def estimate_mesh_error(
-    system: Any,
-    collocation_solution: CollocationSolution,
-    error_per_acceleration_jump: float = 0.05,
-) -> LaneArray:
-    """Estimate the discretization error of a cycle for each batch element, shape (batch,).
-
-    The unit is rad for angles and m for lengths; times are in units of the period. The
-    accelerations are a separate polynomial in each mesh interval. At the boundary between two
-    intervals, the two polynomials differ by their errors. Each such jump is multiplied by the
-    square of the longer interval. The estimate is the largest product, multiplied by
-    `error_per_acceleration_jump`. Phases whose `is_motion_smooth` is False are ignored, because
-    their error in one interval hardly affects the next phase.
-
-    - `error_per_acceleration_jump`: dimensionless factor. The value is chosen because, except for
-      round-off, the estimate bounds the error in tests with random gaits that have periods up to
-      10 s. For most gaits the estimate is far above the error.
-    """
-    section_state = collocation_solution.section_state
-    float_dtype = section_state.dtype
-    largest_acceleration_jump = jnp.zeros(section_state.shape[-1], float_dtype)
-
-    def interpolate_accelerations(location_in_interval: float, accelerations: Array) -> Array:
-        lagrange_weights = compute_lagrange_weights(location_in_interval)
-        return jnp.tensordot(jnp.asarray(lagrange_weights, float_dtype), accelerations, (0, 2))
-
-    for i, phase_mesh in enumerate(system.phase_meshes):
-        if phase_mesh.n_intervals == 1 or not system.phase_sequence.phases[i].is_motion_smooth:
-            continue
-        accelerations = collocation_solution.accelerations[i]
-        acceleration_jump = interpolate_accelerations(
-            1.0, accelerations[:, :-1]
-        ) - interpolate_accelerations(0.0, accelerations[:, 1:])
-        interval_fractions = phase_mesh.interval_length_fractions
-        longer_interval_fraction = np.maximum(interval_fractions[1:], interval_fractions[:-1])
-        longer_interval_length = (
-            longer_interval_fraction[:, None, None].astype(float_dtype)
-            * collocation_solution.durations[:, None, None, i]
-        )
-        acceleration_jump = (
-            jnp.abs(acceleration_jump) * longer_interval_length * longer_interval_length
-        )
-        largest_acceleration_jump = jnp.maximum(
-            largest_acceleration_jump, jnp.max(acceleration_jump, axis=(0, 1, 2))
-        )
-    return error_per_acceleration_jump * largest_acceleration_jump

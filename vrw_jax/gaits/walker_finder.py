@@ -44,6 +44,7 @@ from vrw_jax.base.walker import (
     name_coordinates,
     propose_starts,
 )
+from vrw_jax.gaits.derivatives import SlopeResponse
 from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import (
     MAX_NEWTON_ITERATIONS,
@@ -52,7 +53,6 @@ from vrw_jax.gaits.fixed_points import (
     solve_fixed_point,
 )
 from vrw_jax.gaits.gait_walks import walk_until_periodic
-from vrw_jax.gaits.slope_response import SlopeResponse
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import (
     map_in_batches,

@@ -5,6 +5,11 @@ from vrw_jax.models.contact_mechanics import compute_foot_heights, compute_leg_d
 from vrw_jax.models.contact_state import unpack_state
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian
 from vrw_jax.models.interface import AbstractWheel
+from vrw_jax.models.ladder import (
+    MODEL_CLASSES,
+    describe_accepted_models,
+    list_model_config_names,
+)
 from vrw_jax.models.measures import (
     FORCE_PEAK_MEASURES,
     LIMIT_CYCLE_MEASURES,
@@ -18,11 +23,6 @@ from vrw_jax.models.measures import (
     UNILATERAL_STEP_MEASURES,
     describe_violation,
 )
-from vrw_jax.models.registry import (
-    MODEL_CLASSES,
-    describe_accepted_models,
-    list_model_config_names,
-)
 from vrw_jax.models.rigid import RigidWheel
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
@@ -32,5 +32,6 @@ from vrw_jax.models.step_results import (
     StepResult,
 )
 from vrw_jax.models.stepping import walk
+from vrw_jax.models.trajectory import SAMPLED_FORCE_PEAK_MEASURES
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import N_STEP_INPUTS, advance_gait_step

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax.base.elementwise import run_if_any_element_active, select_trees_by_condition
@@ -17,6 +16,7 @@ from vrw_jax.base.types import Elementwise
 from vrw_jax.models.contact_jvp import (
     ContactConfiguration,
     WheelForceSolution,
+    compute_slip_signs,
     find_slot_contacts,
     solve_contact_configuration,
     solve_contact_forces,
@@ -27,7 +27,6 @@ from vrw_jax.models.contact_mechanics import (
     ContactSlots,
     FreeMotion,
     Friction,
-    LegArray,
     SlotArray,
     WheelMotion,
     align_with_batch,
@@ -39,6 +38,7 @@ from vrw_jax.models.contact_mechanics import (
     compute_kinetic_energy,
     compute_leg_directions,
     find_contact_slots,
+    find_rebound_fraction,
     make_inverse_inertia,
     select_slot_friction,
     stop_gradients,
@@ -50,8 +50,11 @@ from vrw_jax.models.contact_modes import (
     AllowedContactModes,
     ChosenModeCombination,
     ContactSignTolerances,
+    LevelSolution,
     choose_combination,
     is_release_consistent,
+    list_modes_after_event,
+    solve_stopper_lcp,
 )
 from vrw_jax.models.contact_state import (
     ContactState,
@@ -59,9 +62,8 @@ from vrw_jax.models.contact_state import (
     find_kink_sides,
     select_kink_sides,
 )
-from vrw_jax.wheel.ground import GroundAhead
-from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.transitions import ContactMode, GroundAhead
 
 
 class ContactEvent(NamedTuple):
@@ -94,11 +96,10 @@ def classify_event(guard_layout: GuardLayout, guard_index: Int[Array, "..."]) ->
     """Return the kind of the event at which the guard with the index `guard_index` is zero."""
     select_flags = lambda guards: guard_index == align_with_batch(np.array(guards), guard_index)
     n_legs, first_release = len(guard_layout.landing), guard_layout.airborne_release.start
-    kinks = guard_layout.kinks[::n_legs]
     flags: list[Any] = [
         *map(select_flags, guard_layout[:7]),
         select_flags(range(first_release, first_release + n_legs)),
-        tuple(select_flags(range(first, first + n_legs)) for first in kinks),
+        tuple(select_flags(range(first, first + n_legs)) for first in guard_layout.kinks[::n_legs]),
     ]
     return ContactEvent(*flags)
 
@@ -121,134 +122,6 @@ class ContactLaw(NamedTuple):
     def stopper_rest_speed(self) -> Elementwise:
         """Return the speed below which a leg stays on its stopper after an impact, m/s."""
         return self.rest_speed * (1 + self.n_late_events)
-
-
-MAX_BLOCK_PIVOTS = 8
-"""Number of pivots that switch all legs with a wrong sign."""
-MAX_SINGLE_PIVOTS = 16
-"""Number of later pivots that switch one leg each."""
-MAX_ENUMERATED_LEGS = 8
-"""Largest number of legs whose combinations are enumerated if pivoting fails."""
-
-
-class _KinematicLevelSolution(NamedTuple):
-    """Solution in terms of velocities or accelerations, for an assumed set of closed stoppers.
-
-    The stoppers are those of legs in the air.
-    """
-
-    chosen_combination: ChosenModeCombination
-    force_solution: WheelForceSolution
-    stopper_forces: LegArray  # force or impulse of the stoppers, N or N s
-    outward_leg_motion: LegArray  # acceleration or rate of the leg lengths, m/s^2 or m/s
-    motion_after_impact: WheelMotion  # motion after the impact
-
-
-def _solve_stopper_lcp(
-    solve_kinematic_level: Callable[..., _KinematicLevelSolution],
-    contact_law: ContactLaw,
-    motion: WheelMotion,
-    is_at_stopper: Array,
-    is_stopper_tested: Array,
-    tolerances: ContactSignTolerances,
-) -> tuple[_KinematicLevelSolution, Array]:
-    """Return the solution with complementary stopper forces, and whether each stopper is closed.
-
-    The stopper of a tested leg is closed if it pushes. It is open if the leg moves inwards. The
-    first pivots switch all legs with a wrong sign together. Later pivots switch only the last of
-    these legs, which prevents cycles. The method is principal pivoting, which is finite if no
-    friction couples the legs (Murty 1974, Kostreva 1978).
-
-    - `solve_kinematic_level`: function that solves for velocities or accelerations, for an assumed
-      set of closed stoppers. Its arguments are the contact law, the motion, the flags of the closed
-      stoppers and, if it is known, the combination of contact modes, else None.
-
-    If stoppers are bilateral, all stoppers in `is_at_stopper` are closed and may pull.
-
-    If pivoting fails, all combinations are enumerated, and the solution with the smallest violation
-    is returned. This solution is admissible if its violation is at most `MAX_VIOLATION`.
-    """
-    if not contact_law.has_one_sided_stoppers:
-        return solve_kinematic_level(contact_law, motion, is_at_stopper, None), is_at_stopper
-    constant_inputs = stop_gradients((contact_law, motion))
-    tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
-    n_combinations = 1 << jnp.minimum(
-        jnp.sum(is_stopper_tested, axis=0, dtype=jnp.int32),
-        MAX_ENUMERATED_LEGS,
-    )
-    leg_index = align_with_batch(np.arange(len(is_at_stopper), dtype=np.int32), n_combinations)
-
-    def is_unfinished(pivot_state: tuple) -> Array:
-        _, combination_code, n_attempts, best_solution = pivot_state
-        return (n_attempts == 0) | ((best_solution[0] > 1.0) & (combination_code < n_combinations))
-
-    def pivot_legs(pivot_state: tuple) -> tuple:
-        is_stopper_holding, combination_code, n_attempts, best_solution = pivot_state
-        level_solution = solve_kinematic_level(
-            constant_inputs[0], constant_inputs[1], is_stopper_holding, None
-        )
-        sign_violation = jnp.where(
-            is_stopper_holding,
-            -level_solution.stopper_forces / tolerances.force_tolerance,
-            level_solution.outward_leg_motion / tolerances.motion_tolerance,
-        )
-        sign_violation = jnp.where(is_stopper_tested, lax.stop_gradient(sign_violation), 0.0)
-        has_wrong_sign = sign_violation > 1.0
-        max_violation = jnp.maximum(
-            jnp.max(sign_violation, axis=0), level_solution.chosen_combination.sign_violation
-        )
-        best_solution = select_trees_by_condition(
-            max_violation < best_solution[0],
-            (max_violation, is_stopper_holding, level_solution.chosen_combination),
-            best_solution,
-        )
-        is_last_wrong_leg = leg_index == jnp.max(jnp.where(has_wrong_sign, leg_index, -1), axis=0)
-        switched_legs = is_stopper_holding ^ jnp.where(
-            n_attempts < MAX_BLOCK_PIVOTS, has_wrong_sign, is_last_wrong_leg
-        )
-        is_pivoting = (
-            (combination_code < 0)
-            & jnp.any(has_wrong_sign, axis=0)
-            & (n_attempts < MAX_BLOCK_PIVOTS + MAX_SINGLE_PIVOTS)
-        )
-        combination_code = jnp.where(is_pivoting, combination_code, combination_code + 1)
-        enumerated_legs = jnp.where(
-            is_stopper_tested, ((combination_code >> tested_leg_rank) & 1) == 1, is_at_stopper
-        )
-        return select_trees_by_condition(
-            is_unfinished(pivot_state),
-            (
-                jnp.where(is_pivoting, switched_legs, enumerated_legs),
-                combination_code,
-                n_attempts + 1,
-                best_solution,
-            ),
-            pivot_state,
-        )
-
-    int_zeros = jnp.zeros_like(n_combinations)
-    slot_zeros = jnp.stack([n_combinations, n_combinations]) * 0
-    infinite_sign_violation = jnp.full_like(constant_inputs[1].theta, jnp.inf)
-    initial_state = (
-        is_at_stopper,
-        int_zeros - 1,
-        int_zeros,
-        (
-            infinite_sign_violation,
-            is_at_stopper,
-            ChosenModeCombination(slot_zeros, slot_zeros > 0, infinite_sign_violation, int_zeros),
-        ),
-    )
-    final_state = lax.while_loop(
-        lambda pivot_state: jnp.any(is_unfinished(pivot_state)), pivot_legs, initial_state
-    )
-    max_violation, is_stopper_holding, chosen_combination = final_state[3]
-    chosen_combination = chosen_combination._replace(
-        n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
-    )
-    return solve_kinematic_level(
-        contact_law, motion, is_stopper_holding, chosen_combination
-    ), is_stopper_holding
 
 
 class ContactEventResult(NamedTuple):
@@ -305,53 +178,67 @@ def _apply_restitution(
     )
 
 
-def _limit_energy_gain(
+def _solve_level(
     contact_law: ContactLaw,
     motion: WheelMotion,
-    newton_solution: _KinematicLevelSolution,
-    inelastic_solution: _KinematicLevelSolution,
-) -> _KinematicLevelSolution:
-    """Return the impact with the largest part of Newton's rebound that adds no energy.
+    contact_slots: ContactSlots,
+    stoppers: tuple[Array, Array],
+    tolerances: ContactSignTolerances,
+    compute_free_motion: Callable[..., FreeMotion],
+    list_allowed_modes: Callable[..., AllowedContactModes],
+    is_impact: bool,
+) -> tuple[LevelSolution, Bool[Array, "n ..."]]:
+    """Return the solution of a level, and whether each leg in the air is held on its stopper.
 
-    With Coulomb friction, Newton's law of restitution can increase the energy (Kane 1984). The
-    inelastic impact never increases the energy. The result is on the straight line from the
-    inelastic impact to Newton's impact, on which the energy is a quadratic function. Impulses stay
-    in the friction cone, because the cone is convex.
+    - `stoppers`: whether each leg in the air is on its stopper, and whether its stopper is tested;
+    - `compute_free_motion`: function of the contact law, the motion and the inverse inertia;
+    - `list_allowed_modes`: function of the inverse inertia and the free motion;
+    - `is_impact`: whether velocities are solved for.
     """
-    compute_energy = lambda motion_state: compute_kinetic_energy(contact_law.s, motion_state)
-    energy_inelastic = compute_energy(inelastic_solution.motion_after_impact)
-    energy_newton = compute_energy(newton_solution.motion_after_impact)
-    energy_midpoint = compute_energy(
-        jax.tree.map(
-            lambda a, b: 0.5 * (a + b),
-            inelastic_solution.motion_after_impact,
-            newton_solution.motion_after_impact,
+
+    def solve(
+        contact_law: ContactLaw,
+        motion: WheelMotion,
+        is_airborne_leg_locked: Array,
+        chosen_combination: ChosenModeCombination | None,
+    ) -> LevelSolution:
+        s, friction = contact_law.s, select_slot_friction(contact_law.friction, contact_slots)
+        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked)
+        free_motion = compute_free_motion(contact_law, motion, inverse_inertia)
+        if chosen_combination is None:
+            chosen_combination = choose_combination(
+                s,
+                inverse_inertia,
+                free_motion,
+                list_allowed_modes(inverse_inertia, free_motion),
+                friction,
+                tolerances,
+                contact_law.counts_all_solutions,
+            )
+        contact_configuration = ContactConfiguration(
+            s,
+            friction,
+            contact_slots,
+            *chosen_combination[:2],
+            is_airborne_leg_locked,
+            motion,
         )
-    )
-    parabola_curvature = 2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_newton)
-    parabola_linear_term = 4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_newton
-    allowed_energy_gain = jnp.maximum(compute_energy(motion) - energy_inelastic, 0.0)
-    has_energy_gain = energy_newton > compute_energy(motion)
-    sqrt_discriminant = jnp.sqrt(
-        jnp.where(
-            has_energy_gain,
-            parabola_linear_term * parabola_linear_term
-            + 4.0 * parabola_curvature * allowed_energy_gain,
-            1.0,
+        force_solution = (
+            solve_impact(contact_configuration)
+            if is_impact and contact_law.restitution is None
+            else solve_contact_configuration(contact_configuration, inverse_inertia, free_motion)
         )
-    )
-    rebound_fraction = jnp.where(
-        has_energy_gain,
-        2.0
-        * allowed_energy_gain
-        / jnp.where(has_energy_gain, parabola_linear_term + sqrt_discriminant, 1.0),
-        1.0,
-    )
-    interpolate_rebound = lambda a, b: jnp.where(has_energy_gain, a + rebound_fraction * (b - a), b)
-    return _KinematicLevelSolution(
-        newton_solution.chosen_combination,
-        *jax.tree.map(interpolate_rebound, inelastic_solution[1:], newton_solution[1:]),
-    )
+        sin, cos = inverse_inertia.leg_directions
+        x, z, _ = force_solution.hub_motion
+        if is_impact:
+            contact_impulse = s.m * (sin * (x - motion.vx) + cos * (z - motion.vz) + motion.dL)
+            stoppers = contact_impulse, force_solution.length_motion
+        else:
+            outward_leg_motion = free_motion.leg_motion + sin * x + cos * z
+            stoppers = s.m * outward_leg_motion, outward_leg_motion
+        return LevelSolution(chosen_combination, force_solution, *stoppers)
+
+    return solve_stopper_lcp(solve, contact_law, motion, *stoppers, tolerances)
 
 
 def _solve_velocity_level(
@@ -359,7 +246,7 @@ def _solve_velocity_level(
     motion: WheelMotion,
     contact_state: ContactState,
     contact_event: ContactEvent,
-) -> tuple[_KinematicLevelSolution, ContactSlots, Bool[Array, "n ..."]]:
+) -> tuple[LevelSolution, ContactSlots, Bool[Array, "n ..."]]:
     """Return the solution of an impact in which all contacts strike at once.
 
     Coulomb's law applies to impulses. The result is (solution, contact slots, whether each leg in
@@ -397,117 +284,40 @@ def _solve_velocity_level(
         contact_law.stopper_rest_speed / MAX_VIOLATION,
     )
 
-    def solve_kinematic_level(
-        contact_law: ContactLaw,
-        motion: WheelMotion,
-        is_airborne_leg_locked: Array,
-        chosen_combination: ChosenModeCombination | None,
-    ) -> _KinematicLevelSolution:
-        s, friction = contact_law.s, select_slot_friction(contact_law.friction, contact_slots)
-        leg_directions = compute_leg_directions(s, motion.theta)
-        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked)
-        free_motion = compute_free_velocity(s, motion, contact_slots, inverse_inertia)
-        rebound_motion = _apply_restitution(
-            contact_law, motion, contact_slots, inverse_inertia, free_motion
-        )
-        if chosen_combination is None:
-            chosen_combination = choose_combination(
-                s,
-                inverse_inertia,
-                rebound_motion,
-                allowed_contact_modes,
-                friction,
-                tolerances,
-                contact_law.counts_all_solutions,
-            )
-        contact_configuration = ContactConfiguration(
-            s,
-            friction,
-            contact_slots,
-            *chosen_combination[:2],
-            is_airborne_leg_locked,
-            motion,
-        )
-        force_solution = (
-            solve_impact(contact_configuration)
-            if contact_law.restitution is None
-            else solve_contact_configuration(contact_configuration, inverse_inertia, rebound_motion)
-        )
-        motion_after = _apply_impact_velocities(motion, force_solution)
-        hub_velocity_jump_x, hub_velocity_jump_z = (
-            motion_after.vx - motion.vx,
-            motion_after.vz - motion.vz,
-        )
-        contact_impulse = s.m * (
-            leg_directions.sin * hub_velocity_jump_x
-            + leg_directions.cos * hub_velocity_jump_z
-            + motion.dL
-        )
-        return _KinematicLevelSolution(
-            chosen_combination, force_solution, contact_impulse, motion_after.dL, motion_after
-        )
-
     is_airborne_leg_locked = is_at_stopper & ~contact_slots.is_in_slot
-    is_stopper_tested = is_airborne_leg_locked & contact_event.is_impact
-    level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve_kinematic_level,
+    level_solution, is_held_airborne = _solve_level(
         contact_law,
         motion,
-        is_airborne_leg_locked,
-        is_stopper_tested,
+        contact_slots,
+        (is_airborne_leg_locked, is_airborne_leg_locked & contact_event.is_impact),
         tolerances,
-    )
-    return level_solution, contact_slots, is_held_airborne
-
-
-def _list_modes_after_event(
-    contact_event: ContactEvent, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
-) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
-    """Return the contact modes that may follow an event, and the modes that need no test.
-
-    The result contains two sets of modes for each contact slot, with one bit per mode.
-
-    - `slot_modes`: contact mode of the foot in each contact slot before the event;
-    - `is_consistent`: whether the released foot moves in the release direction (see
-      `is_release_consistent`);
-    - `follows_paper_rule`: whether the rule of the paper applies to infinite friction.
-    """
-    current_mode_bit, off_mode_bit = 1 << slot_modes, 1 << ContactMode.OFF
-    possible_modes = jnp.where(
-        slot_modes == ContactMode.STICK, ALL_MODES_MASK, current_mode_bit | off_mode_bit
-    )
-    reversed_mode_bit = jnp.where(
-        slot_modes == ContactMode.SLIP_DOWN, 1 << ContactMode.SLIP_UP, 1 << ContactMode.SLIP_DOWN
-    )
-    possible_modes = jnp.where(
-        contact_event.is_stopping_to_slide,
-        1 << ContactMode.STICK | off_mode_bit | reversed_mode_bit,
-        possible_modes,
-    )
-    untested_modes = jnp.where(
-        (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide, 0, current_mode_bit
-    )
-    for event_flags, following_mode, ended_mode in (
-        (contact_event.is_foot_lifting_off, off_mode_bit, current_mode_bit),
-        (contact_event.is_starting_to_slide_up, 1 << ContactMode.SLIP_UP, 1 << ContactMode.STICK),
-        (
-            contact_event.is_starting_to_slide_down,
-            1 << ContactMode.SLIP_DOWN,
-            1 << ContactMode.STICK,
+        lambda contact_law, motion, inverse_inertia: _apply_restitution(
+            contact_law,
+            motion,
+            contact_slots,
+            inverse_inertia,
+            compute_free_velocity(contact_law.s, motion, contact_slots, inverse_inertia),
         ),
-    ):
-        tested_mode_bits = (
-            ALL_MODES_MASK
-            & ~ended_mode
-            & jnp.where(is_consistent | follows_paper_rule, ALL_MODES_MASK, ~following_mode)
+        lambda *_: allowed_contact_modes,
+        is_impact=True,
+    )
+    if contact_law.restitution is not None:
+        inelastic_solution, *_ = _solve_velocity_level(
+            contact_law._replace(restitution=None), motion, contact_state, contact_event
         )
-        possible_modes = jnp.where(
-            event_flags, jnp.where(is_consistent, following_mode, tested_mode_bits), possible_modes
+        has_energy_gain, fraction = find_rebound_fraction(
+            s,
+            motion,
+            _apply_impact_velocities(motion, inelastic_solution.force_solution),
+            _apply_impact_velocities(motion, level_solution.force_solution),
         )
-        untested_modes = jnp.where(
-            event_flags, jnp.where(is_consistent, following_mode, 0), untested_modes
+        # Between both impacts, impulses stay in the friction cone, because the cone is convex.
+        interpolate = lambda a, b: jnp.where(has_energy_gain, a + fraction * (b - a), b)
+        level_solution = LevelSolution(
+            level_solution.chosen_combination,
+            *jax.tree.map(interpolate, inelastic_solution[1:], level_solution[1:]),
         )
-    return possible_modes, untested_modes
+    return level_solution, contact_slots, is_held_airborne
 
 
 FORCE_ROUNDOFF_FRACTION = 1e-9
@@ -557,71 +367,40 @@ def _solve_acceleration_level(
         FORCE_ROUNDOFF_FRACTION * s.Mt * s.g, FORCE_ROUNDOFF_FRACTION * s.g
     )
 
-    def solve_kinematic_level(
-        contact_law: ContactLaw,
-        motion: WheelMotion,
-        is_airborne_leg_locked: Array,
-        chosen_combination: ChosenModeCombination | None,
-    ) -> _KinematicLevelSolution:
-        inverse_inertia = make_inverse_inertia(s, motion, contact_slots, is_airborne_leg_locked)
-        free_motion = compute_free_acceleration(s, motion, contact_slots, inverse_inertia)
-        if chosen_combination is None:
-            is_consistent = is_release_consistent(
-                s,
-                inverse_inertia,
-                free_motion,
-                (slot_modes, is_slot_locked),
-                friction,
-                is_released,
-                release_direction,
-            )
-            possible_modes, untested_slot_modes = _list_modes_after_event(
-                contact_event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
-            )
-            allowed_contact_modes = AllowedContactModes(
-                possible_modes,
-                ~may_leave_stopper,
-                was_resting & False,
-                untested_slot_modes,
-                may_leave_stopper,
-            )
-            chosen_combination = choose_combination(
-                s,
-                inverse_inertia,
-                free_motion,
-                allowed_contact_modes,
-                friction,
-                tolerances,
-                contact_law.counts_all_solutions,
-            )
-        contact_configuration = ContactConfiguration(
+    def list_allowed_modes(
+        inverse_inertia: ContactInverseInertia, free_motion: FreeMotion
+    ) -> AllowedContactModes:
+        is_consistent = is_release_consistent(
             s,
+            inverse_inertia,
+            free_motion,
+            (slot_modes, is_slot_locked),
             friction,
-            contact_slots,
-            *chosen_combination[:2],
-            is_airborne_leg_locked,
-            motion,
+            is_released,
+            release_direction,
         )
-        force_solution = solve_contact_configuration(
-            contact_configuration, inverse_inertia, free_motion
+        possible_modes, untested_slot_modes = list_modes_after_event(
+            contact_event, slot_modes, is_consistent & ~follows_paper_rule, follows_paper_rule
         )
-        hub_acceleration_x, hub_acceleration_z, _ = force_solution.hub_motion
-        outward_leg_motion = (
-            free_motion.leg_motion
-            + inverse_inertia.leg_directions.sin * hub_acceleration_x
-            + inverse_inertia.leg_directions.cos * hub_acceleration_z
-        )
-        return _KinematicLevelSolution(
-            chosen_combination, force_solution, s.m * outward_leg_motion, outward_leg_motion, motion
+        return AllowedContactModes(
+            possible_modes,
+            ~may_leave_stopper,
+            was_resting & False,
+            untested_slot_modes,
+            may_leave_stopper,
         )
 
-    level_solution, is_held_airborne = _solve_stopper_lcp(
-        solve_kinematic_level,
+    level_solution, is_held_airborne = _solve_level(
         contact_law,
         motion,
-        is_airborne_leg_locked,
-        is_airborne_leg_locked,
+        contact_slots,
+        (is_airborne_leg_locked, is_airborne_leg_locked),
         tolerances,
+        lambda contact_law, motion, inverse_inertia: compute_free_acceleration(
+            contact_law.s, motion, contact_slots, inverse_inertia
+        ),
+        list_allowed_modes,
+        is_impact=False,
     )
     return level_solution.chosen_combination, contact_slots, was_resting, is_held_airborne
 
@@ -650,15 +429,13 @@ def _bring_slow_contacts_to_rest(
     leg_directions = compute_leg_directions(contact_law.s, motion.theta)
     tangential_speed, normal_speed = compute_foot_velocities(motion, leg_directions)
     stays_in_contact = contact_slots.is_in_slot & (normal_speed < contact_law.rest_speed)
-    mode_against_slip = jnp.where(
-        tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP
-    )
-    modes_after_rest = jnp.where(
-        jnp.abs(tangential_speed) < contact_law.rest_speed, ContactMode.STICK, mode_against_slip
-    )
+    slip_mode = jnp.where(tangential_speed > 0.0, ContactMode.SLIP_DOWN, ContactMode.SLIP_UP)
+    comes_to_rest = jnp.abs(tangential_speed) < contact_law.rest_speed
     modes_after_rest = jnp.where(
         stays_in_contact,
-        jnp.where(contact_modes == ContactMode.STICK, ContactMode.STICK, modes_after_rest),
+        jnp.where(
+            (contact_modes == ContactMode.STICK) | comes_to_rest, ContactMode.STICK, slip_mode
+        ),
         ContactMode.OFF,
     )
     is_leg_locked = is_at_stopper | (
@@ -670,10 +447,7 @@ def _bring_slow_contacts_to_rest(
     s, frozen_motion = stop_gradients((contact_law.s, motion))
 
     def find_reversed_slip(_: Array) -> Array:
-        """Return whether the projection reverses the slip of each foot.
-
-        A foot with reversed slip also comes to rest.
-        """
+        """Return whether the projection reverses the slip of a foot, which then comes to rest."""
         slip_speed_after, _ = compute_foot_velocities(
             project_motion(s, frozen_motion, modes_after_rest, is_leg_locked),
             leg_directions,
@@ -718,14 +492,8 @@ def _merge_touching_contacts(
     is_foot_landing = contact_event.is_foot_landing | (
         is_touching & (contact_state.contact_modes == ContactMode.OFF) & contact_event.is_impact
     )
-    fits_two_slots = (
-        jnp.sum(
-            is_foot_landing | (contact_state.contact_modes != ContactMode.OFF),
-            axis=0,
-            dtype=jnp.int32,
-        )
-        <= 2
-    )
+    is_loaded = is_foot_landing | (contact_state.contact_modes != ContactMode.OFF)
+    fits_two_slots = jnp.sum(is_loaded, axis=0, dtype=jnp.int32) <= 2
     has_more_contacts = (bounce_height >= s.L0 - motion.L) & (
         motion.dL >= -contact_law.stopper_rest_speed
     )
@@ -758,20 +526,17 @@ def _replace_liftoff_by_slip(
         & (contact_configuration.slot_modes == ContactMode.STICK)
         & (contact_configuration.friction == jnp.inf)
     )
-    is_force_uphill = (
-        run_if_any_element_active(
-            jnp.any(is_starting_to_slide),
-            lambda _: solve_contact_forces(contact_configuration).tangential_forces,
-            jnp.zeros_like(contact_configuration.friction),
-        )
-        > 0.0
+    tangential_forces = run_if_any_element_active(
+        jnp.any(is_starting_to_slide),
+        lambda _: solve_contact_forces(contact_configuration).tangential_forces,
+        jnp.zeros_like(contact_configuration.friction),
     )
+    slides_up = is_starting_to_slide & (tangential_forces > 0.0)
+    slides_down = is_starting_to_slide & ~(tangential_forces > 0.0)
     return contact_event._replace(
         is_foot_lifting_off=contact_event.is_foot_lifting_off & ~is_starting_to_slide,
-        is_starting_to_slide_up=contact_event.is_starting_to_slide_up
-        | (is_starting_to_slide & is_force_uphill),
-        is_starting_to_slide_down=contact_event.is_starting_to_slide_down
-        | (is_starting_to_slide & ~is_force_uphill),
+        is_starting_to_slide_up=contact_event.is_starting_to_slide_up | slides_up,
+        is_starting_to_slide_down=contact_event.is_starting_to_slide_down | slides_down,
     )
 
 
@@ -790,18 +555,29 @@ def _update_kink_sides(
     """
     if not contact_state.is_kink_positive:
         return ()
-    sides_after_impact = find_kink_sides(
-        s, jnp.where(is_at_stopper, s.L0, motion.L), jnp.where(is_at_stopper, 0.0, motion.dL)
-    )
-    kinks = zip(
-        sides_after_impact,
-        contact_state.is_kink_positive,
-        contact_event.is_kink_crossed,
-        strict=True,
-    )
+    L, dL = jnp.where(is_at_stopper, s.L0, motion.L), jnp.where(is_at_stopper, 0.0, motion.dL)
+    sides_after_impact = find_kink_sides(s, L, dL)
     return tuple(
         jnp.where(contact_event.is_impact, after_impact, before ^ is_crossed)
-        for after_impact, before, is_crossed in kinks
+        for after_impact, before, is_crossed in zip(
+            sides_after_impact,
+            contact_state.is_kink_positive,
+            contact_event.is_kink_crossed,
+            strict=True,
+        )
+    )
+
+
+def _scatter_combination(
+    contact_slots: ContactSlots,
+    chosen_combination: ChosenModeCombination,
+    is_airborne_leg_held: Array,
+) -> tuple[Int[Array, "n ..."], Bool[Array, "n ..."]]:
+    """Return the contact mode of each foot, and whether each leg is on its stopper."""
+    contact_modes = contact_slots.scatter_to_legs(chosen_combination.slot_modes).astype(jnp.int32)
+    is_slot_leg_held = contact_slots.scatter_to_legs(chosen_combination.is_stopper_holding) > 0
+    return contact_modes, jnp.where(
+        contact_slots.is_in_slot, is_slot_leg_held, is_airborne_leg_held
     )
 
 
@@ -812,42 +588,26 @@ def resolve_event(
     contact_event: ContactEvent,
 ) -> ContactEventResult:
     """Return motion and contact state after an event, with the impulses and the lost energy."""
-    contact_event = _merge_touching_contacts(
-        contact_law,
-        motion,
-        contact_state,
-        _replace_liftoff_by_slip(contact_law, motion, contact_state, contact_event),
-    )
+    contact_event = _replace_liftoff_by_slip(contact_law, motion, contact_state, contact_event)
+    contact_event = _merge_touching_contacts(contact_law, motion, contact_state, contact_event)
     s, is_impact = contact_law.s, contact_event.is_impact
     was_touching = (contact_state.contact_modes != ContactMode.OFF) | contact_event.is_foot_landing
-    was_at_stopper = (
-        contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper
-    ) & ~contact_event.is_leg_leaving_stopper
+    was_held = contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper
+    was_at_stopper = was_held & ~contact_event.is_leg_leaving_stopper
     velocity_solution, contact_slots, is_stopper_holding = _solve_velocity_level(
         contact_law, motion, contact_state, contact_event
     )
-    if contact_law.restitution is not None:
-        inelastic_solution = _solve_velocity_level(
-            contact_law._replace(restitution=None), motion, contact_state, contact_event
-        )[0]
-        velocity_solution = _limit_energy_gain(
-            contact_law, motion, velocity_solution, inelastic_solution
-        )
-    impact_modes = contact_slots.scatter_to_legs(
-        velocity_solution.chosen_combination.slot_modes
-    ).astype(jnp.int32)
-    stays_at_stopper = jnp.where(
-        contact_slots.is_in_slot,
-        contact_slots.scatter_to_legs(velocity_solution.chosen_combination.is_stopper_holding) > 0,
-        was_at_stopper & is_stopper_holding,
+    force_solution = velocity_solution.force_solution
+    impact_modes, stays_at_stopper = _scatter_combination(
+        contact_slots, velocity_solution.chosen_combination, was_at_stopper & is_stopper_holding
     )
     if contact_law.restitution is not None:  # Only a part of the impulse may act.
         stays_at_stopper = stays_at_stopper & (
-            jnp.abs(velocity_solution.motion_after_impact.dL) < contact_law.stopper_rest_speed
+            jnp.abs(force_solution.length_motion) < contact_law.stopper_rest_speed
         )
     slow_contact_result = _bring_slow_contacts_to_rest(
         contact_law,
-        velocity_solution.motion_after_impact,
+        _apply_impact_velocities(motion, force_solution),
         contact_slots,
         impact_modes,
         stays_at_stopper,
@@ -856,66 +616,52 @@ def resolve_event(
     motion_after, contact_modes, is_at_stopper = select_trees_by_condition(
         is_impact, slow_contact_result, (motion, contact_state.contact_modes, was_at_stopper)
     )
-    leg_directions = compute_leg_directions(s, motion.theta)
+    _, normal_speeds = compute_foot_velocities(
+        motion_after, compute_leg_directions(s, motion.theta)
+    )
     is_without_slot = was_touching & ~contact_slots.is_in_slot
-    impact_energy_loss = compute_kinetic_energy(s, motion) - compute_kinetic_energy(s, motion_after)
     stopper_impulse = jnp.where(is_stopper_holding, velocity_solution.stopper_forces, jnp.inf)
-
     is_kink_positive = _update_kink_sides(
         s, motion_after, is_at_stopper, contact_state, contact_event
     )
     contact_law = contact_law._replace(s=select_kink_sides(s, is_kink_positive))
-    acceleration_solution, contact_slots, was_resting, is_stopper_holding = (
-        _solve_acceleration_level(
-            contact_law, motion_after, contact_modes, is_at_stopper, contact_event
-        )
+    next_combination, contact_slots, was_resting, is_stopper_holding = _solve_acceleration_level(
+        contact_law, motion_after, contact_modes, is_at_stopper, contact_event
     )
-    contact_modes = contact_slots.scatter_to_legs(acceleration_solution.slot_modes).astype(
-        jnp.int32
+    contact_modes, is_leg_locked = _scatter_combination(
+        contact_slots, next_combination, is_at_stopper & is_stopper_holding
     )
-    is_leg_locked = jnp.where(
-        contact_slots.is_in_slot,
-        contact_slots.scatter_to_legs(acceleration_solution.is_stopper_holding) > 0,
-        is_at_stopper & is_stopper_holding,
-    )
-    is_sliding = (acceleration_solution.slot_modes == ContactMode.SLIP_DOWN) | (
-        acceleration_solution.slot_modes == ContactMode.SLIP_UP
-    )
+    is_sliding = compute_slip_signs(next_combination.slot_modes) != 0.0
     contact_state = ContactState(
         contact_modes=contact_modes,
         is_leg_locked=is_leg_locked,
         has_just_lifted=was_touching & (contact_modes == ContactMode.OFF),
-        has_just_unlocked=(contact_state.is_leg_locked | contact_event.is_leg_meeting_stopper)
-        & ~is_leg_locked,
+        has_just_unlocked=was_held & ~is_leg_locked,
         has_just_slid=contact_slots.scatter_to_legs(is_sliding & was_resting) > 0,
         is_kink_positive=is_kink_positive,
     )
     n_impact_solutions = velocity_solution.chosen_combination.n_solutions
-    n_force_solutions = acceleration_solution.n_solutions
-    zero_without_impact = lambda slot_impulses: jnp.where(is_impact, slot_impulses, 0.0)
+    n_force_solutions = next_combination.n_solutions
+    count_both = lambda select: jnp.where(
+        is_impact, select(n_impact_solutions, n_force_solutions), n_force_solutions
+    )
+    zero_without_impact = lambda impact_value: jnp.where(is_impact, impact_value, 0.0)
     return ContactEventResult(
         motion=motion_after._replace(
             L=jnp.where(is_leg_locked, s.L0, motion_after.L),
             dL=jnp.where(is_leg_locked, 0.0, motion_after.dL),
         ),
         contact_state=contact_state,
-        impact_energy_loss=jnp.where(is_impact, impact_energy_loss, 0.0),
-        normal_impulse=zero_without_impact(velocity_solution.force_solution.normal_forces),
-        tangential_impulse=zero_without_impact(velocity_solution.force_solution.tangential_forces),
+        impact_energy_loss=zero_without_impact(
+            compute_kinetic_energy(s, motion) - compute_kinetic_energy(s, motion_after)
+        ),
+        normal_impulse=zero_without_impact(force_solution.normal_forces),
+        tangential_impulse=zero_without_impact(force_solution.tangential_forces),
         stopper_impulse=jnp.where(is_impact, jnp.min(stopper_impulse, axis=0), jnp.inf),
-        n_solutions=jnp.where(
-            is_impact, jnp.minimum(n_impact_solutions, n_force_solutions), n_force_solutions
-        ),
+        n_solutions=count_both(jnp.minimum),
         is_painleve_paradox=(n_force_solutions == 0) & ((n_impact_solutions > 0) | ~is_impact),
-        max_n_solutions=jnp.where(
-            is_impact, jnp.maximum(n_impact_solutions, n_force_solutions), n_force_solutions
-        ),
-        has_third_foot=jnp.any(
-            is_without_slot
-            & (compute_foot_velocities(motion_after, leg_directions).normal_to_slope < 0.0),
-            axis=0,
-        )
-        & is_impact,
+        max_n_solutions=count_both(jnp.maximum),
+        has_third_foot=jnp.any(is_without_slot & (normal_speeds < 0.0), axis=0) & is_impact,
     )
 
 

@@ -7,16 +7,24 @@ wheel under the same search.
 
 The *initiating guard* of a contact state is the guard that was zero at the event before this state.
 An example is the guard for the normal force on a foot that has just lifted off.
+
+Step sizes are determined by the motion and computed once for all tangents. At each stage of a
+Runge-Kutta step, the quantities common to all tangents are also computed once. Each tangent then
+requires only linear operations.
 """
 
+import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
 from vrw_jax import lanes
+from vrw_jax.base.elementwise import run_if_any_element_active
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.event_location import GUARD_ROUNDOFF_IN_EPS, has_guard_crossed
 from vrw_jax.flow.integrate import PhaseEnd
@@ -51,8 +59,8 @@ from vrw_jax.models.contact_state import (
     unpack_state,
 )
 from vrw_jax.wheel.laws import compute_damping_coefficient
-from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import compute_wheel_units
+from vrw_jax.wheel.transitions import ContactMode
 
 # Absolute value below which the determinant is treated as zero at Painlevé's singularity. There,
 # forces are a ratio of two vanishing quantities, which neither round-off nor integration resolves.
@@ -330,3 +338,223 @@ def integrate_by_diffrax(
         options,
         compute_packed_units(contact_mode_dynamics.s),
     )
+
+
+class TangentBatch(NamedTuple):
+    """Tangents of the input columns of all batch elements, and functions of all tangents.
+
+    The first axis of an array contains tangents, and the last axis the batch. An array of *tangent
+    rows* contains the tangents of all floating-point arrays of a `LaneState`.
+    """
+
+    n_tangents: Array  # number of tangents of each batch element
+    n_column_tangents: Array  # number of leading tangents whose columns may vary
+    column_tangents: Array  # tangents of the input columns
+
+    def get_input_tangent(self, k: Array) -> Array:
+        """Return the tangent of the input columns with index `k`."""
+        return lax.dynamic_index_in_dim(self.column_tangents, k, 0, keepdims=False)
+
+    def allocate_tangent_rows(self, n_rows: int) -> Array:
+        """Return an uninitialized array for all tangents, (tangents, n_rows, batch)."""
+        return lax.empty(
+            (len(self.column_tangents), n_rows, *self.n_tangents.shape), self.column_tangents.dtype
+        )
+
+    def map_tangents_sequentially(
+        self,
+        compute_new_rows: Callable[[Array, Array], Any],
+        tangent_rows: Array,
+        first_replaced_row: Array | int = 0,
+    ) -> Array:
+        """Return the tangents after a function has been applied to each, (tangents, rows, batch).
+
+        The results of the function replace the rows from `first_replaced_row` onward.
+
+        - `compute_new_rows`: function that takes the index and the rows of a tangent, and returns a
+          tree of new rows.
+        """
+        should_continue = lambda state: jnp.any(state[0] < self.n_tangents)
+
+        def update_tangent_rows(state: tuple[Array, Array]) -> tuple[Array, Array]:
+            k, tangent_rows = state
+            new_rows = pack_tree_into_rows(
+                compute_new_rows(k, lax.dynamic_index_in_dim(tangent_rows, k, 0, False))
+            )
+            # Stacking row by row keeps the rows in registers.
+            new_rows = jnp.stack([new_rows[i] for i in range(len(new_rows))])
+            start_indices = k, jnp.int32(first_replaced_row), jnp.int32(0)
+            return k + 1, lax.dynamic_update_slice(tangent_rows, new_rows[None], start_indices)
+
+        return lax.while_loop(
+            should_continue, update_tangent_rows, (jnp.zeros((), jnp.int32), tangent_rows)
+        )[1]
+
+
+def pack_tree_into_rows(array_tree: Any) -> Array:
+    """Return all arrays of a tree, concatenated to one array (rows, batch)."""
+    return jnp.concatenate(
+        [leaf.reshape(-1, leaf.shape[-1]) for leaf in jax.tree.leaves(array_tree)]
+    )
+
+
+def unpack_tree_from_rows(tangent_rows: Array, tangent_template: Any) -> Any:
+    """Return rows as a tree, which inverts `pack_tree_into_rows`."""
+    leaves, tree_structure = jax.tree.flatten(tangent_template)
+    arrays, row_offset = [], 0
+    for leaf in leaves:
+        n_leaf_rows = math.prod(leaf.shape[:-1])
+        leaf_rows = tangent_rows[..., row_offset : row_offset + n_leaf_rows, :]
+        arrays.append(leaf_rows.reshape(*tangent_rows.shape[:-2], *leaf.shape))
+        row_offset += n_leaf_rows
+    return jax.tree.unflatten(tree_structure, arrays)
+
+
+class IntervalTangents(NamedTuple):
+    """Tangents of an interval between two events, with the methods of `flow.PhaseTangents`."""
+
+    make_phase: Callable[[Any, Array], BatchPhase]  # for constants and rows of quantities
+    phase_constants: Any  # floating-point arrays of the dynamics
+    push_to_constants: Callable[[Array], Any]  # from tangents of columns to those of the constants
+    tangents: TangentBatch
+    start_tangents: Array  # tangents of coordinates, rates and losses, (tangents, rows, batch)
+    held_constants: tuple = ()
+
+    @property
+    def zero_constants_tangent(self) -> Any:
+        """Return the tangent of constants that do not vary."""
+        return jax.tree.map(jnp.zeros_like, self.phase_constants)
+
+    def linearize(
+        self, function: Callable[[BatchPhase, StageState], Array], q: Any, v: Any, rows: Array
+    ) -> Any:
+        """Return the linear map from tangents of (constants, q, v) to those of a function's value.
+
+        - `rows`: rows of `ContactQuantities` at the state, which are not computed again.
+        """
+
+        def evaluate(phase_constants: Any, q: Array, v: Array) -> Array:
+            phase = self.make_phase(phase_constants, rows)
+            return function(phase, phase.make_state(q, v))
+
+        return jax.linearize(evaluate, self.phase_constants, q, v)[1]
+
+    def propagate_to_step_end(
+        self,
+        tableau: ButcherTableau,
+        stage_states: list[StageState],
+        start_tangents: Array,
+        h: Array,
+        is_accepted: Array | bool = True,
+    ) -> Array:
+        """Return the tangents at the end of a solver step of length `h`, s, if it is accepted."""
+        q, v, _ = stage_states[0]
+        n, n_rates, tangents = len(q), len(v), self.tangents
+        stage_rows = jnp.stack([state.acceleration.acceleration for state in stage_states[:-1]])
+        evaluate_rates = lambda _, state: state.acceleration.acceleration[:n_rates]
+
+        def push_stage(loop_state: tuple[Array, Array]) -> tuple[Array, Array]:
+            i, rate_tangents = loop_state
+            stage = compute_stage_coordinates(tableau, i, q, v, stage_rows, h)
+            rows = lax.dynamic_index_in_dim(stage_rows, i, 0, False)
+            push = self.linearize(evaluate_rates, *stage, rows)
+            # A second linearization removes the terms of inputs, which most tangents keep constant.
+            _, push_coordinates = jax.linearize(
+                lambda q, v: push(self.zero_constants_tangent, q, v), *stage
+            )
+
+            def push_tangent(k: Array, previous_rates: Array) -> Array:
+                coordinate_tangents = _propagate_to_stage(
+                    tableau,
+                    i,
+                    lax.dynamic_index_in_dim(start_tangents, k, 0, False),
+                    previous_rates.reshape(-1, *v.shape),
+                    n,
+                    h,
+                )
+                has_input_tangent = jnp.any(k < tangents.n_column_tangents)
+                rate_tangent = run_if_any_element_active(
+                    ~has_input_tangent,
+                    lambda _: push_coordinates(*coordinate_tangents),
+                    jnp.zeros_like(v),
+                )
+                return run_if_any_element_active(
+                    has_input_tangent,
+                    lambda _: push(
+                        self.push_to_constants(tangents.get_input_tangent(k)), *coordinate_tangents
+                    ),
+                    rate_tangent,
+                )
+
+            return i + 1, tangents.map_tangents_sequentially(
+                push_tangent, rate_tangents, i * n_rates
+            )
+
+        n_stages = len(stage_states) - 1
+        rate_tangents = lax.while_loop(
+            lambda loop_state: loop_state[0] < n_stages,
+            push_stage,
+            (jnp.zeros((), jnp.int32), tangents.allocate_tangent_rows(n_stages * n_rates)),
+        )[1]
+
+        def propagate_to_end(k: Array, start_row: Array) -> Array:
+            rates = lax.dynamic_index_in_dim(rate_tangents, k, 0, False).reshape(-1, *v.shape)
+            end = compute_stage_coordinates(
+                tableau, n_stages, start_row[:n], start_row[n:], rates, h
+            )
+            return jnp.where(is_accepted, jnp.concatenate(end), start_row)
+
+        return tangents.map_tangents_sequentially(propagate_to_end, start_tangents)
+
+    def evaluate_rate_and_tangents(
+        self,
+        evaluate_function: Callable[[BatchPhase, StageState], Array],
+        state: StageState,
+        directions: Array,
+    ) -> tuple[Array, Array]:
+        """Return time derivative and tangents of a number, for tangents of a state."""
+        q, v, (_, _, rows) = state
+        push = self.linearize(evaluate_function, q, v, rows)
+        rate = push(self.zero_constants_tangent, v[: len(q)], rows[: len(v)])
+
+        def push_direction(k: Array, _: Array) -> Array:
+            direction = lax.dynamic_index_in_dim(directions, k, 0, False)
+            constants_tangent = self.push_to_constants(self.tangents.get_input_tangent(k))
+            return push(constants_tangent, direction[: len(q)], direction[len(q) :])
+
+        tangents = self.tangents.map_tangents_sequentially(
+            push_direction, self.tangents.allocate_tangent_rows(1)
+        )
+        return rate, tangents[:, 0]
+
+
+def _propagate_to_stage(
+    tableau: ButcherTableau, i: Array, start_tangent: Array, rate_tangents: Array, n: int, h: Array
+) -> tuple[Array, Array]:
+    """Return the tangents of `compute_stage_coordinates`, from the tangents at the earlier stages.
+
+    - `start_tangent`: tangent of `n` coordinates, and of the rates.
+    """
+    flat_matrices = [
+        jnp.asarray(stage_matrix.ravel())
+        for stage_matrix in (tableau.stage_matrix, tableau.squared_stage_matrix)
+    ]
+    n_stages, stage_node = len(tableau.stage_matrix[0]), jnp.asarray(tableau.stage_nodes)[i]
+
+    def add_stage(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        j, rate_increment, coordinate_increment = state
+        a, b = (
+            lax.dynamic_index_in_dim(flat_matrix, i * n_stages + j, 0, False)
+            for flat_matrix in flat_matrices
+        )
+        rates = lax.dynamic_index_in_dim(rate_tangents, j, 0, False)[:n]
+        return j + 1, rate_increment + a * rates, coordinate_increment + b * rates
+
+    q, v, losses = start_tangent[:n], start_tangent[n : 2 * n], start_tangent[2 * n :]
+    initial_state = jnp.zeros((), jnp.int32), jnp.zeros_like(q), jnp.zeros_like(q)
+    _, rate_increment, coordinate_increment = lax.while_loop(
+        lambda state: state[0] < i, add_stage, initial_state
+    )
+    stage_q = q + h * (stage_node * v + h * coordinate_increment)
+    # The losses do not affect the motion.
+    return stage_q, jnp.concatenate([v + h * rate_increment, losses])

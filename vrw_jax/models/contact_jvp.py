@@ -5,14 +5,17 @@ impact. The tangents of these unknowns solve the same equations, with the tangen
 the right-hand side. Only that residual is differentiated.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
+from vrw_jax.base.types import Elementwise
 from vrw_jax.lanes.settings import with_default_jax_settings
 from vrw_jax.models.contact_mechanics import (
     ContactInverseInertia,
@@ -23,6 +26,7 @@ from vrw_jax.models.contact_mechanics import (
     LegArray,
     SlotArray,
     WheelMotion,
+    align_with_batch,
     compute_free_acceleration,
     compute_free_velocity,
     find_contact_slots,
@@ -33,10 +37,9 @@ from vrw_jax.models.contact_mechanics import (
     select_slot_friction,
     sum_over_legs,
 )
-from vrw_jax.models.contact_modes import replace_infinite_friction, solve_combination
 from vrw_jax.wheel.laws import evaluate_hub_torque, evaluate_leg_force, number_legs
-from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.transitions import ContactMode
 
 
 class ContactConfiguration(NamedTuple):
@@ -243,11 +246,7 @@ def _compute_free_motion_tangent(
     sin, cos = inverse_inertia.leg_directions
     slot_sin, slot_cos = inverse_inertia.sin, inverse_inertia.cos
     t, n = force_solution.tangential_forces, force_solution.normal_forces
-    select_inputs = lambda configuration: (
-        configuration.s,
-        configuration.friction,
-        configuration.motion,
-    )
+    select_inputs = lambda x: (x.s, x.friction, x.motion)
     inputs, constants = eqx.partition(select_inputs(contact_configuration), eqx.is_inexact_array)
     s, friction, motion = select_inputs(contact_configuration)
     fixed_friction, fixed_theta = replace_infinite_friction(friction), motion.theta
@@ -264,10 +263,7 @@ def _compute_free_motion_tangent(
         # Directions turn with the legs. The fixed vectors make the derivatives short.
         turn = motion.theta - fixed_theta
         rotate_with = lambda u, e, fixed_u, fixed_e: (u - fixed_e * turn, e + fixed_u * turn)
-        rotate_against = lambda u, e, fixed_u, fixed_e: (
-            u + fixed_e * turn,
-            e - fixed_u * turn,
-        )
+        rotate_against = lambda u, e, fixed_u, fixed_e: (u + fixed_e * turn, e - fixed_u * turn)
         friction_change = replace_infinite_friction(friction) - fixed_friction
         changed_t = t - compute_slip_signs(slot_modes) * friction_change * n
         leg_pulls, transverse_forces = rotate_against(
@@ -287,13 +283,8 @@ def _compute_free_motion_tangent(
             hub_torque - sum_over_legs(leg_moments) - sum_over_legs(foot_moments),
         )
         leg_inertia_forces = [s.m * term for term in rotate_with(*legs, *leg_terms_at_point)]
-        return (
-            length_residual,
-            hub_residual,
-            leg_inertia_forces,
-            (-foot_transverse, -foot_radial),
-            changed_t,
-        )
+        foot_residual = -foot_transverse, -foot_radial
+        return length_residual, hub_residual, leg_inertia_forces, foot_residual, changed_t
 
     _, (length_tangent, hub_tangent, leg_forces, foot_tangent, friction_force_tangents) = jax.jvp(
         evaluate_residual,
@@ -349,3 +340,212 @@ def _list_velocity_terms(
     L, dL = map(contact_slots.gather_from_legs, (motion.L, solution.length_motion))
     jumps = solution.length_motion - motion.dL, (motion.L - s.a) * (dtheta - motion.dtheta)
     return jumps, (dL, L * dtheta), (vx - motion.vx, vz - motion.vz), 0.0, 0.0
+
+
+class SlotForceSolution(NamedTuple):
+    """Forces (N) and resulting accelerations, or impulses (N s) and velocities after the impact.
+
+    A `SlotArray` has one entry for the leg in each contact slot.
+    """
+
+    tangential_forces: SlotArray  # tangential forces on the feet, positive downhill
+    normal_forces: SlotArray  # normal forces on the feet, positive if they push
+    stopper_forces: SlotArray  # forces of the stoppers, positive if they push
+    leg_pull_forces: SlotArray  # force of stopper and foot along u on the leg's mass
+    hub_motion: HubVector
+    length_motion: SlotArray  # accelerations of the leg lengths, or rates after an impact
+    foot_motion_x: SlotArray  # accelerations of the feet, or velocities after an impact
+    foot_motion_z: SlotArray
+    painleve_determinant: Any  # of order 1; zero at Painlevé's singularity
+
+
+def _compute_determinant(A: Array) -> Array:
+    """Return the determinant of a 2 x 2 matrix."""
+    return A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+
+
+def _solve_2x2_system(A: Array, b: Array) -> Array:
+    """Return the solution of A x = b for a 2 x 2 matrix A; NaN if A is singular.
+
+    If b is a matrix, each of its columns is a right-hand side.
+    """
+    determinant = _compute_determinant(A)
+    inverse_determinant = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
+    return jnp.stack(
+        [
+            (A[1, 1] * b[0] - A[0, 1] * b[1]) * inverse_determinant,
+            (A[0, 0] * b[1] - A[1, 0] * b[0]) * inverse_determinant,
+        ]
+    )
+
+
+def _make_diagonal_matrix(diagonal: SlotArray) -> Array:
+    """Return the 2 x 2 matrix with the entries of `diagonal` on its diagonal, and zeros."""
+    return jnp.where(align_with_batch(np.eye(2, dtype=bool), diagonal[0]), diagonal, 0.0)
+
+
+def replace_infinite_friction(friction: Elementwise) -> Array:
+    """Return the friction coefficients of Coulomb's law, with 0 in place of infinite coefficients.
+
+    Coulomb's law then yields no friction on a foot that slides under infinite friction.
+    """
+    return jnp.where(jnp.isfinite(friction), friction, 0.0)
+
+
+REFERENCE_MASS_RATIO = 18.0
+"""Ratio of total mass to leg mass that scales the determinant of the contact equations.
+
+At this ratio, resting and sliding feet have the same scale in the determinant. The value is that of
+the wheel in Table 1 of the paper, chosen because `painleve_atol` was measured for this wheel.
+"""
+
+
+def _solve_slot_forces(
+    s: Symbols,
+    inverse_inertia: ContactInverseInertia,
+    free_motion: FreeMotion,
+    slot_modes: Array,
+    is_stopper_holding: Array,
+    friction: SlotArray,
+    opaque_one: Array,
+) -> tuple[SlotArray, SlotArray, SlotArray, Array]:
+    """Return stopper forces, foot forces transverse to and along the legs, and the determinant.
+
+    The unknown c is the transverse force on a sticking foot. For a sliding foot, c is the normal
+    force. In the limit of infinite friction, c is the friction force instead. For an unloaded foot,
+    c = 0. The stopper forces f are eliminated first: they solve N f = p + P c. For an open stopper,
+    the corresponding equation is f = 0, so the system is always regular. In matrices, the first
+    index is that of the equation.
+    """
+    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
+    sliding_coefficient = jnp.where(friction == jnp.inf, 1.0, replace_infinite_friction(friction))
+    normal_force_factor = jnp.where(friction == jnp.inf, 0.0, 1.0)
+    is_sticking = slot_modes == ContactMode.STICK
+    slides_down = slot_modes == ContactMode.SLIP_DOWN
+    is_sliding = slides_down | (slot_modes == ContactMode.SLIP_UP)
+    is_loaded = is_sticking | is_sliding
+    friction_factor = jnp.where(slides_down, -sliding_coefficient, sliding_coefficient)
+    select_by_mode = lambda sticking_value, sliding_value: jnp.where(
+        is_sticking, sticking_value, jnp.where(is_sliding, sliding_value, 0.0)
+    )
+    # These are the force on a foot for c = 1, and the weights of the foot's transverse motion and
+    # of the force on the leg's mass in the foot's condition.
+    transverse_per_c = select_by_mode(1.0, friction_factor * cos - normal_force_factor * sin)
+    radial_per_c = select_by_mode(0.0, friction_factor * sin + normal_force_factor * cos)
+    weight_transverse = select_by_mode(1.0, -sin)
+    weight_radial = select_by_mode(0.0, cos * inverse_leg_mass)
+
+    leg_compliance = jnp.where(is_sticking, 0.0, inverse_leg_mass)
+    N = jnp.where(
+        is_stopper_holding[:, None],
+        inverse_inertia.K + _make_diagonal_matrix(leg_compliance),
+        _make_diagonal_matrix(jnp.ones_like(leg_compliance)),
+    )
+    outward_leg_motion = (
+        sin * free_motion.hub_motion[0]
+        + cos * free_motion.hub_motion[1]
+        + free_motion.slot_leg_motion
+    )
+    foot_motion_of_leg = jnp.where(is_sticking, free_motion.foot_radial_motion, 0.0)
+    p = jnp.where(is_stopper_holding, outward_leg_motion + foot_motion_of_leg, 0.0)
+    P = jnp.where(
+        is_stopper_holding[:, None],
+        inverse_inertia.H * transverse_per_c
+        - _make_diagonal_matrix(radial_per_c * inverse_leg_mass),
+        0.0,
+    )
+    p, P, N = prevent_fusion((p, P, N), opaque_one)
+    stopper_without_feet, stopper_response = prevent_fusion(
+        (_solve_2x2_system(N, p), _solve_2x2_system(N, P)), opaque_one
+    )
+
+    R = _make_diagonal_matrix(weight_radial) - weight_transverse[:, None] * jnp.swapaxes(
+        inverse_inertia.H, 0, 1
+    )
+    C = (
+        weight_transverse[:, None] * inverse_inertia.G * transverse_per_c
+        + _make_diagonal_matrix(weight_radial * radial_per_c)
+        + R[:, :1] * stopper_response[0]
+        + R[:, 1:] * stopper_response[1]
+        + _make_diagonal_matrix(jnp.where(is_loaded, 0.0, 1.0))
+    )
+    right_hand_side = (
+        -weight_transverse * free_motion.foot_transverse_motion
+        - weight_radial * s.m * free_motion.foot_radial_motion
+    )
+    c = _solve_2x2_system(
+        C,
+        right_hand_side - R[:, 0] * stopper_without_feet[0] - R[:, 1] * stopper_without_feet[1],
+    )
+    stopper_force = (
+        stopper_without_feet + stopper_response[:, 0] * c[0] + stopper_response[:, 1] * c[1]
+    )
+    foot_force_radial = jnp.where(
+        is_sticking, -s.m * free_motion.foot_radial_motion - stopper_force, radial_per_c * c
+    )
+    scale_masses = jnp.where(is_sticking, s.Mt / REFERENCE_MASS_RATIO, s.m)
+    scale_masses = jnp.where(is_loaded, scale_masses, 1.0)
+    painleve_determinant = scale_masses[0] * scale_masses[1] * _compute_determinant(C)
+    forces = stopper_force, transverse_per_c * c, foot_force_radial
+    return prevent_fusion((*forces, painleve_determinant), opaque_one)
+
+
+@eqx.filter_jit  # This function is traced once for all call sites.
+def solve_combination(
+    s: Symbols,
+    inverse_inertia: ContactInverseInertia,
+    free_motion: FreeMotion,
+    slot_modes: Array,
+    is_stopper_holding: Array,
+    friction: SlotArray,
+) -> SlotForceSolution:
+    """Return forces and motion for one combination of contact modes and stoppers.
+
+    - `slot_modes`: contact mode of the foot in each contact slot, shape (2, ...);
+    - `is_stopper_holding`: whether the stopper holds the leg in each contact slot, shape (2, ...);
+    - `friction`: friction coefficient of the foot in each contact slot, shape (2, ...).
+
+    A sticking foot stays at rest. A sliding foot stays on the ground, with friction against the
+    slip. A leg on its stopper has a constant length.
+    """
+    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
+    opaque_one = make_opaque_one(free_motion.hub_motion[2])
+    stopper_force, foot_force_transverse, foot_force_radial, painleve_determinant = (
+        _solve_slot_forces(
+            s, inverse_inertia, free_motion, slot_modes, is_stopper_holding, friction, opaque_one
+        )
+    )
+    leg_pull_forces = foot_force_radial + stopper_force
+    hub_motion = vx, vz, _ = tuple(
+        free
+        + transverse[0] * foot_force_transverse[0]
+        + transverse[1] * foot_force_transverse[1]
+        - radial[0] * stopper_force[0]
+        - radial[1] * stopper_force[1]
+        for free, transverse, radial in zip(
+            free_motion.hub_motion,
+            inverse_inertia.hub_response_transverse,
+            inverse_inertia.hub_response_radial,
+            strict=True,
+        )
+    )
+    hub_change = tuple(map(operator.sub, hub_motion, free_motion.hub_motion))
+    foot_transverse = (
+        inverse_inertia.compute_transverse_foot_motion(hub_change)
+        + free_motion.foot_transverse_motion
+    )
+    foot_radial = free_motion.foot_radial_motion + leg_pull_forces * inverse_leg_mass
+    free_length_motion = (
+        sin * vx + cos * vz + free_motion.slot_leg_motion - leg_pull_forces * inverse_leg_mass
+    )
+    return SlotForceSolution(
+        tangential_forces=foot_force_transverse * cos + foot_force_radial * sin,
+        normal_forces=foot_force_radial * cos - foot_force_transverse * sin,
+        stopper_forces=stopper_force,
+        leg_pull_forces=leg_pull_forces,
+        hub_motion=hub_motion,
+        length_motion=jnp.where(is_stopper_holding, 0.0, free_length_motion),
+        foot_motion_x=foot_transverse * cos + foot_radial * sin,
+        foot_motion_z=foot_radial * cos - foot_transverse * sin,
+        painleve_determinant=painleve_determinant,
+    )

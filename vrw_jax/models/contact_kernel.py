@@ -52,20 +52,18 @@ from vrw_jax.models.contact_mechanics import (
     stop_gradients,
     unpack_motion,
 )
+from vrw_jax.models.contact_modes import PAPER_RULE_SENTINEL
 from vrw_jax.models.contact_record import (
     GaitStepSummary,
     StepRecord,
     UnilateralStep,
-    apply_friction_rule,
-    compute_rest_speed,
+    compute_min_bounce_height,
+    compute_section_foot_distance,
     init_step_record,
+    pack_section_state,
     record_contact_interval,
     record_event,
     record_force_extremum,
-)
-from vrw_jax.models.contact_section import (
-    compute_section_foot_distance,
-    pack_section_state,
     replace_invalid_start,
     unpack_section_state,
 )
@@ -78,15 +76,13 @@ from vrw_jax.models.contact_state import (
     choose_stopping_guard,
     compute_contact_quantities,
     compute_force_rates,
-    is_wheel_at_rest,
+    compute_state_units,
     make_contact_mode_dynamics,
     make_guard_layout,
     unpack_state,
 )
 from vrw_jax.models.phase_sequence import find_stance_slope
-from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.laws import count_kinks
-from vrw_jax.wheel.outcomes import ContactMode, replace_rest_outcome
 from vrw_jax.wheel.params import (
     NO_LAWS,
     PARAMETER_NAMES,
@@ -97,6 +93,12 @@ from vrw_jax.wheel.params import (
     compute_wheel_units,
     make_wheel_from_parameters,
     stack_parameters,
+)
+from vrw_jax.wheel.transitions import (
+    ContactMode,
+    GroundAhead,
+    are_coordinates_at_rest,
+    replace_rest_outcome,
 )
 
 SLOPE_INDEX = PARAMETER_NAMES.index("slope")
@@ -225,13 +227,11 @@ class BatchWalkSettings(NamedTuple):
             self.law_structure, list(input_columns[n_wheel_columns : self.friction_index])
         )
         s = add_laws(compute_symbols(self.n_legs, *input_columns[:n_wheel_columns]), laws)
-        friction = apply_friction_rule(input_columns[self.friction_index], self.uses_paper_rule)
-        if not self.n_ground_columns:
-            return s, friction
-        previous_friction = apply_friction_rule(
-            input_columns[self.friction_index + 1], self.uses_paper_rule
-        )
-        return s, (friction, previous_friction)
+        first = self.friction_index
+        friction = list(input_columns[first : first + 1 + bool(self.n_ground_columns)])
+        if self.uses_paper_rule:
+            friction = [jnp.where(x == jnp.inf, PAPER_RULE_SENTINEL, x) for x in friction]
+        return s, tuple(friction) if self.n_ground_columns else friction[0]
 
     def extract_ground_ahead(self, input_columns: Array) -> GroundAhead | None:
         """Return the ground ahead for columns that `resolve_heights` returned, or None on flat
@@ -389,7 +389,8 @@ class BatchWalkSettings(NamedTuple):
             friction,
             self.has_one_sided_stoppers,
             self.is_detailed,
-            compute_rest_speed(s, self.step_options),
+            # This is the landing speed after the smallest resolved bounce, m/s.
+            jnp.sqrt(2.0 * s.g * compute_min_bounce_height(s.L0, self.step_options)),
             input_columns[-1] if self.has_restitution else None,
             self.extract_ground_ahead(input_columns),
             jnp.maximum(record.events - first_ramp_event, 0),
@@ -483,7 +484,8 @@ class BatchWalkSettings(NamedTuple):
         - `phase_tangents`: tangents that are integrated together with the motion, or None.
         """
         dynamics = self.make_lane_contact_dynamics(input_columns, lane_state.contact_state)
-        options = compute_wheel_units(dynamics.s).scale_times_to_seconds(self.step_options)
+        units = compute_wheel_units(dynamics.s)
+        options = units.scale_times_to_seconds(self.step_options)
         phase = make_contact_phase(
             dynamics, self.tableau, options, limits_tangents=phase_tangents is not None
         )
@@ -537,7 +539,9 @@ class BatchWalkSettings(NamedTuple):
             v=v,
             interval_duration=phase_end.duration,
             guard_index=choose_stopping_guard(dynamics, rates, guard_index, atol),
-            is_resting=is_wheel_at_rest(dynamics.s, rates, accelerations, atol),
+            is_resting=are_coordinates_at_rest(
+                rates, accelerations, compute_state_units(dynamics.s)[1], units.time_unit, atol
+            ),
             n_solver_steps=phase_end.solver_steps,
             interval_outcome=jnp.where(is_active, outcome, lane_state.interval_outcome).astype(
                 jnp.int32

@@ -24,7 +24,6 @@ from jaxtyping import Array, Bool, Float, Shaped
 
 from vrw_jax.base.elementwise import compute_sine_cosine
 from vrw_jax.base.types import Elementwise, Scalar
-from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.laws import (
     compute_leg_potential,
     evaluate_hub_torque,
@@ -32,6 +31,7 @@ from vrw_jax.wheel.laws import (
     number_legs,
 )
 from vrw_jax.wheel.params import Symbols
+from vrw_jax.wheel.transitions import GroundAhead
 
 LegArray = Float[Array, "n_legs ..."]
 """Array with one entry per leg on the first axis."""
@@ -470,6 +470,37 @@ def compute_kinetic_energy(s: Symbols, motion: WheelMotion) -> Elementwise:
     x, z = _compute_point_velocities(motion, leg_directions, motion.L - s.a, motion.dL)
     hub_mass = s.Mt - s.n * s.m
     return 0.5 * (hub_mass * (motion.vx**2 + motion.vz**2) + s.m * sum_over_legs(x * x + z * z))
+
+
+def find_rebound_fraction(
+    s: Symbols, motion: WheelMotion, inelastic_motion: WheelMotion, newton_motion: WheelMotion
+) -> tuple[Array, Array]:
+    """Return whether Newton's rebound adds energy, and the largest fraction of it that adds none.
+
+    With Coulomb friction, Newton's law of restitution can increase the energy (Kane 1984). The
+    inelastic impact never increases the energy. On the straight line from the inelastic impact to
+    Newton's impact, the energy is a quadratic function.
+
+    - `motion`: motion before the impact.
+    """
+    midpoint_motion = jax.tree.map(lambda a, b: 0.5 * (a + b), inelastic_motion, newton_motion)
+    energy, energy_inelastic, energy_newton, energy_midpoint = (
+        compute_kinetic_energy(s, x)
+        for x in (motion, inelastic_motion, newton_motion, midpoint_motion)
+    )
+    curvature = 2.0 * (energy_inelastic - 2.0 * energy_midpoint + energy_newton)
+    linear_term = 4.0 * energy_midpoint - 3.0 * energy_inelastic - energy_newton
+    allowed_gain = jnp.maximum(energy - energy_inelastic, 0.0)
+    has_energy_gain = energy_newton > energy
+    sqrt_discriminant = jnp.sqrt(
+        jnp.where(
+            has_energy_gain,
+            linear_term * linear_term + 4.0 * curvature * allowed_gain,
+            1.0,
+        )
+    )
+    divisor = jnp.where(has_energy_gain, linear_term + sqrt_discriminant, 1.0)
+    return has_energy_gain, jnp.where(has_energy_gain, 2.0 * allowed_gain / divisor, 1.0)
 
 
 def compute_potential_energy(s: Symbols, motion: WheelMotion) -> tuple[Elementwise, Elementwise]:

@@ -16,11 +16,9 @@ The foot slides without friction only if neither is possible.
 
 import functools
 import itertools
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,236 +28,27 @@ from jaxtyping import Array, Bool, Int
 from vrw_jax import lanes
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.types import Elementwise
+from vrw_jax.models.contact_jvp import (
+    WheelForceSolution,
+    replace_infinite_friction,
+    solve_combination,
+)
 from vrw_jax.models.contact_mechanics import (
     ContactInverseInertia,
     FreeMotion,
-    HubVector,
+    LegArray,
     SlotArray,
+    WheelMotion,
     align_with_batch,
     make_opaque_one,
     prevent_fusion,
+    stop_gradients,
 )
-from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import Symbols, compute_wheel_units
+from vrw_jax.wheel.transitions import ContactMode
 
 PAPER_RULE_SENTINEL = -np.inf
 """Friction coefficient that selects the rule (A1)-(A4) of the paper for infinite friction."""
-
-
-class SlotForceSolution(NamedTuple):
-    """Forces (N) and resulting accelerations, or impulses (N s) and velocities after the impact.
-
-    A `SlotArray` has one entry for the leg in each contact slot.
-    """
-
-    tangential_forces: SlotArray  # tangential forces on the feet, positive downhill
-    normal_forces: SlotArray  # normal forces on the feet, positive if they push
-    stopper_forces: SlotArray  # forces of the stoppers, positive if they push
-    leg_pull_forces: SlotArray  # force of stopper and foot along u on the leg's mass
-    hub_motion: HubVector
-    length_motion: SlotArray  # accelerations of the leg lengths, or rates after an impact
-    foot_motion_x: SlotArray  # accelerations of the feet, or velocities after an impact
-    foot_motion_z: SlotArray
-    painleve_determinant: Any  # of order 1; zero at Painlevé's singularity
-
-
-def _compute_determinant(A: Array) -> Array:
-    """Return the determinant of a 2 x 2 matrix."""
-    return A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-
-
-def _solve_2x2_system(A: Array, b: Array) -> Array:
-    """Return the solution of A x = b for a 2 x 2 matrix A; NaN if A is singular.
-
-    If b is a matrix, each of its columns is a right-hand side.
-    """
-    determinant = _compute_determinant(A)
-    inverse_determinant = 1.0 / jnp.where(determinant == 0.0, jnp.nan, determinant)
-    return jnp.stack(
-        [
-            (A[1, 1] * b[0] - A[0, 1] * b[1]) * inverse_determinant,
-            (A[0, 0] * b[1] - A[1, 0] * b[0]) * inverse_determinant,
-        ]
-    )
-
-
-def _make_diagonal_matrix(diagonal: SlotArray) -> Array:
-    """Return the 2 x 2 matrix with the entries of `diagonal` on its diagonal, and zeros."""
-    return jnp.where(align_with_batch(np.eye(2, dtype=bool), diagonal[0]), diagonal, 0.0)
-
-
-def replace_infinite_friction(friction: Elementwise) -> Array:
-    """Return the friction coefficients of Coulomb's law, with 0 in place of infinite coefficients.
-
-    Coulomb's law then yields no friction on a foot that slides under infinite friction.
-    """
-    return jnp.where(jnp.isfinite(friction), friction, 0.0)
-
-
-REFERENCE_MASS_RATIO = 18.0
-"""Ratio of total mass to leg mass that scales the determinant of the contact equations.
-
-At this ratio, resting and sliding feet have the same scale in the determinant. The value is that of
-the wheel in Table 1 of the paper, chosen because `painleve_atol` was measured for this wheel.
-"""
-
-
-def _solve_slot_forces(
-    s: Symbols,
-    inverse_inertia: ContactInverseInertia,
-    free_motion: FreeMotion,
-    slot_modes: Array,
-    is_stopper_holding: Array,
-    friction: SlotArray,
-    opaque_one: Array,
-) -> tuple[SlotArray, SlotArray, SlotArray, Array]:
-    """Return the forces in the contact slots, and the determinant of the foot equations.
-
-    The result is (stopper forces, foot forces transverse to the legs, foot forces along the legs,
-    determinant).
-
-    The unknown c is the transverse force on a sticking foot. For a sliding foot, c is the normal
-    force. In the limit of infinite friction, c is the friction force instead. For an unloaded foot,
-    c = 0. The stopper forces f are eliminated first: they solve N f = p + P c. For an open stopper,
-    the corresponding equation is f = 0, so the system is always regular. In matrices, the first
-    index is that of the equation.
-    """
-    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
-    sliding_coefficient = jnp.where(friction == jnp.inf, 1.0, replace_infinite_friction(friction))
-    normal_force_factor = jnp.where(friction == jnp.inf, 0.0, 1.0)
-    is_sticking = slot_modes == ContactMode.STICK
-    slides_down = slot_modes == ContactMode.SLIP_DOWN
-    is_sliding = slides_down | (slot_modes == ContactMode.SLIP_UP)
-    is_loaded = is_sticking | is_sliding
-    friction_factor = jnp.where(slides_down, -sliding_coefficient, sliding_coefficient)
-    select_by_mode = lambda sticking_value, sliding_value: jnp.where(
-        is_sticking, sticking_value, jnp.where(is_sliding, sliding_value, 0.0)
-    )
-    # These are the force on a foot for c = 1, and the weights of the foot's transverse motion and
-    # of the force on the leg's mass in the foot's condition.
-    transverse_per_c = select_by_mode(1.0, friction_factor * cos - normal_force_factor * sin)
-    radial_per_c = select_by_mode(0.0, friction_factor * sin + normal_force_factor * cos)
-    weight_transverse = select_by_mode(1.0, -sin)
-    weight_radial = select_by_mode(0.0, cos * inverse_leg_mass)
-
-    leg_compliance = jnp.where(is_sticking, 0.0, inverse_leg_mass)
-    N = jnp.where(
-        is_stopper_holding[:, None],
-        inverse_inertia.K + _make_diagonal_matrix(leg_compliance),
-        _make_diagonal_matrix(jnp.ones_like(leg_compliance)),
-    )
-    outward_leg_motion = (
-        sin * free_motion.hub_motion[0]
-        + cos * free_motion.hub_motion[1]
-        + free_motion.slot_leg_motion
-    )
-    free_length_motion = outward_leg_motion + jnp.where(
-        is_sticking, free_motion.foot_radial_motion, 0.0
-    )
-    p = jnp.where(is_stopper_holding, free_length_motion, 0.0)
-    P = jnp.where(
-        is_stopper_holding[:, None],
-        inverse_inertia.H * transverse_per_c
-        - _make_diagonal_matrix(radial_per_c * inverse_leg_mass),
-        0.0,
-    )
-    p, P, N = prevent_fusion((p, P, N), opaque_one)
-    stopper_without_feet, stopper_response = prevent_fusion(
-        (_solve_2x2_system(N, p), _solve_2x2_system(N, P)), opaque_one
-    )
-
-    R = _make_diagonal_matrix(weight_radial) - weight_transverse[:, None] * jnp.swapaxes(
-        inverse_inertia.H, 0, 1
-    )
-    C = (
-        weight_transverse[:, None] * inverse_inertia.G * transverse_per_c
-        + _make_diagonal_matrix(weight_radial * radial_per_c)
-        + R[:, :1] * stopper_response[0]
-        + R[:, 1:] * stopper_response[1]
-        + _make_diagonal_matrix(jnp.where(is_loaded, 0.0, 1.0))
-    )
-    right_hand_side = (
-        -weight_transverse * free_motion.foot_transverse_motion
-        - weight_radial * s.m * free_motion.foot_radial_motion
-    )
-    c = _solve_2x2_system(
-        C,
-        right_hand_side - R[:, 0] * stopper_without_feet[0] - R[:, 1] * stopper_without_feet[1],
-    )
-    stopper_force = (
-        stopper_without_feet + stopper_response[:, 0] * c[0] + stopper_response[:, 1] * c[1]
-    )
-    foot_force_radial = jnp.where(
-        is_sticking, -s.m * free_motion.foot_radial_motion - stopper_force, radial_per_c * c
-    )
-    scale_masses = jnp.where(is_sticking, s.Mt / REFERENCE_MASS_RATIO, s.m)
-    scale_masses = jnp.where(is_loaded, scale_masses, 1.0)
-    painleve_determinant = scale_masses[0] * scale_masses[1] * _compute_determinant(C)
-    return prevent_fusion(
-        (stopper_force, transverse_per_c * c, foot_force_radial, painleve_determinant),
-        opaque_one,
-    )
-
-
-@eqx.filter_jit  # This function is traced once for all call sites.
-def solve_combination(
-    s: Symbols,
-    inverse_inertia: ContactInverseInertia,
-    free_motion: FreeMotion,
-    slot_modes: Array,
-    is_stopper_holding: Array,
-    friction: SlotArray,
-) -> SlotForceSolution:
-    """Return forces and motion for one combination of contact modes and stoppers.
-
-    - `slot_modes`: contact mode of the foot in each contact slot, shape (2, ...);
-    - `is_stopper_holding`: whether the stopper holds the leg in each contact slot, shape (2, ...);
-    - `friction`: friction coefficient of the foot in each contact slot, shape (2, ...).
-
-    A sticking foot stays at rest. A sliding foot stays on the ground, with friction against the
-    slip. A leg on its stopper has a constant length.
-    """
-    sin, cos, inverse_leg_mass = inverse_inertia.sin, inverse_inertia.cos, 1.0 / s.m
-    opaque_one = make_opaque_one(free_motion.hub_motion[2])
-    stopper_force, foot_force_transverse, foot_force_radial, painleve_determinant = (
-        _solve_slot_forces(
-            s, inverse_inertia, free_motion, slot_modes, is_stopper_holding, friction, opaque_one
-        )
-    )
-    leg_pull_forces = foot_force_radial + stopper_force
-    hub_motion = vx, vz, _ = tuple(
-        free
-        + transverse[0] * foot_force_transverse[0]
-        + transverse[1] * foot_force_transverse[1]
-        - radial[0] * stopper_force[0]
-        - radial[1] * stopper_force[1]
-        for free, transverse, radial in zip(
-            free_motion.hub_motion,
-            inverse_inertia.hub_response_transverse,
-            inverse_inertia.hub_response_radial,
-            strict=True,
-        )
-    )
-    hub_change = tuple(map(operator.sub, hub_motion, free_motion.hub_motion))
-    foot_transverse = (
-        inverse_inertia.compute_transverse_foot_motion(hub_change)
-        + free_motion.foot_transverse_motion
-    )
-    foot_radial = free_motion.foot_radial_motion + leg_pull_forces * inverse_leg_mass
-    free_length_motion = (
-        sin * vx + cos * vz + free_motion.slot_leg_motion - leg_pull_forces * inverse_leg_mass
-    )
-    return SlotForceSolution(
-        tangential_forces=foot_force_transverse * cos + foot_force_radial * sin,
-        normal_forces=foot_force_radial * cos - foot_force_transverse * sin,
-        stopper_forces=stopper_force,
-        leg_pull_forces=leg_pull_forces,
-        hub_motion=hub_motion,
-        length_motion=jnp.where(is_stopper_holding, 0.0, free_length_motion),
-        foot_motion_x=foot_transverse * cos + foot_radial * sin,
-        foot_motion_z=foot_radial * cos - foot_transverse * sin,
-        painleve_determinant=painleve_determinant,
-    )
 
 
 _MODE_PRIORITY = {
@@ -384,15 +173,6 @@ MAX_VIOLATION = 1e3
 
 It applies if no combination has all signs correct.
 """
-
-
-class _ModeEnumerationState(NamedTuple):
-    """State of the loop over the combinations of a table."""
-
-    untested_combination_mask: CombinationMask  # allowed combinations that are not yet examined
-    best_combination: CombinationMask  # first admissible combination, else the least violating one
-    lowest_sign_violation: Elementwise
-    n_solutions: Int[Array, "..."]
 
 
 def _evaluate_sign_violation(
@@ -537,16 +317,13 @@ def choose_combination(
             jnp.inf,
         )
 
-    def is_unfinished(mode_enumeration_state: _ModeEnumerationState) -> Array:
-        return jnp.any(mode_enumeration_state.untested_combination_mask != 0, axis=0) & (
-            counts_all_solutions | (mode_enumeration_state.n_solutions == 0)
-        )
+    def is_unfinished(state: tuple) -> Array:
+        untested_mask, _, _, n_solutions = state
+        return jnp.any(untested_mask != 0, axis=0) & (counts_all_solutions | (n_solutions == 0))
 
-    def evaluate_next_combinations(
-        mode_enumeration_state: _ModeEnumerationState,
-    ) -> _ModeEnumerationState:
+    def evaluate_next_combinations(state: tuple) -> tuple:
         """Return the state of the enumeration after the next few allowed combinations."""
-        untested_mask, best_combination, lowest_sign_violation, n_solutions = mode_enumeration_state
+        untested_mask, best_combination, lowest_violation, n_solutions = state
         combinations = []
         for _ in range(1 if lanes.targets_machine_code() else N_COMBINATIONS_PER_ITERATION):
             lowest_bits = untested_mask & -untested_mask
@@ -555,44 +332,35 @@ def choose_combination(
             )
             untested_mask = untested_mask ^ combination
             combinations.append(combination)
-        combination, combination_sign_violation, n_admissible = _find_least_violating_combination(
+        combination, violation, n_admissible = _find_least_violating_combination(
             evaluate_combination, combinations, make_opaque_one(free_motion.hub_motion[2])
         )
-        best_combination, lowest_sign_violation = select_trees_by_condition(
-            combination_sign_violation < lowest_sign_violation,
-            (combination, combination_sign_violation),
-            (best_combination, lowest_sign_violation),
+        best = select_trees_by_condition(
+            violation < lowest_violation,
+            (combination, violation),
+            (best_combination, lowest_violation),
         )
-        n_solutions = n_solutions + n_admissible
         return select_trees_by_condition(
-            is_unfinished(mode_enumeration_state),
-            _ModeEnumerationState(
-                untested_mask, best_combination, lowest_sign_violation, n_solutions
-            ),
-            mode_enumeration_state,
+            is_unfinished(state), (untested_mask, *best, n_solutions + n_admissible), state
         )
 
+    # The state consists of the untested combinations, the first admissible combination or else the
+    # least violating one, its violation, and the number of solutions.
     untested_mask = allowed_modes.mask_allowed_combinations(*mode_combination_table)
-    infinite_sign_violation = jnp.full_like(lax.stop_gradient(free_motion.hub_motion[2]), jnp.inf)
-    initial_state = _ModeEnumerationState(
+    initial_state = (
         untested_mask,
         0 * untested_mask + align_with_batch(np.array([1, 0], np.int32), uses_paper_rule),
-        infinite_sign_violation,
+        jnp.full_like(lax.stop_gradient(free_motion.hub_motion[2]), jnp.inf),
         0 * untested_mask[0],
     )
-    mode_enumeration_state = lax.while_loop(
-        lambda mode_enumeration_state: jnp.any(is_unfinished(mode_enumeration_state)),
-        evaluate_next_combinations,
-        initial_state,
+    _, best_combination, lowest_violation, n_solutions = lax.while_loop(
+        lambda state: jnp.any(is_unfinished(state)), evaluate_next_combinations, initial_state
     )
-    n_solutions = jnp.maximum(
-        mode_enumeration_state.n_solutions,
-        (mode_enumeration_state.lowest_sign_violation <= MAX_VIOLATION).astype(jnp.int32),
-    )
+    has_solution = (lowest_violation <= MAX_VIOLATION).astype(jnp.int32)
     return ChosenModeCombination(
-        *decode_mode_combination(mode_enumeration_state.best_combination),
-        mode_enumeration_state.lowest_sign_violation,
-        n_solutions,
+        *decode_mode_combination(best_combination),
+        lowest_violation,
+        jnp.maximum(n_solutions, has_solution),
     )
 
 
@@ -653,3 +421,187 @@ def is_release_consistent(
         )
 
     return compute_mode_margin(shifted_free_motion) > compute_mode_margin(free_motion)
+
+
+MAX_BLOCK_PIVOTS = 8
+"""Number of pivots that switch all legs with a wrong sign."""
+
+
+MAX_SINGLE_PIVOTS = 16
+"""Number of later pivots that switch one leg each."""
+
+
+MAX_ENUMERATED_LEGS = 8
+"""Largest number of legs whose combinations are enumerated if pivoting fails."""
+
+
+class LevelSolution(NamedTuple):
+    """Solution in terms of velocities or accelerations, for an assumed set of closed stoppers.
+
+    The stoppers are those of legs in the air.
+    """
+
+    chosen_combination: ChosenModeCombination
+    force_solution: WheelForceSolution
+    stopper_forces: LegArray  # force or impulse of the stoppers, N or N s
+    outward_leg_motion: LegArray  # acceleration or rate of the leg lengths, m/s^2 or m/s
+
+
+def solve_stopper_lcp(
+    solve_level: Callable[..., LevelSolution],
+    contact_law: Any,
+    motion: WheelMotion,
+    is_at_stopper: Array,
+    is_stopper_tested: Array,
+    tolerances: ContactSignTolerances,
+) -> tuple[LevelSolution, Array]:
+    """Return the solution with complementary stopper forces, and whether each stopper is closed.
+
+    The stopper of a tested leg is closed if it pushes. It is open if the leg moves inwards. If
+    stoppers are bilateral, all stoppers in `is_at_stopper` are closed and may pull.
+
+    - `solve_level`: function that solves for velocities or accelerations, for an assumed set of
+      closed stoppers. Its arguments are the contact law, the motion, the flags of the closed
+      stoppers and, if it is known, the combination of contact modes, else None.
+    """
+    if not contact_law.has_one_sided_stoppers:
+        return solve_level(contact_law, motion, is_at_stopper, None), is_at_stopper
+    is_stopper_holding, chosen_combination = _pivot_stoppers(
+        functools.partial(solve_level, *stop_gradients((contact_law, motion))),
+        jnp.full_like(motion.theta, jnp.inf),
+        is_at_stopper,
+        is_stopper_tested,
+        tolerances,
+    )
+    return solve_level(
+        contact_law, motion, is_stopper_holding, chosen_combination
+    ), is_stopper_holding
+
+
+def _pivot_stoppers(
+    solve_level: Callable[..., LevelSolution],
+    infinite_sign_violation: Array,
+    is_at_stopper: Array,
+    is_stopper_tested: Array,
+    tolerances: ContactSignTolerances,
+) -> tuple[Array, ChosenModeCombination]:
+    """Return which stoppers are closed, and the combination of modes, by principal pivoting.
+
+    The first pivots switch all legs with a wrong sign together. Later pivots switch only the last
+    of these legs, which prevents cycles. Principal pivoting is finite if no friction couples the
+    legs (Murty 1974, Kostreva 1978). If it fails, all combinations are enumerated, and the solution
+    with the smallest violation is returned. This solution is admissible if its violation is at most
+    `MAX_VIOLATION`.
+    """
+    tested_leg_rank = jnp.cumsum(is_stopper_tested.astype(jnp.int32), axis=0) - 1
+    n_combinations = 1 << jnp.minimum(
+        jnp.sum(is_stopper_tested, axis=0, dtype=jnp.int32), MAX_ENUMERATED_LEGS
+    )
+    leg_index = align_with_batch(np.arange(len(is_at_stopper), dtype=np.int32), n_combinations)
+
+    def is_unfinished(pivot_state: tuple) -> Array:
+        _, combination_code, n_attempts, best_solution = pivot_state
+        return (n_attempts == 0) | ((best_solution[0] > 1.0) & (combination_code < n_combinations))
+
+    def pivot_legs(pivot_state: tuple) -> tuple:
+        is_stopper_holding, combination_code, n_attempts, best_solution = pivot_state
+        level_solution = solve_level(is_stopper_holding, None)
+        sign_violation = jnp.where(
+            is_stopper_holding,
+            -level_solution.stopper_forces / tolerances.force_tolerance,
+            level_solution.outward_leg_motion / tolerances.motion_tolerance,
+        )
+        sign_violation = jnp.where(is_stopper_tested, lax.stop_gradient(sign_violation), 0.0)
+        has_wrong_sign = sign_violation > 1.0
+        max_violation = jnp.maximum(
+            jnp.max(sign_violation, axis=0), level_solution.chosen_combination.sign_violation
+        )
+        best_solution = select_trees_by_condition(
+            max_violation < best_solution[0],
+            (max_violation, is_stopper_holding, level_solution.chosen_combination),
+            best_solution,
+        )
+        is_last_wrong_leg = leg_index == jnp.max(jnp.where(has_wrong_sign, leg_index, -1), axis=0)
+        switched_legs = is_stopper_holding ^ jnp.where(
+            n_attempts < MAX_BLOCK_PIVOTS, has_wrong_sign, is_last_wrong_leg
+        )
+        is_pivoting = (
+            (combination_code < 0)
+            & jnp.any(has_wrong_sign, axis=0)
+            & (n_attempts < MAX_BLOCK_PIVOTS + MAX_SINGLE_PIVOTS)
+        )
+        combination_code = jnp.where(is_pivoting, combination_code, combination_code + 1)
+        enumerated_legs = jnp.where(
+            is_stopper_tested, ((combination_code >> tested_leg_rank) & 1) == 1, is_at_stopper
+        )
+        next_holding = jnp.where(is_pivoting, switched_legs, enumerated_legs)
+        return select_trees_by_condition(
+            is_unfinished(pivot_state),
+            (next_holding, combination_code, n_attempts + 1, best_solution),
+            pivot_state,
+        )
+
+    zero = jnp.zeros_like(n_combinations)
+    slot_zeros = jnp.stack([n_combinations, n_combinations]) * 0
+    no_combination = ChosenModeCombination(
+        slot_zeros, slot_zeros > 0, infinite_sign_violation, zero
+    )
+    best_solution = infinite_sign_violation, is_at_stopper, no_combination
+    *_, (max_violation, is_stopper_holding, chosen_combination) = lax.while_loop(
+        lambda pivot_state: jnp.any(is_unfinished(pivot_state)),
+        pivot_legs,
+        (is_at_stopper, zero - 1, zero, best_solution),
+    )
+    return is_stopper_holding, chosen_combination._replace(
+        n_solutions=jnp.where(max_violation <= MAX_VIOLATION, chosen_combination.n_solutions, 0)
+    )
+
+
+def list_modes_after_event(
+    contact_event: Any, slot_modes: Array, is_consistent: Array, follows_paper_rule: Array
+) -> tuple[Int[Array, "2 ..."], Int[Array, "2 ..."]]:
+    """Return the contact modes that may follow an event, and the modes that need no test.
+
+    The result contains two sets of modes for each contact slot, with one bit per mode.
+
+    - `slot_modes`: contact mode of the foot in each contact slot before the event;
+    - `is_consistent`: whether the released foot moves in the release direction (see
+      `is_release_consistent`);
+    - `follows_paper_rule`: whether the rule of the paper applies to infinite friction.
+    """
+    current_mode_bit, off_mode_bit = 1 << slot_modes, 1 << ContactMode.OFF
+    possible_modes = jnp.where(
+        slot_modes == ContactMode.STICK, ALL_MODES_MASK, current_mode_bit | off_mode_bit
+    )
+    reversed_mode_bit = jnp.where(
+        slot_modes == ContactMode.SLIP_DOWN, 1 << ContactMode.SLIP_UP, 1 << ContactMode.SLIP_DOWN
+    )
+    possible_modes = jnp.where(
+        contact_event.is_stopping_to_slide,
+        1 << ContactMode.STICK | off_mode_bit | reversed_mode_bit,
+        possible_modes,
+    )
+    untested_modes = jnp.where(
+        (slot_modes == ContactMode.STICK) | contact_event.is_stopping_to_slide, 0, current_mode_bit
+    )
+    for event_flags, following_mode, ended_mode in (
+        (contact_event.is_foot_lifting_off, off_mode_bit, current_mode_bit),
+        (contact_event.is_starting_to_slide_up, 1 << ContactMode.SLIP_UP, 1 << ContactMode.STICK),
+        (
+            contact_event.is_starting_to_slide_down,
+            1 << ContactMode.SLIP_DOWN,
+            1 << ContactMode.STICK,
+        ),
+    ):
+        tested_mode_bits = (
+            ALL_MODES_MASK
+            & ~ended_mode
+            & jnp.where(is_consistent | follows_paper_rule, ALL_MODES_MASK, ~following_mode)
+        )
+        possible_modes = jnp.where(
+            event_flags, jnp.where(is_consistent, following_mode, tested_mode_bits), possible_modes
+        )
+        untested_modes = jnp.where(
+            event_flags, jnp.where(is_consistent, following_mode, 0), untested_modes
+        )
+    return possible_modes, untested_modes

@@ -6,7 +6,7 @@ events.
 """
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from vrw_jax.models.contact_jvp import (
     WheelForceSolution,
     compute_slip_signs,
     find_slot_contacts,
+    replace_infinite_friction,
     solve_contact_forces,
 )
 from vrw_jax.models.contact_mechanics import (
@@ -40,8 +41,6 @@ from vrw_jax.models.contact_mechanics import (
     stop_gradients,
     sum_over_legs,
 )
-from vrw_jax.models.contact_modes import replace_infinite_friction
-from vrw_jax.wheel.ground import GroundAhead
 from vrw_jax.wheel.laws import (
     OneSidedLegForce,
     compute_motor_work,
@@ -51,8 +50,12 @@ from vrw_jax.wheel.laws import (
     evaluate_leg_kinks,
     number_legs,
 )
-from vrw_jax.wheel.outcomes import ContactMode, are_coordinates_at_rest, are_rates_negligible
 from vrw_jax.wheel.params import Symbols, compute_wheel_units
+from vrw_jax.wheel.transitions import (
+    ContactMode,
+    GroundAhead,
+    are_rates_negligible,
+)
 
 PackedState = Float[Array, "dim ..."]
 """Motion and loss accumulators as one vector of 10 + 2 n entries.
@@ -594,22 +597,6 @@ def compute_state_units(s: Symbols) -> tuple[Array, Array]:
     return (
         stack_units(wheel_units.length_unit, jnp.ones_like(s.L0)),
         stack_units(wheel_units.velocity_unit, wheel_units.rate_unit),
-    )
-
-
-def is_wheel_at_rest(
-    s: Symbols,
-    coordinate_rates: Array,
-    coordinate_accelerations: Iterable[Array],
-    atol: Elementwise,
-) -> Bool[Array, "..."]:
-    """Return whether the wheel is at rest, from rates and accelerations of all coordinates.
-
-    - `atol`: absolute tolerance in the wheel's units.
-    """
-    rate_units, time_unit = compute_state_units(s)[1], compute_wheel_units(s).time_unit
-    return are_coordinates_at_rest(
-        coordinate_rates, coordinate_accelerations, rate_units, time_unit, atol
     )
 
 

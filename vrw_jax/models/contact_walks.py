@@ -1,4 +1,13 @@
-"""Walks of batches with unilateral contact, and steps with their Jacobians, by machine code."""
+"""Walks of one wheel and of batches with unilateral contact, and their tangents.
+
+`jax.vmap` maps the compiled functions of one wheel to batch elements. For derivatives, each tangent
+then has its own batch element in addition to that of the motion. In contrast,
+`step_batch_with_jacobian` computes many tangents of each element.
+
+Events, contacts and step sizes are determined by the motion and computed once. The derivatives are
+those of the discrete flow with the accepted step sizes, and of the event times: see
+`flow.tangents`.
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -9,122 +18,59 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from vrw_jax import lanes
 from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
-from vrw_jax.flow.solver_steps import load_explicit_tableau
+from vrw_jax.flow.integrate import compute_phase_end_jvp
+from vrw_jax.flow.solver_steps import BatchPhase
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
 from vrw_jax.models.contact_impacts import project_motion
-from vrw_jax.models.contact_kernel import BatchWalkSettings, run_walks
+from vrw_jax.models.contact_integrator import (
+    IntervalTangents,
+    TangentBatch,
+    make_contact_phase,
+    pack_tree_into_rows,
+    unpack_tree_from_rows,
+)
+from vrw_jax.models.contact_kernel import (
+    N_HEIGHT_COLUMNS,
+    BatchWalkResult,
+    BatchWalkSettings,
+    LaneState,
+    init_lane_states,
+    make_walk_result,
+    run_walks,
+)
 from vrw_jax.models.contact_mechanics import pack_motion
-from vrw_jax.models.contact_record import UnilateralStep
-from vrw_jax.models.contact_section import (
+from vrw_jax.models.contact_record import (
     LOCKED_CODE_OFFSET,
+    GaitStepSummary,
+    UnilateralStep,
     compute_section_units,
     embed_section_state,
     unpack_section_state,
 )
-from vrw_jax.models.contact_tangents import walk_with_tangents
-from vrw_jax.models.unilateral_wheel import UnilateralWheel
-from vrw_jax.models.walk_batch import (
-    StepBatchResult,
-    StepInput,
-    WalkBatch,
-    make_step_input,
-)
-from vrw_jax.wheel.outcomes import ContactMode
+from vrw_jax.models.contact_state import ContactModeDynamics, ContactQuantities
+from vrw_jax.models.viscoelastic import load_batch_tableau
 from vrw_jax.wheel.params import (
-    FRICTION_NAME,
     PARAMETER_NAMES,
     Symbols,
+    WheelParams,
     compute_symbols,
     compute_wheel_units_of_rows,
+    stack_parameters,
 )
-
-
-def step_batch_with_contact(
-    model: Any,
-    inputs: list[StepInput],
-    next_line: list[StepInput],
-    section_states: np.ndarray,
-    n_steps: int,
-    options: StepOptions,
-    requested_engine: str,
-    n_legs: int,
-    derivative_names: Sequence[str],
-) -> StepBatchResult:
-    """Return the result of `step_batch` for a model with unilateral contact.
-
-    Without derivatives on flat ground, one call of the kernel computes all gait steps. On uneven
-    ground, further inputs are the friction of the feet that landed earlier, and the increase of the
-    slope to the next line of the ground, rad, or two rises (see `models.select_stance_line`), m.
-
-    - `next_line`: slope of the next line, or two rises; empty if all lines have one slope.
-    """
-    if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
-        raise ValueError(
-            f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
-            "need 'lanes' and an explicit Runge-Kutta solver: map vrw.walk over the wheels."
-        )
-    if np.ndim(model.restitution):
-        raise ValueError(
-            f"restitution has shape {np.shape(model.restitution)}, but a batch needs one number "
-            "for all elements: call vrw.step_batch for each restitution."
-        )
-    first_values = np.stack([x.select_values(0) for x in inputs])
-    section_states = embed_section_states(first_values, section_states, n_legs)
-    friction = np.asarray(model.friction, section_states.dtype)
-    is_ground_uneven = bool(next_line) or friction.ndim == 2
-    if not (derivative_names or is_ground_uneven or model.leg_period > 1):
-        x, durations, outcome, n_stepped, solver_steps, _ = map(
-            np.asarray, walk_batch(first_values, section_states, n_steps, model, options, n_legs)
-        )
-        solver_index = np.zeros_like(n_stepped)
-        return StepBatchResult(
-            x, durations, outcome, n_stepped, solver_steps, solver_index, "lanes", (options.solver,)
-        )
-    if is_ground_uneven:
-        slope = inputs[PARAMETER_NAMES.index("slope")]
-        if len(next_line) == 1:
-            next_slope = next_line[0]
-            tilt = next_slope._replace(
-                values=next_slope.values - slope.values,
-                list_terms=lambda k: [(k, -1.0), *next_slope.list_terms(k)],
-            )
-            next_line = [tilt]
-        inputs = [
-            *inputs,
-            make_step_input(FRICTION_NAME, friction, n_steps, len(section_states), -1),
-            *(next_line or [StepInput("", np.zeros_like(slope.values))]),
-        ]
-    batch = WalkBatch(section_states.T.copy(), inputs, derivative_names)
-    input_indices = list(batch.input_indices)
-
-    def step_lanes(_: Any, inputs: np.ndarray, x: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
-        if not derivative_names:
-            x, durations, outcome, _, solver_steps, _ = walk_batch(
-                inputs, x.T, 1, model, options, n_legs
-            )
-            outputs: tuple[Any, ...] = x, durations, outcome, solver_steps
-        else:
-            step, jacobian = step_batch_with_jacobian(
-                inputs, x.T, model, options, n_legs, input_indices
-            )
-            columns = np.concatenate([jacobian.section_state, jacobian.durations], 1)
-            outputs = step.section_state, step.durations, step.outcome, step.solver_steps
-            outputs += (columns[:, :, input_indices],)
-        return tuple(np.asarray(x).T for x in outputs)
-
-    batch.take_steps(n_steps, step_lanes, model)
-    return batch.make_batch_result("lanes", (options.solver,))
+from vrw_jax.wheel.transitions import ContactMode
 
 
 def walk_batch(
     input_columns: np.ndarray,
     section_states: np.ndarray,
     n_steps: int,
-    model: UnilateralWheel,
+    model: Any,
     options: StepOptions,
     n_legs: int,
 ) -> tuple[np.ndarray, ...]:
@@ -147,7 +93,7 @@ def walk_batch(
 def step_batch_with_jacobian(
     input_columns: np.ndarray,
     section_states: np.ndarray,
-    model: UnilateralWheel,
+    model: Any,
     options: StepOptions,
     n_legs: int,
     input_indices: Sequence[int] | None = None,
@@ -357,7 +303,7 @@ def _compile_section_function(
 
 
 def _make_static_walk_settings(
-    model: UnilateralWheel, options: StepOptions, n_legs: int, has_tangents: bool, n_columns: int
+    model: Any, options: StepOptions, n_legs: int, has_tangents: bool, n_columns: int
 ) -> BatchWalkSettings:
     """Return the walk settings without traced options and number of steps, as a hashable key.
 
@@ -379,7 +325,7 @@ def _make_static_walk_settings(
 
 
 def _run_walk(
-    model: UnilateralWheel,
+    model: Any,
     options: StepOptions,
     n_legs: int,
     n_steps: int,
@@ -445,10 +391,8 @@ def _run_lane_walks(
     - `tangent_input_indices`: index of the input of each tangent, or -1.
     """
     options = eqx.combine(traced_options, static_walk_settings.step_options)
-    tableau = load_explicit_tableau(options.solver)
-    assert tableau is not None  # The caller has checked the solver.
     walk_settings = static_walk_settings._replace(
-        n_steps=n_steps, step_options=options, tableau=tableau
+        n_steps=n_steps, step_options=options, tableau=load_batch_tableau(options)
     )
     if tangent_input_indices is None:
         return run_walks(walk_settings, input_columns, section_state)
@@ -468,3 +412,270 @@ def _run_lane_walks(
         unit_tangents[:, len(input_columns) :],
         jnp.sum(tangent_input_indices >= 0, axis=0, dtype=jnp.int32),
     )
+
+
+def walk_with_tangents(
+    walk_settings: BatchWalkSettings,
+    input_columns: Array,
+    section_state: Array,
+    input_column_tangents: Array,
+    section_state_tangents: Array,
+    n_tangents: Array,
+) -> tuple[BatchWalkResult, Any]:
+    """Return the result of `run_walks`, and the tangents of its floating-point arrays.
+
+    - `n_tangents`: number of tangents of each batch element;
+    - `input_column_tangents`, `section_state_tangents`: tangents of the inputs. The first axis
+      contains the tangents, of which the first `n_tangents` are used.
+
+    The first axis of the resulting tangents also contains the tangents.
+    """
+    input_columns, push_to_columns = jax.linearize(
+        walk_settings.resolve_heights, input_columns, section_state
+    )
+    if walk_settings.n_ground_columns == N_HEIGHT_COLUMNS:
+        input_column_tangents = jnp.stack(
+            list(map(push_to_columns, input_column_tangents, section_state_tangents))
+        )
+    count_rows = lambda array_tree: len(pack_tree_into_rows(array_tree))
+    split_floats = lambda tree: eqx.partition(tree, eqx.is_inexact_array)
+    split_state = lambda lane_state: split_floats(lane_state._replace(progress=None))
+
+    def begin_walk(input_columns: Array, section_state: Array) -> tuple[LaneState, tuple]:
+        input_columns, lane_state = init_lane_states(walk_settings, input_columns, section_state)
+        return eqx.filter(lane_state, eqx.is_inexact_array), (input_columns, lane_state)
+
+    template, pushforward, (input_columns, lane_state) = jax.linearize(
+        begin_walk, input_columns, section_state, has_aux=True
+    )
+    n_column_tangents = jnp.zeros_like(n_tangents)
+    for k in range(len(input_column_tangents)):
+        n_column_tangents = jnp.where(
+            jnp.any(input_column_tangents[k] != 0.0, axis=0), k + 1, n_column_tangents
+        )
+    tangents = TangentBatch(n_tangents, n_column_tangents, input_column_tangents)
+    push_start_tangent = lambda k, _: pushforward(
+        tangents.get_input_tangent(k),
+        lax.dynamic_index_in_dim(section_state_tangents, k, 0, keepdims=False),
+    )
+    progress = walk_settings.begin_progress(input_columns, lane_state)
+    lane_state = lane_state._replace(progress=progress)
+    tangent_rows = tangents.map_tangents_sequentially(
+        push_start_tangent, tangents.allocate_tangent_rows(count_rows(template))
+    )
+
+    def advance(state: tuple[LaneState, Array]) -> tuple[LaneState, Array]:
+        lane_state, tangent_rows = state
+        floats, others = split_state(lane_state)
+        others = others._replace(progress=lane_state.progress)
+
+        def process_events(input_columns: Array, floats: LaneState) -> tuple[LaneState, LaneState]:
+            next_state = walk_settings.process_events(input_columns, eqx.combine(floats, others))
+            return split_state(next_state)[0], next_state
+
+        _, pushforward, next_state = jax.linearize(
+            process_events, input_columns, floats, has_aux=True
+        )
+        push_event_tangent = lambda k, tangent_row: pushforward(
+            tangents.get_input_tangent(k), unpack_tree_from_rows(tangent_row, template)
+        )
+        tangent_rows = tangents.map_tangents_sequentially(push_event_tangent, tangent_rows)
+        return _integrate_with_tangents(
+            walk_settings, input_columns, next_state, tangents, tangent_rows
+        )
+
+    lane_state, tangent_rows = lax.while_loop(
+        lambda state: jnp.any(state[0].is_unfinished), advance, (lane_state, tangent_rows)
+    )
+    floats, others = split_state(lane_state)
+    compute_result = lambda floats, input_columns: split_floats(
+        walk_settings.compute_step_result(eqx.combine(floats, others), input_columns)
+    )
+    float_results, pushforward, other_results = jax.linearize(
+        compute_result, floats, input_columns, has_aux=True
+    )
+    push_result_tangent = lambda k, _: pushforward(
+        unpack_tree_from_rows(lax.dynamic_index_in_dim(tangent_rows, k, 0, False), template),
+        tangents.get_input_tangent(k),
+    )
+    result_tangents = tangents.map_tangents_sequentially(
+        push_result_tangent, tangents.allocate_tangent_rows(count_rows(float_results))
+    )
+    walk_result = make_walk_result(eqx.combine(float_results, other_results), lane_state)
+    return walk_result, unpack_tree_from_rows(result_tangents, float_results)
+
+
+def _integrate_with_tangents(
+    walk_settings: BatchWalkSettings,
+    input_columns: Array,
+    lane_state: LaneState,
+    tangents: TangentBatch,
+    tangent_rows: Array,
+) -> tuple[LaneState, Array]:
+    """Return the state of all batch elements at their next events, and its tangents."""
+    tableau = walk_settings.tableau
+    assert tableau is not None  # diffrax differentiates in another way.
+
+    # The time of a force extremum is constant for derivatives.
+    contact_state = lane_state.contact_state._replace(force_rate_signs=None)
+    constants, push_to_constants, others = jax.linearize(
+        lambda columns: eqx.partition(
+            walk_settings.make_lane_contact_dynamics(columns, contact_state), eqx.is_inexact_array
+        ),
+        input_columns,
+        has_aux=True,
+    )
+
+    def make_phase(constants: Any, rows: Array) -> BatchPhase:
+        dynamics: ContactModeDynamics = eqx.combine(constants, others)
+        quantities = ContactQuantities.unpack_rows(dynamics, rows)
+        dynamics = dynamics._replace(known_solution=quantities.force_solution)
+        return make_contact_phase(
+            dynamics, tableau, walk_settings.step_options, is_differentiated=True
+        )
+
+    n_rows = len(lane_state.q) + len(lane_state.v)
+    phase_tangents = IntervalTangents(
+        make_phase, constants, push_to_constants, tangents, tangent_rows[:, :n_rows]
+    )
+    lane_state, phase_end, search_end = walk_settings.integrate(
+        input_columns, lane_state, phase_tangents
+    )
+    assert search_end is not None
+    motion_tangents, time_tangents, _ = compute_phase_end_jvp(
+        tableau, phase_tangents, phase_end, search_end
+    )
+    integrator_state = search_end.integrator_state
+    end_tangents = jnp.concatenate([motion_tangents, time_tangents[:, None]], 1)
+
+    def select_end_tangent(k: Array, _: Array) -> Array:
+        select_tangent = lambda x: lax.dynamic_index_in_dim(x, k, 0, False)
+        start_tangent = select_tangent(integrator_state.state_tangents)
+        return jnp.where(
+            integrator_state.has_guard_crossed,
+            select_tangent(end_tangents),
+            jnp.concatenate([start_tangent, jnp.zeros_like(start_tangent[:1])]),
+        )
+
+    return lane_state, tangents.map_tangents_sequentially(select_end_tangent, tangent_rows)
+
+
+def prepare_walk(
+    is_detailed: bool,
+    engine: str,
+    measures_force_peaks: bool,
+    uses_diffrax: bool,
+    wheel: Any,
+    params: WheelParams,
+    x: Array,
+    options: StepOptions,
+) -> tuple[BatchWalkSettings, Array, Array]:
+    """Return the settings of walks of one step, and input columns and section states.
+
+    - `engine`: name of the engine in the results;
+    - `uses_diffrax`: whether diffrax replaces the batch kernel.
+    """
+    uneven_ground_columns = jax.tree.leaves(wheel.uneven)
+    restitution = () if wheel.restitution is None else (wheel.restitution.astype(x.dtype),)
+    input_columns = jnp.stack(
+        [*stack_parameters(params), wheel.friction, *uneven_ground_columns, *restitution]
+    )
+    walk_settings = BatchWalkSettings(
+        params.n_legs,
+        1,
+        wheel.max_events,
+        wheel.has_one_sided_stoppers,
+        wheel.uses_paper_rule,
+        is_detailed,
+        options,
+        None if uses_diffrax else load_batch_tableau(options),
+        len(uneven_ground_columns),
+        wheel.restitution is not None,
+        engine,
+        measures_force_peaks,
+        jax.tree.structure(params.laws),
+    )
+    return walk_settings, input_columns, x
+
+
+WalkPreparation = Callable[..., tuple[BatchWalkSettings, Array, Array]]
+"""`prepare_walk` as a function of (wheel, params, x, options)."""
+
+
+def take_contact_steps(prepare: WalkPreparation, *arguments: Any) -> Any:
+    """Return the results of one step of all batch elements, which are on the last axis.
+
+    If details are requested, the results are those in `UnilateralStep`. Otherwise they are section
+    state, durations, outcome and number of solver steps.
+    """
+    return _select_step_results(run_walks(*prepare(*arguments)))
+
+
+def _select_step_results(walk_result: BatchWalkResult) -> Any:
+    step_result = walk_result.step_result
+    if not isinstance(step_result, GaitStepSummary):
+        return step_result
+    return (
+        step_result.section_state,
+        step_result.durations,
+        walk_result.outcome,
+        walk_result.n_solver_steps,
+    )
+
+
+def call_with_one_lane(function: Callable) -> Callable:
+    """Return a function of one wheel from a function of a batch, without machine code."""
+
+    def call_function(*arguments: Any) -> Any:
+        lane_outputs = function(*jax.tree.map(lambda x: jnp.asarray(x)[..., None], arguments))
+        return jax.tree.map(lambda x: x[..., 0], lane_outputs)
+
+    return call_function
+
+
+def make_column_function(
+    prepare: WalkPreparation, structure: Any, argnums: tuple[int, ...]
+) -> Callable:
+    """Return a function of the leaves of (wheel, params, x, options) for Jacobian columns.
+
+    Its results are those of `lanes.compute_jacobian_columns`, with the tolerances for derivatives.
+    Each column is the tangent of a batch element of its own.
+    """
+    divide_results = lambda walk_result: eqx.partition(
+        _select_step_results(walk_result), eqx.is_inexact_array
+    )
+
+    def compute_walk_tangents(leaves: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple:
+        walk_settings, input_columns, x = prepare(*jax.tree.unflatten(structure, leaves))
+        _, input_column_tangents, section_state_tangents = prepare(
+            *jax.tree.unflatten(structure, tangents)
+        )
+        walk_result, result_tangents = walk_with_tangents(
+            walk_settings,
+            input_columns,
+            x,
+            input_column_tangents[None],
+            section_state_tangents[None],
+            n_tangents=jnp.ones_like(input_columns[0], jnp.int32),
+        )
+        result_tangents = jax.tree.map(lambda leaf: leaf[0], result_tangents)
+        float_tangents, _ = divide_results(walk_result._replace(step_result=result_tangents))
+        return float_tangents, *divide_results(walk_result)
+
+    compute_compiled_tangents = lanes.jit_batch(compute_walk_tangents)
+
+    def compute_columns(*leaves: Array) -> tuple:
+        *settings, options = jax.tree.unflatten(structure, leaves)
+        leaves = tuple(jax.tree.leaves((*settings, options.with_derivative_tolerances())))
+        selected_entries, unravel = ravel_pytree([leaves[i] for i in argnums])
+        unit_vectors = jnp.eye(selected_entries.size, dtype=selected_entries.dtype)
+        tangents = [jnp.zeros_like(leaf) for leaf in leaves]
+        for i, leaf_tangents in zip(argnums, jax.vmap(unravel)(unit_vectors), strict=True):
+            tangents[i] = leaf_tangents
+        batch_axes = tuple(0 if i in argnums else None for i in range(len(leaves)))
+        columns, *results = jax.vmap(compute_compiled_tangents, (None, batch_axes))(
+            leaves, tuple(tangents)
+        )
+        return columns, *jax.tree.map(lambda x: x[0], results)
+
+    return compute_columns

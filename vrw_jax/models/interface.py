@@ -18,7 +18,6 @@ from vrw_jax.base.types import Elementwise
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_results import SectionState, combine_steps
-from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.laws import count_kinks
 from vrw_jax.wheel.params import (
     LAW_NAMES,
@@ -30,6 +29,7 @@ from vrw_jax.wheel.params import (
     list_law_parameters,
     make_wheel_from_parameters,
 )
+from vrw_jax.wheel.transitions import compute_foot_distance
 
 StepGroundValues = tuple[Array, ...]
 """Arrays that describe the ground under one step or under all steps: slopes, rises and, for some

@@ -1,28 +1,33 @@
-"""Ladder of models: each step is computed with the simplest model whose assumptions hold.
+"""Ladder of models, which takes the simplest valid model for each step, and table of all models.
 
 The step is first computed with the viscoelastic model, together with its margins. If a margin is
 violated, the step is computed again with the unilateral model. Under `vmap`, a model is selected
 for each batch element. The unilateral model computes nothing for elements for which the
 viscoelastic model is valid. The rigid model is never selected, because its assumption of rigid legs
 is violated for every finite stiffness.
+
+To add a model, only the table `MODEL_CLASSES` has to be extended.
 """
 
 import dataclasses
 import enum
+import platform
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.base.options import StepOptions
+from vrw_jax.base.options import StepOptions, list_tree_parameters
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_each_batch_element
 from vrw_jax.base.types import RealInput, Scalar
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET, FullState, embed_section_state
+from vrw_jax.lanes.disk_cache import find_library_version
+from vrw_jax.models.contact_record import LOCKED_CODE_OFFSET, FullState, embed_section_state
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES, make_flag_attributes
 from vrw_jax.models.phase_sequence import replace_invalid_inputs
@@ -40,8 +45,8 @@ from vrw_jax.models.unilateral_wheel import (
 )
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.laws import convert_leg_force
-from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import WheelParams, convert_friction
+from vrw_jax.wheel.transitions import ContactMode
 
 
 class ModelCode(enum.IntEnum):
@@ -365,3 +370,75 @@ class LadderWheel(AbstractContactWheel):
         trajectory = unilateral_wheel.sample_step(params, x, options, n_samples)
         selection = {"rung": model_choice.model_code, "reason": model_choice.reason_code}
         return dataclasses.replace(trajectory, model_selection=selection)
+
+
+MODEL_CLASSES: dict[str, type[AbstractWheel]] = {
+    "viscoelastic": ViscoelasticWheel,
+    "rigid": RigidWheel,
+    "unilateral": UnilateralWheel,
+    "auto": LadderWheel,
+}
+"""Classes of all models by their names in a configuration, in the order in which error messages
+list them. The first class is the default model.
+"""
+
+
+def list_model_config_names(
+    command_name: str | None = None, parameter_name: str | None = None
+) -> tuple[str, ...]:
+    """Return the configuration names of all models that satisfy two optional conditions.
+
+    - `command_name`: command that must accept the model;
+    - `parameter_name`: parameter on which the model's motion must depend.
+    """
+    return tuple(
+        config_name
+        for config_name, model_class in MODEL_CLASSES.items()
+        if (command_name is None or command_name in model_class.commands)
+        and (parameter_name is None or parameter_name in model_class().parameter_names)
+    )
+
+
+def describe_accepted_models(
+    command_name: str | None = None, parameter_name: str | None = None
+) -> str:
+    """Return the models from `list_model_config_names` as expressions that users can write.
+
+    An example is `vrw.RigidWheel() or "auto"`.
+    """
+    *first_expressions, last_expression = (
+        f'"{name}"' if name == "auto" else f"vrw.{MODEL_CLASSES[name].__name__}()"
+        for name in list_model_config_names(command_name, parameter_name)
+    )
+    return " or ".join(filter(None, (", ".join(first_expressions), last_expression)))
+
+
+def collect_provenance_attributes(
+    params: Any, model: object, options: StepOptions | None = None
+) -> dict[str, str | float | int]:
+    """Return dataset attributes that describe how a result was computed.
+
+    They state versions, device, floating-point type, tolerances and parameters. The default of
+    `options` is `StepOptions()`.
+    """
+    options = StepOptions() if options is None else options
+    parameter_attributes: dict[str, str | float | int] = {
+        f"parameter_{parameter.name}": float(parameter.value)
+        for parameter in list_tree_parameters(params)
+        if jnp.ndim(parameter.value) == 0
+    }
+    if isinstance(params, WheelParams):
+        parameter_attributes["parameter_n_legs"] = params.n_legs
+    return parameter_attributes | {
+        "model": repr(model),
+        "versions": ", ".join(
+            f"{library_name} {find_library_version(library_name)}"
+            for library_name in ("vrw-jax", "jax", "diffrax", "numpy")
+        )
+        + f", python {platform.python_version()}",
+        "device": jax.devices()[0].device_kind,
+        "dtype": str(jnp.result_type(*jax.tree.leaves(params), float)),
+        "solver": options.solver,
+        "rtol": float(options.rtol),
+        "atol": float(options.atol),
+    }

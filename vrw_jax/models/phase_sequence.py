@@ -22,6 +22,13 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.integrate import PhaseEnd
+from vrw_jax.flow.phase_integration import (
+    GuardsAndMargins,
+    PhaseKinks,
+    StateArray,
+    VectorField,
+    integrate_phase,
+)
 from vrw_jax.models.step_results import (
     PAPER_START_STATE,
     DoubleSupportIndicators,
@@ -34,14 +41,7 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Motion
-from vrw_jax.wheel.ground import (
-    GroundAhead,
-    compute_foot_distance,
-    compute_foot_distance_for_length,
-    compute_line_slope,
-)
 from vrw_jax.wheel.laws import compute_motor_work
-from vrw_jax.wheel.outcomes import replace_rest_outcome
 from vrw_jax.wheel.params import (
     MAX_SI_VALUE,
     PARAMETER_DOMAINS,
@@ -56,7 +56,14 @@ from vrw_jax.wheel.phases import (
     PhaseMargins,
     make_paper_phases,
 )
-from vrw_jax.wheel.transitions import Landing
+from vrw_jax.wheel.transitions import (
+    GroundAhead,
+    Landing,
+    compute_foot_distance,
+    compute_foot_distance_for_length,
+    compute_line_slope,
+    replace_rest_outcome,
+)
 
 FALLBACK_SINGLE_SUPPORT_STATE = (-0.3, 0.9, 0.95, 1.0, 0.0, 0.0)
 """Regular posture (theta, L1, L2 and their rates) that replaces the state of a wheel after a failed
@@ -191,12 +198,8 @@ def _run_remaining_phases(
             if phase is remaining_phases[-1]
             else is_phase_active & (phase_end.duration > 0.0)
         )
-    return (
-        tuple(phase_start_states),
-        tuple(phase_end_results),
-        tuple(has_phase_occurred),
-        step_outcome,
-    )
+    starts, ends = tuple(phase_start_states), tuple(phase_end_results)
+    return starts, ends, tuple(has_phase_occurred), step_outcome
 
 
 def finish_gait_step(
@@ -286,11 +289,8 @@ def make_step_result(
 
     - `friction`: friction coefficient of the ground, for the friction margins.
     """
-    s, landing_result, phase_end_results = (
-        phase_sequence.s,
-        phase_sequence.step_start_landing,
-        phase_sequence.phase_end_results,
-    )
+    s, landing_result = phase_sequence.s, phase_sequence.step_start_landing
+    phase_end_results = phase_sequence.phase_end_results
     has_step_begun = phase_sequence.outcome != Outcome.BAD_INPUT
     has_stopper_collision = phase_sequence.has_phase_occurred[2]
     zero_unless_begun = lambda x: jnp.where(has_step_begun, x, 0.0)
@@ -427,11 +427,8 @@ def _make_margins_and_required_friction(
     - `liftoff_motion`: motion at the end of double support;
     - `stopper_collision`: collision of Leg 2 with its stopper.
     """
-    s, landing_result, has_phase_occurred = (
-        phase_sequence.s,
-        phase_sequence.step_start_landing,
-        phase_sequence.has_phase_occurred,
-    )
+    s, landing_result = phase_sequence.s, phase_sequence.step_start_landing
+    has_phase_occurred = phase_sequence.has_phase_occurred
     has_step_begun = phase_sequence.outcome != Outcome.BAD_INPUT
     has_stopper_collision = has_phase_occurred[2]
     phase_minima = [
@@ -473,15 +470,11 @@ def _make_margins_and_required_friction(
     subtract_from_friction = lambda required_coefficient: jnp.where(
         has_step_begun, friction - required_coefficient, 0.0
     )
-
-    def compute_locked_stopper_impulses(
-        motion_after: Motion, hub_velocity_jump: tuple, has_impact_occurred: Array
-    ) -> Array:
-        leg_impulses = transitions.compute_locked_leg_impulses(
-            s, motion_after, hub_velocity_jump, range(3, s.n + 1)
-        )
-        return jnp.where(has_impact_occurred, leg_impulses, 0.0)
-
+    compute_locked_stopper_impulses = lambda impact, has_impact_occurred: jnp.where(
+        has_impact_occurred,
+        transitions.compute_locked_leg_impulses(s, impact.motion_after, impact.hub_velocity_jump),
+        0.0,
+    )
     margins = Margins(
         fore_foot_force=find_lowest_margin("fore_foot_force", 0, 1, 2),
         takeoff_acceleration=jnp.where(
@@ -496,17 +489,11 @@ def _make_margins_and_required_friction(
         contraction=find_lowest_margin("contraction", 0, 1, 2),
         friction_fore=subtract_from_friction(required_friction.fore),
         friction_rear=subtract_from_friction(required_friction.rear),
-        landing_stopper_impulse=compute_locked_stopper_impulses(
-            landing_result.motion_after, landing_result.hub_velocity_jump, has_step_begun
-        ),
+        landing_stopper_impulse=compute_locked_stopper_impulses(landing_result, has_step_begun),
         hit_stopper_impulse=compute_locked_stopper_impulses(
-            stopper_collision.motion_after,
-            stopper_collision.hub_velocity_jump,
-            has_stopper_collision,
+            stopper_collision, has_stopper_collision
         ),
-        hit_planted_impulse=jnp.where(
-            has_stopper_collision, stopper_collision.foot_impulse.normal, 0.0
-        ),
+        hit_planted_impulse=jnp.where(has_stopper_collision, stopper_impulse.normal, 0.0),
         landing_friction_fore=subtract_from_friction(required_friction.landing_fore),
         landing_friction_rear=subtract_from_friction(required_friction.landing_rear),
     )
@@ -611,3 +598,75 @@ def find_stance_slope(
 
 IMPOSSIBLE_SLOPE = jnp.pi
 """Slope outside the domain of slopes, so that a step on it is BAD_INPUT, rad."""
+
+
+class ElementPhase(NamedTuple):
+    """Equations of first order of a phase of one wheel. The state y = (q, v) is one vector."""
+
+    motion_unpacker: Callable[[StateArray], Motion]
+    vector_field: VectorField
+    guards: GuardsAndMargins
+    kinks: PhaseKinks | None
+
+
+def make_element_phase(phase: AbstractPhase, records_margins: bool) -> ElementPhase:
+    """Return the functions of a phase that `flow.phase_integration` calls.
+
+    - `records_margins`: whether the integrator also evaluates margins.
+    """
+
+    def evaluate_vector_field(y: StateArray) -> StateArray:
+        accelerations = phase.solve_acceleration(phase.unpack_motion(y))
+        return jnp.stack([*y[phase.n_dof :], *accelerations[: phase.n_dof]])
+
+    def evaluate_guards_and_margins(y: StateArray) -> Array:
+        phase_instant = PhaseInstant(phase, phase.unpack_motion(y), None)
+        margins = phase.compute_margins(phase_instant) if records_margins else ()
+        return jnp.stack([*phase.compute_guards(phase_instant), *margins])
+
+    guards_and_margins = GuardsAndMargins(
+        evaluate_guards_and_margins,
+        len(phase.all_guard_outcomes) - phase.n_kinks,
+        phase.are_margins_counted_at_start if records_margins else (),
+    )
+
+    def enter_sides(sides: Vector) -> tuple[VectorField, Callable]:
+        functions = make_element_phase(phase.on_sides(sides), records_margins)
+        return functions.vector_field, functions.guards.evaluate_guards_and_margins
+
+    return ElementPhase(
+        phase.unpack_motion,
+        evaluate_vector_field,
+        guards_and_margins,
+        PhaseKinks(lambda y: phase.compute_kinks(phase.unpack_motion(y)), enter_sides)
+        if phase.n_kinks
+        else None,
+    )
+
+
+def make_element_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
+    """Return a function that integrates one phase of one wheel to its end.
+
+    diffrax takes the steps of implicit solvers, and of all solvers with `engine="diffrax"`.
+    """
+
+    def run_phase(
+        phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: Any
+    ) -> PhaseEnd:
+        element_phase = make_element_phase(phase, records_margins)
+        phase_end = integrate_phase(
+            element_phase.vector_field,
+            element_phase.guards,
+            jnp.stack([*q, *v]),
+            is_phase_active,
+            compute_wheel_units(phase.s).scale_times_to_seconds(options),
+            jnp.stack(phase.coordinate_units),
+            element_phase.kinks,
+        )
+        y = tuple(phase_end.state)
+        return phase_end._replace(
+            state=(y[: phase.n_dof], y[phase.n_dof :]),
+            margin_minima=phase_end.margin_minima if records_margins else None,
+        )
+
+    return run_phase

@@ -37,8 +37,8 @@ from vrw_jax.models.step_results import (
 )
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Motion, compute_rear_foot_height
-from vrw_jax.wheel.ground import compute_foot_distance
 from vrw_jax.wheel.params import Symbols, WheelParams, require_known_friction
+from vrw_jax.wheel.transitions import compute_foot_distance
 
 # Number of angles that each round of the search for minima of margins samples. The value is chosen
 # because forces are smooth over the 45 degrees of a step.
@@ -111,13 +111,8 @@ class RigidWheel(AbstractWheel):
         return jnp.stack([0.5 * s.alpha + 0.0 * rolling_rate, rolling_rate, 0.0 * rolling_rate])
 
     def advance(self, params: WheelParams, x: SectionState, options: StepOptions) -> AdvanceResult:
-        step_result = self.take_step(params, x, options)
-        return AdvanceResult(
-            step_result.section_state,
-            step_result.durations,
-            step_result.outcome,
-            step_result.solver_steps,
-        )
+        step = self.take_step(params, x, options)
+        return AdvanceResult(step.section_state, step.durations, step.outcome, step.solver_steps)
 
     def _compute_landing_rate_ratio(self, s: Symbols) -> Elementwise:
         """Return the angular rate just after a landing divided by that just before it."""
@@ -129,12 +124,8 @@ class RigidWheel(AbstractWheel):
             s, half_angle, jnp.ones_like(half_angle), jnp.zeros_like(half_angle)
         ).motion_after
         M = dynamics.compute_mass_matrix(s, motion_after_landing.L1, motion_after_landing.L2)
-        return (
-            M.multiply_vector(
-                (motion_after_landing.dtheta, motion_after_landing.dL1, motion_after_landing.dL2)
-            )[0]
-            / foot_inertia
-        )
+        rates = motion_after_landing.dtheta, motion_after_landing.dL1, motion_after_landing.dL2
+        return M.multiply_vector(rates)[0] / foot_inertia
 
     def compute_foot_distance(self, params: WheelParams, x: AnySectionState) -> Elementwise:
         half_angle = jnp.full_like(x[0], 0.5 * params.leg_angle)
@@ -318,7 +309,7 @@ class RigidWheel(AbstractWheel):
             for foot_impulse in (fore_impulse, rear_impulse)
         )
         stopper_impulses = transitions.compute_locked_leg_impulses(
-            s, motion_after, hub_velocity_jump, range(3, s.n + 1)
+            s, motion_after, hub_velocity_jump
         )
         return rear_impulse, required_friction, stopper_impulses
 
@@ -439,13 +430,9 @@ class VerticalRateMap(NamedTuple):
 
         - `slope`: slope of the ground, rad.
         """
-        slope_dependent_squared_rate = self.squared_rate_amplitude * jnp.cos(
-            slope - self.slope_of_largest_squared_rate
-        )
-        return (
-            slope_dependent_squared_rate / (1.0 - self.retained_squared_rate_fraction)
-            - self.doubled_gravity_stiffness
-        )
+        rate = self.squared_rate_amplitude * jnp.cos(slope - self.slope_of_largest_squared_rate)
+        lost_fraction = 1.0 - self.retained_squared_rate_fraction
+        return rate / lost_fraction - self.doubled_gravity_stiffness
 
 
 # Number of rounds, each of which narrows the bracket of angles around the lowest sample. The value
@@ -611,12 +598,12 @@ class RollingMotion(eqx.Module):
                     lowest_angles_and_margins,
                 )
 
-            initial_angles_and_margins = bracket_centers, jnp.full_like(bracket_centers, jnp.inf)
+            initial_margins = jnp.full_like(bracket_centers, jnp.inf)
             minimum_angles, _ = lax.fori_loop(
                 0,
                 N_ANGLES_PER_ZOOM_ROUND,
                 update_lowest_margins,
-                initial_angles_and_margins,
+                (bracket_centers, initial_margins),
             )
             return minimum_angles, half_bracket_width * (2.5 / N_ANGLES_PER_ZOOM_ROUND)
 

@@ -46,7 +46,6 @@ from vrw_jax.flow.solver_steps import compute_real_stability_limit, load_explici
 from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.lanes.batching import map_in_batches, select_tree_rows
 from vrw_jax.lanes.lane_function import CompiledBatchFunction, compile_batch_function
-from vrw_jax.models.contact_walks import step_batch_with_contact
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.stepping import (
     convert_heights,
@@ -54,16 +53,17 @@ from vrw_jax.models.stepping import (
     convert_section_state,
     convert_step_options,
 )
-from vrw_jax.models.unit_scaling import complete_jacobian_columns
 from vrw_jax.models.viscoelastic import N_STEP_INPUTS, advance_gait_step
 from vrw_jax.models.walk_batch import (
     START_INPUT_NAME,
     StepBatchResult,
     StepInput,
     WalkBatch,
+    complete_jacobian_columns,
     list_rises,
     make_step_input,
     select_lanes,
+    step_batch_with_contact,
 )
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
@@ -158,72 +158,64 @@ def step_batch(
     )
     check_choice("engine", engine, BATCH_ENGINE_NAMES)
     n_steps, options = check_int("n_steps", n_steps), convert_step_options(options)
-    if is_own_walker(model):
-        if derivatives or "diffrax" in (engine, options.engine):
-            raise ValueError(
-                'derivatives and engine="diffrax" are for models of the wheel only: differentiate '
-                "vrw.step of your walker, and map it with jax.vmap."
-            )
-        if heights is not None:
-            if np.ndim(heights) != 2 or (np.ndim(states) == 2 and len(heights) != len(states)):
-                raise ValueError(
-                    f"heights have shape {np.shape(heights)}, but there are {len(states)} states "
-                    f"and {n_steps} steps: give {n_steps + 1} heights for each state."
-                )
-            params = model.put_on_heights(check_parameters(params), heights, n_steps)
-        return _step_batch_of_own_walker(model, params, states, n_steps, options)
+    step_walker = _step_batch_of_own_walker if is_own_walker(model) else _step_batch_of_wheel
+    return step_walker(model, params, states, n_steps, options, engine, derivatives, heights)
+
+
+def _step_batch_of_wheel(
+    model: Any,
+    params: Any,
+    states: Any,
+    n_steps: int,
+    options: StepOptions,
+    engine: str,
+    derivatives: Any,
+    heights: Any,
+) -> StepBatchResult:
     check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
-    checked_model = convert_model_argument(model, allows_friction_arrays=True)
-    if checked_model.fallback_model is not checked_model:
+    model = convert_model_argument(model, allows_friction_arrays=True)
+    if model.fallback_model is not model:
         raise ValueError(
             "model selects a model for each wheel, but a batch of steps has one: give "
             "vrw.ViscoelasticWheel() or vrw.UnilateralWheel(), or call vrw.step for each wheel."
         )
     derivatives = check_names("derivatives", derivatives, '"section_state", "damping"')
-    params = checked_model.attach_laws(params)
-    checked_section_states = convert_section_state(states, "states", check_numpy_reals)
-    values_by_parameter = _check_parameter_shapes(
-        params, checked_section_states, checked_model, options, n_steps
-    )
-    dtype = values_by_parameter[0].dtype
-    checked_section_states = checked_section_states.astype(dtype, copy=False)
-    element_heights = convert_heights(
-        heights, checked_model, values_by_parameter[SLOPE_INPUT_INDEX].ndim == 2, check_numpy_reals
-    )
-    if element_heights is not None:
-        n_elements = len(checked_section_states)
-        if element_heights.shape not in ((n_elements, n_steps + 1), (n_elements, n_steps + 2)):
+    params = model.attach_laws(params)
+    states = convert_section_state(states, "states", check_numpy_reals)
+    n_elements = len(states) if states.ndim else 0
+    values_by_parameter = _check_parameter_shapes(params, states, model, options, n_steps)
+    slopes, dtype = values_by_parameter[SLOPE_INPUT_INDEX], values_by_parameter[0].dtype
+    heights = convert_heights(heights, model, slopes.ndim == 2, check_numpy_reals)
+    known_input_names = START_INPUT_NAME, *model.parameter_names
+    if heights is not None:
+        known_input_names += ("heights",)
+        if heights.shape not in ((n_elements, n_steps + 1), (n_elements, n_steps + 2)):
             raise ValueError(
-                f"heights have shape {element_heights.shape}, but there are {n_elements} states "
+                f"heights have shape {heights.shape}, but there are {n_elements} states "
                 f"and {n_steps} steps: give {n_steps + 1} heights of footholds for each state, or "
                 f"{n_steps + 2} with that before the walk."
             )
-        element_heights = element_heights.astype(dtype, copy=False)
-    known_input_names = START_INPUT_NAME, *checked_model.parameter_names
-    known_input_names += ("heights",) * (element_heights is not None)
     for derivative_name in derivatives:
         if derivative_name not in known_input_names:
             raise ValueError(
                 f"derivatives contain {derivative_name!r}, but a step depends on "
-                f"{', '.join(known_input_names)}: "
-                "give names of these."
+                f"{', '.join(known_input_names)}: give names of these."
             )
-    slopes, n_elements = values_by_parameter[SLOPE_INPUT_INDEX], len(checked_section_states)
     make_input = lambda name, values, *offset: make_step_input(
         name, values, n_steps, n_elements, *offset
     )
-    inputs = [*map(make_input, checked_model.parameter_names, values_by_parameter)]
-    if element_heights is not None:
-        next_line = list_rises(element_heights, n_steps)
+    inputs = [*map(make_input, model.parameter_names, values_by_parameter)]
+    if heights is not None:
+        next_line = list_rises(heights.astype(dtype, copy=False), n_steps)
     else:
         next_line = [make_input("slope", slopes, 1)] * (slopes.ndim == 2)
-    has_contact_kernel = checked_model.batch_kernel == "legs"
-    compute_batch = step_batch_with_contact if has_contact_kernel else _step_batch_without_contact
-    return compute_batch(
-        checked_model,
+    has_contacts = model.batch_kernel == "legs"
+    step = step_batch_with_contact if has_contacts else _step_batch_without_contact
+    return step(
+        model,
         inputs,
         next_line,
-        checked_section_states,
+        states.astype(dtype, copy=False),
         n_steps,
         options,
         engine,
@@ -233,8 +225,27 @@ def step_batch(
 
 
 def _step_batch_of_own_walker(
-    walker: Any, params: Any, states: Any, n_steps: int, options: StepOptions
+    walker: Any,
+    params: Any,
+    states: Any,
+    n_steps: int,
+    options: StepOptions,
+    engine: str,
+    derivatives: Any,
+    heights: Any,
 ) -> StepBatchResult:
+    if derivatives or "diffrax" in (engine, options.engine):
+        raise ValueError(
+            'derivatives and engine="diffrax" are for models of the wheel only: differentiate '
+            "vrw.step of your walker, and map it with jax.vmap."
+        )
+    if heights is not None:
+        if np.ndim(heights) != 2 or (np.ndim(states) == 2 and len(heights) != len(states)):
+            raise ValueError(
+                f"heights have shape {np.shape(heights)}, but there are {len(states)} states "
+                f"and {n_steps} steps: give {n_steps + 1} heights for each state."
+            )
+        params = walker.put_on_heights(check_parameters(params), heights, n_steps)
     params, states = jax.tree.map(np.asarray, (check_parameters(params), check_reals("x", states)))
     if states.ndim == 0:
         raise ValueError(
@@ -281,15 +292,13 @@ def _check_parameter_shapes(
     if section_states.ndim != 2 or section_states.shape[1] not in allowed_section_sizes:
         raise ValueError(
             f"states have shape {section_states.shape}, but section states have the shape "
-            f"(elements, "
-            f"{' or '.join(map(str, allowed_section_sizes))}): write states[None] for a single one."
+            f"(elements, {' or '.join(map(str, allowed_section_sizes))}): write states[None] for a "
+            "single one."
         )
     n_section_states = len(section_states)
     values_by_parameter = model.list_parameter_values(params)
     n_parameters = len(values_by_parameter) - (FRICTION_NAME in model.parameter_names)
-    parameter_dtype = np.result_type(
-        *(parameter_values.dtype for parameter_values in values_by_parameter[:n_parameters])
-    )
+    parameter_dtype = np.result_type(*(x.dtype for x in values_by_parameter[:n_parameters]))
     StepOptions.check_tolerances(options, parameter_dtype)  # a bound method takes 0.1 ms
     for parameter_name, parameter_values in zip(
         model.parameter_names, values_by_parameter, strict=True
@@ -309,8 +318,8 @@ def _check_parameter_shapes(
                 "one for each"
                 f"{stepwise_advice * is_parameter_stepwise}."
             )
-    common_dtype = np.promote_types(parameter_dtype, section_states.dtype)
-    return [np.asarray(x, common_dtype) for x in values_by_parameter]
+    dtype = np.promote_types(parameter_dtype, section_states.dtype)
+    return [np.asarray(x, dtype) for x in values_by_parameter]
 
 
 def _step_batch_without_contact(
@@ -475,8 +484,6 @@ def _compile_lane_step(
     def step_lanes(
         options: StepOptions, lane_step_inputs: Any, straggler_count: Array | None = None
     ) -> tuple:
-        tableau = load_explicit_tableau(options.solver)
-        assert tableau is not None  # `_select_batch_engine` has checked the solver.
         options = options.with_derivative_tolerances() if input_indices else options
 
         def compute_step_outputs(*lane_step_inputs: Array) -> tuple:
@@ -488,7 +495,7 @@ def _compile_lane_step(
             )
             x = lane_step_inputs[n_parameters : n_parameters + 3]
             step_result, is_unfinished = advance_gait_step(
-                params, x, options, tableau, stop_at_lift_off, straggler_count
+                params, x, options, stop_at_lift_off, straggler_count
             )
             step_diagnostics = is_unfinished, step_result.outcome, step_result.solver_steps
             return jnp.stack([*step_result.section_state, *step_result.durations]), step_diagnostics
@@ -532,23 +539,17 @@ def _step_lanes_by_diffrax(
 
     The results are those of a `LaneStepFunction`.
     """
-    convert_options_dtype = functools.partial(
-        jax.tree.map, lambda step_option_leaf: np.asarray(step_option_leaf, parameter_matrix.dtype)
-    )
-    derivative_step_options = convert_options_dtype(options.with_derivative_tolerances())
-    options = convert_options_dtype(options)
+    to_dtype = functools.partial(jax.tree.map, lambda x: np.asarray(x, parameter_matrix.dtype))
     step_input_matrix = np.vstack([parameter_matrix, section_states, *ground_inputs]).T
 
-    def step_all_elements(
+    def step_elements(
         step_input_matrix: np.ndarray, options: StepOptions, input_indices: tuple[int, ...]
     ) -> Any:
-        step_element_block = functools.partial(
-            _step_elements_by_vmap, model, options, n_legs, input_indices
+        step_block = functools.partial(
+            _step_elements_by_vmap, model, to_dtype(options), n_legs, input_indices
         )
-        step_result_arrays = map_in_batches(
-            step_element_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), step_input_matrix
-        )
-        return jax.tree.map(lambda x: np.array(x).T, step_result_arrays)
+        results = map_in_batches(step_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), step_input_matrix)
+        return jax.tree.map(lambda x: np.array(x).T, results)
 
     def step_elements_with_jacobian(step_input_matrix: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the results of one gait step for all elements, with Jacobians.
@@ -558,32 +559,28 @@ def _step_lanes_by_diffrax(
         solved. Bisection isolates that element.
         """
         try:
-            step_result_arrays = step_all_elements(step_input_matrix, options, input_indices)
+            return step_elements(step_input_matrix, options, input_indices)
         except eqx.EquinoxRuntimeError:
-            step_outputs = step_all_elements(step_input_matrix, derivative_step_options, ())
-            step_outcomes = step_outputs[2]
-            n_elements = len(step_input_matrix)
-            step_jacobian = np.zeros((len(input_indices), 6, n_elements), parameter_matrix.dtype)
-            step_result_arrays = (*step_outputs, step_jacobian)
-            stepped_element_indices = np.flatnonzero(step_outcomes == Outcome.STEPPED)
-            if len(stepped_element_indices) < n_elements:
-                retried_element_blocks = [stepped_element_indices]
-            elif n_elements > 1:
-                retried_element_blocks = np.array_split(stepped_element_indices, 2)
-            else:
-                retried_element_blocks, step_outcomes[:] = [], Outcome.SOLVER_FAILED
-            for element_indices in filter(len, retried_element_blocks):
-                block_step_results = step_elements_with_jacobian(step_input_matrix[element_indices])
-                for full_result_array, block_result_array in zip(
-                    step_result_arrays, block_step_results, strict=True
-                ):
-                    full_result_array[..., element_indices] = block_result_array
-        return step_result_arrays
+            outputs = step_elements(step_input_matrix, options.with_derivative_tolerances(), ())
+        outcomes, n_elements = outputs[2], len(step_input_matrix)
+        jacobian = np.zeros((len(input_indices), 6, n_elements), parameter_matrix.dtype)
+        results = (*outputs, jacobian)
+        stepped = np.flatnonzero(outcomes == Outcome.STEPPED)
+        retried_blocks = [stepped]
+        if len(stepped) == n_elements > 1:
+            retried_blocks = np.array_split(stepped, 2)
+        elif len(stepped) == n_elements:
+            retried_blocks, outcomes[:] = [], Outcome.SOLVER_FAILED
+        for block in filter(len, retried_blocks):
+            block_results = step_elements_with_jacobian(step_input_matrix[block])
+            for result, block_result in zip(results, block_results, strict=True):
+                result[..., block] = block_result
+        return results
 
     return (
         step_elements_with_jacobian(step_input_matrix)
         if input_indices
-        else step_all_elements(step_input_matrix, options, ())
+        else step_elements(step_input_matrix, options, ())
     )
 
 
@@ -671,15 +668,13 @@ def select_cheapest_solver(parameter_matrix: np.ndarray, options: StepOptions) -
 
     - `parameter_matrix`: parameters in the order of `PARAMETER_NAMES`, shape (9, lanes).
     """
-    leg_damping, leg_mass, locked_length, gravity_acceleration = (
-        parameter_matrix[PARAMETER_NAMES.index(parameter_name)]
-        for parameter_name in ("damping", "leg_mass", "locked_length", "gravity")
+    damping, leg_mass, locked_length, gravity = (
+        parameter_matrix[PARAMETER_NAMES.index(name)]
+        for name in ("damping", "leg_mass", "locked_length", "gravity")
     )
-    relative_tolerance = float(options.rtol)
+    rtol = float(options.rtol)
     with np.errstate(all="ignore"):
-        n_decay_times = (
-            1.03 * leg_damping / leg_mass * 0.74 * np.sqrt(locked_length / gravity_acceleration)
-        )
+        n_decay_times = 1.03 * damping / leg_mass * 0.74 * np.sqrt(locked_length / gravity)
 
         def estimate_solver_cost(solver_name: str) -> tuple[np.ndarray, np.ndarray]:
             solver_tableau = load_explicit_tableau(solver_name)
@@ -694,11 +689,8 @@ def select_cheapest_solver(parameter_matrix: np.ndarray, options: StepOptions) -
 
         _, requested_solver_cost = estimate_solver_cost(options.solver)
         n_solver_steps, stable_solver_cost = estimate_solver_cost(STABLE_SOLVER_NAME)
-        stable_solver_tolerance = relative_tolerance / STABLE_SOLVER_TIGHTENING_FACTOR
-        is_stability_limited = n_solver_steps > stable_solver_tolerance**-0.2
-        implicit_solver_cost = (
-            IMPLICIT_SOLVER_COST_EVALUATIONS * (1e-6 / relative_tolerance) ** 0.17
-        )
+        is_stability_limited = n_solver_steps > (rtol / STABLE_SOLVER_TIGHTENING_FACTOR) ** -0.2
+        implicit_solver_cost = IMPLICIT_SOLVER_COST_EVALUATIONS * (1e-6 / rtol) ** 0.17
         solver_costs = (
             requested_solver_cost,
             np.where(is_stability_limited, stable_solver_cost, np.inf),

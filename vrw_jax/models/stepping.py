@@ -39,8 +39,7 @@ from vrw_jax.base.walker import (
 )
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel, StepGroundValues
-from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice
-from vrw_jax.models.registry import describe_accepted_models
+from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice, describe_accepted_models
 from vrw_jax.models.step_results import SectionState, StepResult
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
@@ -631,15 +630,12 @@ def convert_heights(
     return height_converter("heights", heights, "give one height for each foothold, in m")
 
 
-def start_walk_toward_gait(
-    model: AbstractWheel, params: WheelParams, options: StepOptions, n_steps: int = 100
-) -> Walk:
+def start_walk_toward_gait(model: AbstractWheel, params: WheelParams, options: StepOptions) -> Walk:
     """Simulate a walk from the default start of the model toward an attracting gait.
 
-    - `n_steps`: number of steps. The walk need not reach the gait, because a search from its last
-      state follows.
+    The walk need not reach the gait, because a search from its last state follows.
     """
-    return walk(params, model.compute_default_start(params), n_steps, model=model, options=options)
+    return walk(params, model.compute_default_start(params), 100, model=model, options=options)
 
 
 @announce_wait("a gait step of each model", "20 s")

@@ -24,6 +24,7 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import check_parameters, is_own_walker, propose_starts
 from vrw_jax.flow.hybrid_system import HybridSystem, sample_walk_of_system
+from vrw_jax.flow.kinks import StepForceExtrema, summarize_forces
 from vrw_jax.models.contact_mechanics import (
     compute_foot_heights,
     compute_foot_positions,
@@ -33,10 +34,15 @@ from vrw_jax.models.contact_mechanics import (
 )
 from vrw_jax.models.contact_state import PackedState, unpack_state
 from vrw_jax.models.interface import complete_ground_line_slopes, compute_rises
-from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
-from vrw_jax.models.measures import CONTACT_MEASURES, TRAJECTORY_MEASURES, make_labeled_variables
+from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES, collect_provenance_attributes
+from vrw_jax.models.measures import (
+    CONTACT_MEASURES,
+    FORCE_PEAK_MEASURES,
+    TRAJECTORY_MEASURES,
+    make_labeled_variables,
+    make_measure_attributes,
+)
 from vrw_jax.models.phase_sequence import select_stance_line
-from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.stepping import (
     ModelLike,
     SectionStateLike,
@@ -51,8 +57,8 @@ from vrw_jax.wheel.dynamics import (
     rotate_to_landing_leg,
     rotate_to_rear_leg,
 )
-from vrw_jax.wheel.ground import compute_line_slope
 from vrw_jax.wheel.params import WheelParams
+from vrw_jax.wheel.transitions import compute_line_slope
 
 
 @announce_wait("gait steps and their samples", "5 s")
@@ -112,9 +118,21 @@ def simulate(
     if is_own_walker(model):
         options = convert_step_options(options).with_engine(engine)
         return _simulate_own_walker(params, x, n_steps, model, options, n_samples, heights)
-    given_params = params
+    return _simulate_wheel(params, x, n_steps, model, options, engine, n_samples, heights)
+
+
+def _simulate_wheel(
+    given_params: Any,
+    x: Any,
+    n_steps: int,
+    model: Any,
+    options: Any,
+    engine: EngineName,
+    n_samples: int,
+    heights: Any,
+) -> xr.Dataset:
     params, x, model, options, stepwise_ground = convert_walk_arguments(
-        params,
+        given_params,
         x,
         n_steps,
         model,
@@ -125,73 +143,62 @@ def simulate(
         allows_default_start=True,
     )
     s = jax.tree.map(float, params).symbols()
-    if heights is None:
-        line_slopes = (
-            given_params.slope if given_params.slope.ndim else jnp.full(n_steps, params.slope)
-        )
-        slopes = np.asarray(complete_ground_line_slopes(line_slopes, n_steps), float)
-        ground = TrajectoryGround(
-            lambda k, _: float(slopes[k]), float(slopes[0]), 0.0, np.ptp(slopes) > 0.0
-        )
-    else:
-        first_height = float(heights[-n_steps - 1])
-        rises = np.asarray(compute_rises(jnp.asarray(heights), n_steps), float)
-        ground = TrajectoryGround(
-            lambda k, x: float(
-                compute_line_slope(params.slope, rises[k], model.compute_foot_distance(params, x))
-            ),
-            float(params.slope),
-            first_height,
-            True,
-        )
+    ground = _make_ground(params, given_params.slope, heights, n_steps, model)
     models_and_wheels = [(model, params)] * n_steps
     if stepwise_ground is not None:
         models_and_wheels = [
             model.with_step_ground(params, step_ground)
             for step_ground in zip(*stepwise_ground, strict=True)
         ]
-    specify_trajectory = (
-        specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
+    specify = specify_contact_trajectory if model.reports_contacts else specify_phase_trajectory
+    sample_step, variable_names, position_names, coordinates, attributes = specify(
+        models_and_wheels, options, n_samples
     )
-    sample_step, variable_names, slope_position_names, coordinates, dataset_attributes = (
-        specify_trajectory(models_and_wheels, options, n_samples)
+    columns, walked_slopes, n_stepped, outcome = sample_walk_steps(
+        sample_step, position_names, x, n_steps, ground, float(s.Mt * s.g)
     )
-    sampled_columns, walked_slopes, n_stepped, walk_outcome = sample_walk_steps(
-        sample_step, slope_position_names, x, n_steps, ground, float(s.Mt * s.g)
-    )
-    dataset_variables = make_labeled_variables(
-        {name: sampled_columns[name] for name in variable_names},
-        "time",
-    )
-    for variable_name in filter(sampled_columns.__contains__, SELECTION_VARIABLE_ATTRIBUTES):
-        dataset_variables[variable_name] = xr.Variable(
-            "time", sampled_columns[variable_name], SELECTION_VARIABLE_ATTRIBUTES[variable_name]
-        )
-    walk_attributes = {
+    variables = make_labeled_variables({name: columns[name] for name in variable_names}, "time")
+    for name in filter(columns.__contains__, SELECTION_VARIABLE_ATTRIBUTES):
+        variables[name] = xr.Variable("time", columns[name], SELECTION_VARIABLE_ATTRIBUTES[name])
+    attributes = {
         "title": f"Walk of the {type(model).__name__}",
         "n_steps": n_stepped,
-        "outcome": walk_outcome.name,
-        "outcome_meaning": walk_outcome.meaning,
+        "outcome": outcome.name,
+        "outcome_meaning": outcome.meaning,
         "start": np.asarray(x).tolist(),
+        **attributes,
+        **collect_provenance_attributes(params, model, options),
     }
-    provenance_attributes = dataset_attributes | collect_provenance_attributes(
-        params, model, options
-    )
     if heights is not None:
-        provenance_attributes |= {
-            "frame": HEIGHTS_FRAME_TEXT,
-            "slopes": walked_slopes,
-            "heights": np.asarray(heights, float).tolist(),
-        }
+        heights = np.asarray(heights, float).tolist()
+        attributes |= {"frame": HEIGHTS_FRAME_TEXT, "slopes": walked_slopes, "heights": heights}
     elif given_params.slope.ndim:
-        provenance_attributes |= {"frame": SLOPES_FRAME_TEXT, "slopes": slopes.tolist()}
-        del provenance_attributes["parameter_slope"]
-    dataset = xr.Dataset(
-        dataset_variables,
-        coordinates,
-        walk_attributes | provenance_attributes,
+        slopes = [ground.find_line_slope(k, x) for k in range(n_steps + 1)]
+        attributes |= {"frame": SLOPES_FRAME_TEXT, "slopes": slopes}
+        del attributes["parameter_slope"]
+    dataset = xr.Dataset(variables, coordinates, attributes)
+    return dataset.set_coords(variables.keys() & {"step", "phase"})
+
+
+def _make_ground(
+    params: WheelParams, slope: Array, heights: Any, n_steps: int, model: Any
+) -> TrajectoryGround:
+    """Return the ground of a walk, for slopes of its lines or heights of its footholds."""
+    if heights is None:
+        line_slopes = slope if slope.ndim else jnp.full(n_steps, params.slope)
+        slopes = np.asarray(complete_ground_line_slopes(line_slopes, n_steps), float)
+        return TrajectoryGround(
+            lambda k, _: float(slopes[k]), float(slopes[0]), 0.0, np.ptp(slopes) > 0.0
+        )
+    rises = np.asarray(compute_rises(jnp.asarray(heights), n_steps), float)
+    return TrajectoryGround(
+        lambda k, x: float(
+            compute_line_slope(params.slope, rises[k], model.compute_foot_distance(params, x))
+        ),
+        float(params.slope),
+        float(heights[-n_steps - 1]),
+        True,
     )
-    return dataset.set_coords(dataset_variables.keys() & {"step", "phase"})
 
 
 def _simulate_own_walker(
@@ -481,4 +488,173 @@ def specify_contact_trajectory(
             if len(set(friction_by_step)) == 1
             else friction_by_step,
         },
+    )
+
+
+SPLINE_DEGREE = 7
+"""Degree of the spline through the samples of an interval. The value is chosen because the spline's
+error with the default number of samples is that of the solver.
+"""
+
+
+MIN_EXTREMUM_HEIGHT_FRACTION = 1e-7
+"""Smallest height of an extremum above or below its neighborhood, as a fraction of the largest
+force. The value is chosen because errors of the solver would otherwise be extrema of a constant
+force.
+"""
+
+
+SAMPLED_FORCE_PEAK_MEASURES = tuple(
+    name for name in FORCE_PEAK_MEASURES if name != "landing_impulse"
+)
+"""Measures of the peaks of the normal force between impacts."""
+
+
+@announce_wait("samples of gait steps", "10 s")
+def force_peaks(walk: xr.Dataset) -> xr.Dataset:
+    """Return the peaks of the normal force in each step of a walk that `vrw.simulate` returned.
+
+    A peak is a smooth maximum of the force on the fore foot, Leg 1, between two events. Impacts and
+    changes of phase or contact are not peaks, but the largest force may occur there. Peaks are
+    located on a spline of degree 7 through the samples of each interval. For gaits, the method
+    `measures` of the result of `vrw.limit_cycle` returns the same measures without samples, and
+    with derivatives.
+
+    Args:
+        walk: a trajectory with at least 9 samples per phase.
+
+    Returns:
+        A dataset of the force measures over `step`. Its variables `force`, `force_time`,
+        `force_step` and `is_maximum` over `extremum` describe the extrema of the fore foot's force.
+
+    Raises:
+        TypeError, ValueError: an invalid argument, described in one sentence.
+
+    Examples:
+        >>> wheel = vrw.parameter_sets["two_peaks"].params
+        >>> start = vrw.limit_cycle(wheel).section_state
+        >>> peaks = vrw.force_peaks(vrw.simulate(wheel, start, n_steps=1))
+        >>> peaks.n_force_peaks.values, peaks.force.values.round(2)
+        (array([2]), array([223.2 , 133.5 , 158.84]))
+    """
+    check_type("walk", walk, xr.Dataset, "give the result of vrw.simulate")
+    if "lambda_2" in walk:
+        fore_force, rear_force = walk.lambda_2.values, walk.lambda_4.values
+        total_force = fore_force + rear_force
+    elif "normal" in walk:
+        fore_force, total_force = walk.normal.values[:, 0], walk.normal.values.sum(1)
+    else:
+        raise ValueError(
+            f"walk holds {', '.join(map(str, walk)) or 'nothing'}, but no normal force of the "
+            "feet: give the result of vrw.simulate."
+        )
+    sample_times, sample_steps = walk.time.values, walk.step.values
+    if not len(sample_times):
+        raise ValueError(
+            f"the walk has no samples, because its outcome is {walk.attrs.get('outcome')}: give a "
+            "walk that leaves its start."
+        )
+    # The time of an event is listed twice, up to round-off.
+    time_roundoff = 4.0 * np.finfo(float).eps * np.max(sample_times)
+    is_interval_end = (np.diff(sample_times) <= time_roundoff) | (np.diff(sample_steps) != 0)
+    interval_starts = np.flatnonzero(is_interval_end) + 1
+    sampled_intervals = np.split(np.arange(len(sample_times)), interval_starts)
+    n_samples, min_samples = max(map(len, sampled_intervals)), SPLINE_DEGREE + 2
+    if n_samples < min_samples:
+        raise ValueError(
+            f"the phases of the walk have {n_samples} samples, but its peaks need at least "
+            f"{min_samples}: give simulate(..., n_samples={min_samples}) or more."
+        )
+    step_indices = np.unique(sample_steps)
+    fore_force_extrema, measures_by_step = [], []
+    for step_index in step_indices:
+        intervals_of_step = [
+            sample_indices
+            for sample_indices in sampled_intervals
+            if len(sample_indices) == n_samples and sample_steps[sample_indices[0]] == step_index
+        ]
+        extrema = [
+            _find_force_extrema(sample_times, force, intervals_of_step)._replace(
+                other_forces=force[sample_steps == step_index]
+            )
+            for force in (fore_force, total_force)
+        ]
+        fore_force_extrema.append(extrema[0])
+        measures_by_step.append(summarize_forces(np, *extrema))
+    dataset_variables = {
+        name: ("step", np.array([x[name] for x in measures_by_step]), make_measure_attributes(name))
+        for name in SAMPLED_FORCE_PEAK_MEASURES
+    }
+    extremum_times, extremum_forces, is_maximum, *_ = map(
+        np.concatenate, zip(*fore_force_extrema, strict=True)
+    )
+    step_index_by_extremum = np.repeat(
+        step_indices, [len(extrema.times) for extrema in fore_force_extrema]
+    )
+    dataset_variables |= {
+        "force": ("extremum", extremum_forces, make_measure_attributes("lambda_2")),
+        "force_time": ("extremum", extremum_times, make_measure_attributes("time")),
+        "force_step": ("extremum", step_index_by_extremum, make_measure_attributes("step")),
+        "is_maximum": ("extremum", is_maximum, {"long_name": "whether a maximum"}),
+    }
+    return xr.Dataset(dataset_variables, {"step": step_indices}, dict(walk.attrs))
+
+
+def _find_force_extrema(
+    sample_times: np.ndarray,
+    sampled_forces: np.ndarray,
+    sample_indices_by_interval: list[np.ndarray],
+) -> StepForceExtrema:
+    """Return the extrema of a force within the intervals between the events of one step.
+
+    - `sample_indices_by_interval`: indices of the samples in each interval between two events.
+    """
+    from scipy.interpolate import PPoly, make_interp_spline  # This import is slow.
+
+    extrema_by_interval = [(np.zeros(0), np.zeros(0), np.zeros(0, bool))]
+    rate_maxima_by_interval = [(np.zeros(0), np.zeros(0))]
+
+    def find_interior_roots(polynomial: Any) -> np.ndarray:
+        roots = PPoly.from_spline(polynomial).roots()
+        return roots[(roots > 0.0) & (roots < 1.0)]
+
+    min_extremum_height = MIN_EXTREMUM_HEIGHT_FRACTION * np.max(np.abs(sampled_forces))
+    for sample_indices in sample_indices_by_interval:
+        if np.ptp(sampled_forces[sample_indices]) < min_extremum_height:
+            continue
+        interval_sample_times = sample_times[sample_indices]
+        interval_start, interval_duration = interval_sample_times[0], np.ptp(interval_sample_times)
+        time_fractions = (interval_sample_times - interval_start) / interval_duration
+        force_spline = make_interp_spline(
+            time_fractions, sampled_forces[sample_indices], SPLINE_DEGREE
+        )
+        extremum_fractions = find_interior_roots(force_spline.derivative(1))
+        forces_at_extrema_and_ends = force_spline(
+            np.concatenate([[0.0], extremum_fractions, [1.0]])
+        )
+        force_changes = np.abs(np.diff(forces_at_extrema_and_ends))
+        extremum_fractions = extremum_fractions[
+            np.minimum(force_changes[:-1], force_changes[1:]) > min_extremum_height
+        ]
+        extrema_by_interval.append(
+            (
+                interval_start + interval_duration * extremum_fractions,
+                force_spline(extremum_fractions),
+                force_spline(extremum_fractions, 2) < 0.0,
+            )
+        )
+        rate_maximum_fractions = find_interior_roots(force_spline.derivative(2))
+        rate_maximum_fractions = rate_maximum_fractions[
+            force_spline(rate_maximum_fractions, 3) < 0.0
+        ]
+        rate_maxima_by_interval.append(
+            (
+                interval_start + interval_duration * rate_maximum_fractions,
+                force_spline(rate_maximum_fractions, 1) / interval_duration,
+            )
+        )
+    times, forces, is_maximum = map(np.concatenate, zip(*extrema_by_interval, strict=True))
+    rate_times, rate_maxima = map(np.concatenate, zip(*rate_maxima_by_interval, strict=True))
+    return StepForceExtrema(
+        times, forces, is_maximum, ~is_maximum, rate_times, rate_maxima, rate_times > 0.0, ()
     )

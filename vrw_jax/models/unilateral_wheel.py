@@ -1,4 +1,8 @@
-"""Model of the wheel with unilateral contact and Coulomb friction, for any order of events."""
+"""Model of the wheel with unilateral contact and Coulomb friction, for any order of events.
+
+To sample a step, a JAX program advances from event to event and records the start of each interval.
+Every interval is then integrated again, from sample to sample.
+"""
 
 import dataclasses
 import functools
@@ -10,23 +14,53 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_choice, check_int, check_reals, check_type
+from vrw_jax.base.elementwise import make_opaque_loop_condition
 from vrw_jax.base.options import ParameterDomain, StepOptions
 from vrw_jax.base.types import Elementwise, RealInput, Scalar
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.models.contact_record import UnilateralStep
-from vrw_jax.models.contact_section import (
+from vrw_jax.flow.phase_integration import sample_phase
+from vrw_jax.flow.solver_steps import (
+    ButcherTableau,
+    StageState,
+    divide_equally,
+    sample_between_intervals,
+)
+from vrw_jax.models.contact_integrator import make_contact_phase
+from vrw_jax.models.contact_kernel import (
+    advance_to_events,
+    init_lane_states,
+)
+from vrw_jax.models.contact_mechanics import (
+    find_contact_slots,
+    pack_motion,
+    unpack_motion,
+)
+from vrw_jax.models.contact_record import (
     FullState,
+    UnilateralStep,
     compute_full_section_size,
     compute_section_foot_distance,
     compute_section_units,
     embed_section_state,
 )
-from vrw_jax.models.contact_step import (
-    build_contact_step_sampler,
+from vrw_jax.models.contact_state import (
+    N_LOSSES,
+    ContactModeDynamics,
+    ContactQuantities,
+    ContactState,
+    EnergyLossAccumulators,
+    compute_contact_quantities,
+    compute_packed_units,
+    evaluate_vector_field,
+    pack_state,
+    unpack_state,
+)
+from vrw_jax.models.contact_walks import (
     call_with_one_lane,
     make_column_function,
     prepare_walk,
@@ -40,7 +74,7 @@ from vrw_jax.models.interface import (
     require_stepwise_shape,
 )
 from vrw_jax.models.step_results import PAPER_START_STATE
-from vrw_jax.models.viscoelastic import can_use_batch_kernel
+from vrw_jax.models.viscoelastic import can_use_batch_kernel, select_engine
 from vrw_jax.wheel.laws import (
     convert_hub_torque,
     convert_leg_force,
@@ -51,8 +85,10 @@ from vrw_jax.wheel.params import (
     FRICTION_NAME,
     WheelParams,
     WheelUnits,
+    compute_wheel_units,
     convert_friction,
 )
+from vrw_jax.wheel.transitions import ContactMode
 
 STOPPERS_BILATERAL, STOPPERS_ONE_SIDED = "bilateral", "one-sided"
 """Kinds of stoppers for legs in the air: they hold the leg with any force, or they only push."""
@@ -331,7 +367,7 @@ class UnilateralWheel(AbstractContactWheel):
         measures_force_peaks: bool = False,
     ) -> tuple[Any, str]:
         """Return the results of one step, and the name of the engine that computed them."""
-        engine = "lanes" if can_use_batch_kernel(options) else "diffrax"
+        engine = select_engine(options)
         take_step = _compile_step(is_detailed, engine, measures_force_peaks)
         return take_step(self._without_laws(x), self.attach_laws(params), x, options), engine
 
@@ -386,3 +422,191 @@ def _compile_step(is_detailed: bool, engine: str, measures_force_peaks: bool) ->
         take_tight_step,
         partial(make_column_function, prepare),
     )
+
+
+class ContactIntervalLog(NamedTuple):
+    """Start and duration of each interval of a step; an interval is between two events."""
+
+    q: Array  # coordinates at the start of each interval, (intervals, 3 + n)
+    v: Array  # rates and losses in the step so far, (intervals, 3 + n + N_LOSSES)
+    contact_state: ContactState
+    durations: Array  # s
+
+
+def sample_contact_interval(
+    contact_mode_dynamics: ContactModeDynamics,
+    q: Array,
+    v: Array,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+    tableau: ButcherTableau,
+) -> Array:
+    """Return samples of one interval at equally spaced times, (samples, entries, batch).
+
+    The first and the last sample are at the ends of the interval. The entries are coordinates,
+    rates, losses, normal forces and tangential forces in the contact slots.
+
+    - `q`, `v`: coordinates, and rates followed by losses at the start;
+    - `duration`: length of the interval, s.
+    """
+    phase = make_contact_phase(contact_mode_dynamics, tableau, options)
+    take_solver_step: Any = phase.take_solver_step
+
+    def take_sample_step(state: StageState, h: Array) -> tuple[StageState, Array]:
+        stage_states, squared_error = take_solver_step(state, h)
+        return stage_states[-1], squared_error
+
+    def pack_sample(state: StageState) -> Array:
+        contact_quantities = ContactQuantities.unpack_rows(
+            contact_mode_dynamics, state.acceleration.acceleration
+        )
+        slot_forces = contact_quantities.normal_forces, contact_quantities.tangential_forces
+        return jnp.concatenate([state.q, state.v, *slot_forces])
+
+    return sample_between_intervals(
+        take_sample_step,
+        pack_sample,
+        phase.make_state(q, v),
+        tableau,
+        divide_equally(duration, n_samples),
+        options,
+    )
+
+
+def sample_by_diffrax(
+    contact_mode_dynamics: ContactModeDynamics,
+    q: Array,
+    v: Array,
+    duration: Array,
+    n_samples: int,
+    options: StepOptions,
+) -> Array:
+    """Return the samples of `sample_contact_interval` for a single wheel, (samples, entries)."""
+    losses = EnergyLossAccumulators(jnp.zeros_like(duration), *v[len(q) :])
+
+    def pack_sample(packed_state: Array) -> Array:
+        motion, (_, *losses) = unpack_state(packed_state)
+        contact_quantities = compute_contact_quantities(contact_mode_dynamics, motion)
+        slot_forces = contact_quantities.normal_forces, contact_quantities.tangential_forces
+        return jnp.concatenate([*pack_motion(motion), jnp.stack(losses), *slot_forces])
+
+    packed_states = sample_phase(
+        functools.partial(evaluate_vector_field, contact_mode_dynamics),
+        pack_state(unpack_motion(q, v), losses),
+        duration,
+        n_samples,
+        compute_wheel_units(contact_mode_dynamics.s).scale_times_to_seconds(options),
+        compute_packed_units(contact_mode_dynamics.s),
+    )
+    return jax.vmap(pack_sample)(packed_states)
+
+
+@functools.cache
+def build_contact_step_sampler(uses_diffrax: bool, n_samples: int) -> Callable[..., tuple]:
+    """Return a function that samples a step from (wheel, params, x, options).
+
+    The function returns (log, summary and outcome of the step, states, tangential forces, normal
+    forces). The states are packed, (intervals, samples, entries), and the forces on all feet are in
+    N, (intervals, samples, legs). The samples are at equally spaced times from the start to the end
+    of each interval. The function has no derivatives.
+    """
+
+    prepare = functools.partial(prepare_walk, True, "lanes", False, uses_diffrax)
+
+    def prepare_resolved(arguments: tuple) -> tuple:
+        walk_settings, input_columns, x = prepare(*arguments)
+        return walk_settings, walk_settings.resolve_heights(input_columns, x), x
+
+    init_lane_state = lambda *arguments: init_lane_states(*prepare_resolved(arguments))[1]
+
+    def advance_to_event(arguments: tuple, lane_state: Any) -> tuple[Any, ContactIntervalLog]:
+        walk_settings, input_columns, x = prepare_resolved(arguments)
+        start, lane_state = advance_to_events(
+            walk_settings, walk_settings.replace_invalid_lanes(input_columns, x)[0], lane_state
+        )
+        n = len(start.q)
+        return lane_state, ContactIntervalLog(
+            start.q,
+            jnp.concatenate([start.v[:n], start.step_record.losses]),
+            start.contact_state,
+            lane_state.interval_duration,
+        )
+
+    def sample_logged_interval(arguments: tuple, interval_log: ContactIntervalLog) -> Array:
+        walk_settings, input_columns, x = prepare_resolved(arguments)
+        q, v, contact_state, durations = interval_log
+        dynamics = walk_settings.make_lane_contact_dynamics(
+            walk_settings.replace_invalid_lanes(input_columns, x)[0], contact_state
+        )
+        arguments = dynamics, q, v, durations, n_samples, walk_settings.step_options
+        if walk_settings.tableau is None:
+            return sample_by_diffrax(*arguments)
+        return sample_contact_interval(*arguments, walk_settings.tableau)
+
+    def sample_whole_step(*arguments: Any) -> tuple:
+        walk_settings, input_columns, _ = prepare_resolved(arguments)
+        max_events = walk_settings.max_events
+        initial_state = begin_compiled_walk(*arguments)
+        log_template = jax.eval_shape(advance_compiled_walk, arguments, initial_state)[1]
+        allocate_log_array = lambda leaf: jnp.zeros((max_events, *leaf.shape), leaf.dtype)
+
+        def record_interval_end(loop_state: tuple) -> tuple:
+            previous_state, contact_interval_log = loop_state
+            lane_state, interval_entry = advance_compiled_walk(arguments, previous_state)
+            entry_index = previous_state.step_record.events
+            entry_index = jnp.where(
+                lane_state.step_record.events > entry_index, entry_index, max_events
+            )
+            write_log_entry = lambda log_leaf, entry_leaf: log_leaf.at[entry_index].set(
+                entry_leaf, mode="drop"
+            )
+            return lane_state, jax.tree.map(write_log_entry, contact_interval_log, interval_entry)
+
+        should_continue = lambda state: make_opaque_loop_condition(
+            state[0].is_unfinished, state[0].step_record.events
+        )
+        lane_state, contact_interval_log = lax.while_loop(
+            should_continue,
+            record_interval_end,
+            (initial_state, jax.tree.map(allocate_log_array, log_template)),
+        )
+        step_summary = walk_settings.summarize_step(lane_state, input_columns)
+        map_intervals = lax.map if uses_diffrax else lambda f, log: jax.vmap(f)(log)
+        sample_rows = map_intervals(
+            functools.partial(sample_compiled_intervals, arguments), contact_interval_log
+        )
+        interval_samples = _unpack_sample_rows(
+            walk_settings.n_legs, contact_interval_log, sample_rows
+        )
+        return contact_interval_log, step_summary, lane_state.walk_outcome, *interval_samples
+
+    compile_lanes = call_with_one_lane if uses_diffrax else lanes.jit_batch
+    begin_compiled_walk = compile_lanes(init_lane_state)
+    advance_compiled_walk = compile_lanes(advance_to_event)
+    sample_compiled_intervals = (
+        sample_logged_interval if uses_diffrax else lanes.jit_batch(sample_logged_interval)
+    )
+    return jax.jit(sample_whole_step)
+
+
+def _unpack_sample_rows(
+    n_legs: int, contact_interval_log: ContactIntervalLog, sample_rows: Array
+) -> tuple[Array, Array, Array]:
+    """Return packed states, tangential forces (N) and normal forces (N) of all legs, from samples.
+
+    The axes are (intervals, samples, entries). `sample_rows` contains results of
+    `sample_contact_interval`.
+    """
+    n, n_samples = 3 + n_legs, sample_rows.shape[1]
+    q, v, losses, normal_forces, tangential_forces = jnp.split(
+        jnp.moveaxis(sample_rows, -1, 0), (n, 2 * n, 2 * n + N_LOSSES, 2 * n + N_LOSSES + 2)
+    )
+    time_since_event = jnp.linspace(0.0, 1.0, n_samples) * contact_interval_log.durations[:, None]
+    packed_states = pack_state(
+        unpack_motion(q, v), EnergyLossAccumulators(time_since_event, *losses)
+    )
+    contact_modes = contact_interval_log.contact_state.contact_modes.T[..., None]
+    scatter_to_legs = find_contact_slots(contact_modes != ContactMode.OFF).scatter_to_legs
+    legs_first = packed_states, scatter_to_legs(tangential_forces), scatter_to_legs(normal_forces)
+    return tuple(jnp.moveaxis(x, 0, -1) for x in legs_first)  # type: ignore[return-value]

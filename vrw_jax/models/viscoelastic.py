@@ -12,7 +12,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -32,11 +32,6 @@ from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.integrate import PhaseEnd, integrate_batch_phase
 from vrw_jax.flow.kinks import NODE_FRACTIONS, SmoothParts, find_sides
 from vrw_jax.flow.phase_integration import (
-    GuardsAndMargins,
-    PhaseKinks,
-    StateArray,
-    VectorField,
-    integrate_phase,
     sample_phase,
 )
 from vrw_jax.flow.solver_steps import (
@@ -51,12 +46,14 @@ from vrw_jax.flow.solver_steps import (
 )
 from vrw_jax.lanes.autodiff import with_batched_jvp
 from vrw_jax.models.interface import AbstractWheel
-from vrw_jax.models.phase_measures import evaluate_own_measure, measure_forces
+from vrw_jax.models.measures import evaluate_own_measure, measure_forces
 from vrw_jax.models.phase_sequence import (
     PhaseRunner,
     PhaseSequenceResult,
     finish_gait_step,
     make_advance_result,
+    make_element_phase,
+    make_element_phase_runner,
     make_step_result,
     make_trajectory,
     run_step_phases,
@@ -207,7 +204,7 @@ class ViscoelasticWheel(AbstractWheel):
         self, params: WheelParams, x: SectionState, options: StepOptions, records_margins: bool
     ) -> PhaseSequenceResult:
         """Integrate all phases of a step of one wheel and return their starts and ends."""
-        phase_runner = _make_element_phase_runner(options, records_margins)
+        phase_runner = make_element_phase_runner(options, records_margins)
         return run_step_phases(phase_runner, params, tuple(x), options, self.stop_at_lift_off)
 
     def finish_step(
@@ -218,33 +215,13 @@ class ViscoelasticWheel(AbstractWheel):
         phase_state: Float[Array, " 6"],
         options: StepOptions,
     ) -> AdvanceResult:
-        params = self.attach_laws(params)
-
-        def finish_element_step(
-            params: WheelParams, foot_distance: Array, phase_state: Array, options: StepOptions
-        ) -> AdvanceResult:
-            return finish_gait_step(
-                _make_element_phase_runner(options, records_margins=False),
-                params,
-                phase_index,
-                foot_distance,
-                tuple(phase_state),
-                options,
-                self.stop_at_lift_off,
-                _select_engine(options),
-            )
-
-        inputs = params, jnp.asarray(foot_distance), phase_state, options
+        finish = functools.partial(_finish_steps, self.stop_at_lift_off, phase_index)
+        inputs = self.attach_laws(params), jnp.asarray(foot_distance), phase_state, options
         if not can_use_batch_kernel(options):
-            return finish_element_step(*inputs)
-        finish_lane_steps = functools.partial(
-            _finish_lane_steps, self.stop_at_lift_off, phase_index
+            return finish(False, *inputs)
+        return _compile_lanes(functools.partial(finish, True), functools.partial(finish, False))(
+            *inputs
         )
-        return lanes.differentiate(
-            lanes.jit_batch(finish_lane_steps),
-            finish_element_step,
-            functools.partial(_make_column_function, finish_lane_steps),
-        )(*inputs)
 
 
 def _compute_step(
@@ -258,10 +235,11 @@ def _compute_step(
         # Programs take the numbers of the laws as part of the parameters.
         params = model.attach_laws(params)
         model = model.with_laws(None)
-    return _compile_step(model, _select_engine(options), records_margins)(params, x, options)
+    return _compile_step(model, select_engine(options), records_margins)(params, x, options)
 
 
-def _select_engine(options: StepOptions) -> str:
+def select_engine(options: StepOptions) -> str:
+    """Return the name of the engine that computes a step."""
     return "lanes" if can_use_batch_kernel(options) else "diffrax"
 
 
@@ -293,24 +271,18 @@ def _compile_step(model: ViscoelasticWheel, engine: str, records_margins: bool) 
     take_lane_steps = functools.partial(
         take_steps_of_lanes, model.stop_at_lift_off, model.friction if records_margins else None
     )
-    return lanes.differentiate(
-        lanes.jit_batch(take_lane_steps),
-        take_tight_step,
-        functools.partial(_make_column_function, take_lane_steps),
-    )
+    return _compile_lanes(take_lane_steps, take_tight_step)
 
 
 @functools.cache
 def _compile_sampling(stop_at_lift_off: bool, n_samples: int) -> Callable:
     """Return a compiled function of (params, x, options) that samples a step, with derivatives."""
-    sample_lane_steps = functools.partial(_sample_lane_steps, stop_at_lift_off, n_samples)
     model = ViscoelasticWheel(stop_at_lift_off=stop_at_lift_off)
-    return lanes.differentiate(
-        lanes.jit_batch(sample_lane_steps),
+    return _compile_lanes(
+        functools.partial(_sample_lane_steps, stop_at_lift_off, n_samples),
         lambda params, x, options: model._sample_element(
             params, x, options.with_derivative_tolerances(), n_samples
         ),
-        functools.partial(_make_column_function, sample_lane_steps),
     )
 
 
@@ -327,12 +299,7 @@ def _compile_part_sampling(stop_at_lift_off: bool) -> Callable:
             "first derivatives only: take differences of their gradients."
         )
 
-    sample_lane_parts = functools.partial(_sample_lane_parts, stop_at_lift_off)
-    return lanes.differentiate(
-        lanes.jit_batch(sample_lane_parts),
-        refuse,
-        functools.partial(_make_column_function, sample_lane_parts),
-    )
+    return _compile_lanes(functools.partial(_sample_lane_parts, stop_at_lift_off), refuse)
 
 
 def take_steps_of_lanes(
@@ -346,7 +313,9 @@ def take_steps_of_lanes(
 
     - `friction`: friction coefficient of the margins; None for the minimal results.
     """
-    phase_sequence, _ = _run_lane_phases(stop_at_lift_off, friction is not None, params, x, options)
+    phase_sequence = run_batch_phases(
+        params, x, options, stop_at_lift_off, friction is not None, is_compiled_separately=True
+    )
     if friction is None:
         return make_advance_result(phase_sequence, "lanes")
     phase_end_results = tuple(
@@ -366,6 +335,18 @@ def _compile_lane_steps(stop_at_lift_off: bool, friction: float) -> Any:
     """Return steps with margins for NumPy arrays with lanes on the last axis."""
     return lanes.compile_batch_function(
         functools.partial(take_steps_of_lanes, stop_at_lift_off, friction)
+    )
+
+
+def _compile_lanes(take_lane_steps: Callable, take_element_step: Callable) -> Callable:
+    """Return a function of one wheel from that of a batch, differentiable in any mode.
+
+    - `take_element_step`: the same function without machine code, for higher derivatives.
+    """
+    return lanes.differentiate(
+        lanes.jit_batch(take_lane_steps),
+        take_element_step,
+        functools.partial(_make_column_function, take_lane_steps),
     )
 
 
@@ -395,26 +376,27 @@ def _make_column_function(
     return compute_columns
 
 
-def _finish_lane_steps(
+def _finish_steps(
     stop_at_lift_off: bool,
     phase_index: int,
+    runs_lanes: bool,
     params: WheelParams,
     foot_distance: Array,
     phase_state: Array,
     options: StepOptions,
 ) -> AdvanceResult:
-    """Return the results of `finish_gait_step` for a batch."""
-    tableau = load_explicit_tableau(options.solver)
-    assert tableau is not None  # checked by `can_use_batch_kernel`
+    """Return the results of `finish_gait_step` for a batch, or for one wheel without lanes."""
     return finish_gait_step(
-        _make_phase_runner(options, tableau, False, None, is_compiled_separately=True),
+        _make_phase_runner(options, False, is_compiled_separately=True)
+        if runs_lanes
+        else make_element_phase_runner(options, False),
         params,
         phase_index,
         foot_distance,
         tuple(phase_state),
         options,
         stop_at_lift_off,
-        "lanes",
+        select_engine(options),
     )
 
 
@@ -422,7 +404,10 @@ def _sample_lane_steps(
     stop_at_lift_off: bool, n_samples: int, params: WheelParams, x: Array, options: StepOptions
 ) -> Trajectory:
     """Return samples of a batch of walking steps at equidistant times of each phase."""
-    phase_sequence, tableau = _run_lane_phases(stop_at_lift_off, False, params, x, options)
+    phase_sequence = run_batch_phases(
+        params, x, options, stop_at_lift_off, False, is_compiled_separately=True
+    )
+    tableau = load_batch_tableau(options)
     sample = lambda phase, q, v, duration, options: sample_batch_phase(
         make_batch_phase(phase, False), tableau, q, v, divide_equally(duration, n_samples), options
     )
@@ -440,11 +425,17 @@ def _sample_lane_parts(
     stop_at_lift_off: bool, params: WheelParams, x: Array, options: StepOptions
 ) -> tuple[SmoothParts, ...]:
     """Return the smooth parts of each phase, between its kinks, for a batch of steps."""
-    sequence, tableau = _run_lane_phases(
-        stop_at_lift_off, False, params, x, options, MAX_LOGGED_KINKS
+    sequence = run_batch_phases(
+        params,
+        x,
+        options,
+        stop_at_lift_off,
+        False,
+        is_compiled_separately=True,
+        n_logged_kinks=MAX_LOGGED_KINKS,
     )
     parts_by_phase = (
-        _sample_parts_of_phase(tableau, options, *phase_and_ends)
+        _sample_parts_of_phase(options, *phase_and_ends)
         for phase_and_ends in zip(
             sequence.phases, sequence.phase_start_states, sequence.phase_end_results, strict=True
         )
@@ -458,12 +449,9 @@ def _sample_lane_parts(
 
 
 def _sample_parts_of_phase(
-    tableau: ButcherTableau,
-    options: StepOptions,
-    phase: AbstractPhase,
-    start: tuple[Vector, Vector],
-    phase_end: PhaseEnd,
+    options: StepOptions, phase: AbstractPhase, start: tuple[Vector, Vector], phase_end: PhaseEnd
 ) -> SmoothParts:
+    tableau = load_batch_tableau(options)
     options = compute_wheel_units(phase.s).scale_times_to_seconds(options)
     duration, n_dof, log = phase_end.duration, phase.n_dof, phase_end.kink_log
     first_state = jnp.stack([*start[0], *start[1]])
@@ -559,7 +547,6 @@ def advance_gait_step(
     params: WheelParams,
     x: Vector,
     options: StepOptions,
-    tableau: ButcherTableau,
     stop_at_lift_off: bool,
     straggler_count: Array | None = None,
 ) -> tuple[AdvanceResult, Array]:
@@ -569,53 +556,39 @@ def advance_gait_step(
     these elements is valid.
 
     - `x`: section state of each batch element just before touchdown;
-    - `tableau`: Butcher tableau of the explicit solver;
     - `stop_at_lift_off`: see `ViscoelasticWheel`;
     - `straggler_count`: largest number of batch elements that may remain unfinished, see
       `integrate_batch_phase`.
     """
     phase_sequence = run_batch_phases(
-        params,
-        x,
-        options,
-        tableau,
-        stop_at_lift_off,
-        records_margins=False,
-        straggler_count=straggler_count,
+        params, x, options, stop_at_lift_off, False, straggler_count=straggler_count
     )
-    is_phase_unfinished = [
-        phase_end.is_unfinished for phase_end in phase_sequence.phase_end_results
-    ]
     return make_advance_result(phase_sequence, "lanes"), functools.reduce(
-        operator.or_, is_phase_unfinished
+        operator.or_, (phase_end.is_unfinished for phase_end in phase_sequence.phase_end_results)
     )
 
 
 def run_batch_phases(
     params: WheelParams,
-    x: Vector,
+    x: Array | Vector,
     options: StepOptions,
-    tableau: ButcherTableau,
     stop_at_lift_off: bool,
     records_margins: bool,
-    straggler_count: Array | None = None,
-    is_compiled_separately: bool = False,
-    n_logged_kinks: int = 0,
+    **engine_settings: Any,
 ) -> PhaseSequenceResult:
     """Integrate all phases of one walking step per batch element and return their starts and ends.
 
-    - `tableau`: Butcher tableau of the explicit solver;
     - `stop_at_lift_off`: see `ViscoelasticWheel`;
     - `records_margins`: whether the minima of the margins are computed;
-    - `straggler_count`: largest number of batch elements that may remain unfinished, see
-      `integrate_batch_phase`;
-    - `is_compiled_separately`, `n_logged_kinks`: see `BatchPhase`.
+    - `engine_settings`: `straggler_count`, the largest number of batch elements that may remain
+      unfinished, see `integrate_batch_phase`; `is_compiled_separately`, `n_logged_kinks`, see
+      `BatchPhase`.
     """
-    phase_runner = _make_phase_runner(
-        options, tableau, records_margins, straggler_count, is_compiled_separately, n_logged_kinks
-    )
+    phase_runner = _make_phase_runner(options, records_margins, **engine_settings)
     landing_function = with_batched_jvp(transitions.resolve_landing)
-    return run_step_phases(phase_runner, params, x, options, stop_at_lift_off, landing_function)
+    return run_step_phases(
+        phase_runner, params, tuple(x), options, stop_at_lift_off, landing_function
+    )
 
 
 # Upper bound on the first solver step in SLS-I, as a fraction of the step size that the controller
@@ -631,16 +604,16 @@ MAX_FIRST_STEP_IN_TRANSIENT_TIMES = 7.0
 
 def _make_phase_runner(
     options: StepOptions,
-    tableau: ButcherTableau,
     records_margins: bool,
-    straggler_count: Array | None,
-    is_compiled_separately: bool,
+    straggler_count: Array | None = None,
+    is_compiled_separately: bool = False,
     n_logged_kinks: int = 0,
 ) -> PhaseRunner:
     """Return a function that integrates one phase to its end, for all batch elements.
 
     The arguments are those of `run_batch_phases`.
     """
+    tableau = load_batch_tableau(options)
 
     def run_phase(
         phase: AbstractPhase,
@@ -705,96 +678,8 @@ def can_use_batch_kernel(options: StepOptions) -> bool:
     return is_solver_explicit and lanes.is_machine_code_available() and options.engine != "diffrax"
 
 
-def _run_lane_phases(
-    stop_at_lift_off: bool,
-    records_margins: bool,
-    params: WheelParams,
-    x: Array,
-    options: StepOptions,
-    n_logged_kinks: int = 0,
-) -> tuple[PhaseSequenceResult, ButcherTableau]:
-    """Return the starts and ends of the phases of a batch of walking steps, and the tableau."""
+def load_batch_tableau(options: StepOptions) -> ButcherTableau:
+    """Return the tableau of an explicit solver, after the caller has checked the solver."""
     tableau = load_explicit_tableau(options.solver)
-    assert tableau is not None  # `can_use_batch_kernel` has checked the solver.
-    return run_batch_phases(
-        params,
-        tuple(x),
-        options,
-        tableau,
-        stop_at_lift_off,
-        records_margins,
-        is_compiled_separately=True,
-        n_logged_kinks=n_logged_kinks,
-    ), tableau
-
-
-class ElementPhase(NamedTuple):
-    """Equations of first order of a phase of one wheel. The state y = (q, v) is one vector."""
-
-    motion_unpacker: Callable[[StateArray], Motion]
-    vector_field: VectorField
-    guards: GuardsAndMargins
-    kinks: PhaseKinks | None
-
-
-def make_element_phase(phase: AbstractPhase, records_margins: bool) -> ElementPhase:
-    """Return the functions of a phase that `flow.phase_integration` calls.
-
-    - `records_margins`: whether the integrator also evaluates margins.
-    """
-
-    def evaluate_vector_field(y: StateArray) -> StateArray:
-        accelerations = phase.solve_acceleration(phase.unpack_motion(y))
-        return jnp.stack([*y[phase.n_dof :], *accelerations[: phase.n_dof]])
-
-    def evaluate_guards_and_margins(y: StateArray) -> Array:
-        phase_instant = PhaseInstant(phase, phase.unpack_motion(y), None)
-        margins = phase.compute_margins(phase_instant) if records_margins else ()
-        return jnp.stack([*phase.compute_guards(phase_instant), *margins])
-
-    guards_and_margins = GuardsAndMargins(
-        evaluate_guards_and_margins,
-        len(phase.all_guard_outcomes) - phase.n_kinks,
-        phase.are_margins_counted_at_start if records_margins else (),
-    )
-
-    def enter_sides(sides: Vector) -> tuple[VectorField, Callable]:
-        functions = make_element_phase(phase.on_sides(sides), records_margins)
-        return functions.vector_field, functions.guards.evaluate_guards_and_margins
-
-    return ElementPhase(
-        phase.unpack_motion,
-        evaluate_vector_field,
-        guards_and_margins,
-        PhaseKinks(lambda y: phase.compute_kinks(phase.unpack_motion(y)), enter_sides)
-        if phase.n_kinks
-        else None,
-    )
-
-
-def _make_element_phase_runner(options: StepOptions, records_margins: bool) -> PhaseRunner:
-    """Return a function that integrates one phase of one wheel to its end.
-
-    diffrax takes the steps of implicit solvers, and of all solvers with `engine="diffrax"`.
-    """
-
-    def run_phase(
-        phase: AbstractPhase, q: Vector, v: Vector, is_phase_active: Array, _: Any
-    ) -> PhaseEnd:
-        element_phase = make_element_phase(phase, records_margins)
-        phase_end = integrate_phase(
-            element_phase.vector_field,
-            element_phase.guards,
-            jnp.stack([*q, *v]),
-            is_phase_active,
-            compute_wheel_units(phase.s).scale_times_to_seconds(options),
-            jnp.stack(phase.coordinate_units),
-            element_phase.kinks,
-        )
-        y = tuple(phase_end.state)
-        return phase_end._replace(
-            state=(y[: phase.n_dof], y[phase.n_dof :]),
-            margin_minima=phase_end.margin_minima if records_margins else None,
-        )
-
-    return run_phase
+    assert tableau is not None
+    return tableau

@@ -1,13 +1,24 @@
-"""Walks of batches of walkers, and derivatives with respect to their starts and parameters."""
+"""Walks of batches of walkers, and derivatives with respect to their starts and parameters.
+
+Some derivatives follow from the units of length, time and mass by Euler's theorem. The choice of
+these units does not affect a gait. So every output of a step or a cycle is a homogeneous function
+of the parameters and the start, and each unit determines one column of the Jacobian from the other
+columns. Two columns of the Jacobian of a step are computed in this way. The unit of mass would
+determine a third column, but no mass is always large enough to divide by: the column for the mass
+of a light leg would lose its digits. The columns of the Jacobian of a cycle are more expensive. For
+a cycle, the unit of mass also determines the derivative in the direction in which both masses grow.
+"""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
+from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome, describe_outcomes
 from vrw_jax.base.printing import (
     AbstractPrintable,
@@ -15,6 +26,11 @@ from vrw_jax.base.printing import (
     format_outcome_counts,
     format_quantity,
 )
+from vrw_jax.flow.solver_steps import load_explicit_tableau
+from vrw_jax.lanes.autodiff import compute_jacobian_columns
+from vrw_jax.lanes.batching import BatchFunction
+from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
+from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_DOMAINS, PARAMETER_NAMES, UNIT_POWERS
 
 
 class StepSensitivity(eqx.Module):
@@ -311,3 +327,192 @@ def select_lanes(lane_indices: np.ndarray, n_lanes: int) -> Any:
     If these are all lanes, the index is a slice, which copies nothing.
     """
     return slice(None) if len(lane_indices) == n_lanes else lane_indices
+
+
+_SECTION_STATE_UNITS = ("rad", "rad/s", "m/s")
+_STEP_INPUT_UNITS = (
+    *(parameter_domain.unit for parameter_domain in PARAMETER_DOMAINS.values()),
+    *_SECTION_STATE_UNITS,
+    "rad",
+)
+
+
+class UnitScalingPowers(NamedTuple):
+    """Exponents of one unit in the units of the inputs and outputs of a step."""
+
+    step_input_powers: tuple[int, ...]  # exponents for parameters, start, slope of the next line
+    step_output_powers: tuple[int, ...]  # exponents for section state and durations
+
+    def subtract_known_jacobian_columns(
+        self,
+        scaled_output: Array,
+        step_inputs: Sequence[Array],
+        known_jacobian_columns: Mapping[int, Array],
+    ) -> Array:
+        """Subtract the contribution of each known Jacobian column from the sum in Euler's theorem.
+
+        `scaled_output` is an output times the exponent of the unit in that output. The contribution
+        of a column is the column times its input and the exponent of the unit in that input. By
+        Euler's theorem, the result is the sum of the contributions of the unknown columns.
+        """
+        for i, known_jacobian_column in known_jacobian_columns.items():
+            if self.step_input_powers[i]:
+                scaled_output = (
+                    scaled_output
+                    - (self.step_input_powers[i] * step_inputs[i]) * known_jacobian_column
+                )
+        return scaled_output
+
+
+LENGTH_UNIT_SCALING, TIME_UNIT_SCALING, MASS_UNIT_SCALING = (
+    UnitScalingPowers(
+        *(
+            tuple(UNIT_POWERS[unit_name][unit_index] for unit_name in unit_names)
+            for unit_names in (_STEP_INPUT_UNITS, (*_SECTION_STATE_UNITS, "s", "s", "s"))
+        )
+    )
+    for unit_index in range(3)
+)
+UNIT_SCALING_BY_PARAMETER_INDEX = {
+    PARAMETER_NAMES.index("gravity"): TIME_UNIT_SCALING,
+    PARAMETER_NAMES.index("locked_length"): LENGTH_UNIT_SCALING,
+}
+"""Unit scaling that determines the Jacobian column of a parameter, by the index of the parameter.
+Gravity comes first, because its unit contains a length.
+"""
+
+
+def complete_jacobian_by_scaling(
+    step_inputs: Sequence[Array],
+    known_jacobian_columns: Mapping[int, Array],
+    scaled_outputs: Mapping[int, Array],
+) -> dict[int, Array]:
+    """Return all columns of a Jacobian, by the index of the input.
+
+    Euler's theorem determines the columns of `UNIT_SCALING_BY_PARAMETER_INDEX`.
+
+    - `known_jacobian_columns`: all other columns, by the index of the input;
+    - `scaled_outputs`: outputs times the exponents of a unit, by the index of the parameter whose
+      column the unit determines.
+    """
+    known_jacobian_columns = dict(known_jacobian_columns)
+    for parameter_index, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items():
+        unknown_column_product = unit_scaling.subtract_known_jacobian_columns(
+            scaled_outputs[parameter_index], step_inputs, known_jacobian_columns
+        )
+        known_jacobian_columns[parameter_index] = unknown_column_product / (
+            unit_scaling.step_input_powers[parameter_index] * step_inputs[parameter_index]
+        )
+    return known_jacobian_columns
+
+
+def complete_jacobian_columns(
+    batch_function: BatchFunction, step_inputs: Sequence[Array], input_indices: Sequence[int]
+) -> tuple:
+    """Compute the Jacobian of section state and durations with respect to all inputs of a step.
+
+    The results are those of `compute_jacobian_columns`. Two columns are computed from all other
+    columns by unit scaling.
+
+    - `batch_function`: function that computes the step for a batch;
+    - `step_inputs`: parameters, then the start, then on uneven ground the slope of the next line of
+      the ground;
+    - `input_indices`: indices of all inputs, in the order of the returned columns.
+    """
+    computed_indices = [
+        i for i in range(len(step_inputs)) if i not in UNIT_SCALING_BY_PARAMETER_INDEX
+    ]
+    computed_jacobian_columns, step_outputs, nonfloat_outputs = compute_jacobian_columns(
+        batch_function, step_inputs, computed_indices
+    )
+    scaled_outputs = {
+        i: jnp.asarray(unit_scaling.step_output_powers, step_outputs.dtype)[:, None] * step_outputs
+        for i, unit_scaling in UNIT_SCALING_BY_PARAMETER_INDEX.items()
+    }
+    jacobian_columns_by_input = complete_jacobian_by_scaling(
+        step_inputs,
+        dict(zip(computed_indices, computed_jacobian_columns, strict=True)),
+        scaled_outputs,
+    )
+    return (
+        jnp.stack([jacobian_columns_by_input[i] for i in input_indices]),
+        step_outputs,
+        nonfloat_outputs,
+    )
+
+
+def step_batch_with_contact(
+    model: Any,
+    inputs: list[StepInput],
+    next_line: list[StepInput],
+    section_states: np.ndarray,
+    n_steps: int,
+    options: StepOptions,
+    requested_engine: str,
+    n_legs: int,
+    derivative_names: Sequence[str],
+) -> StepBatchResult:
+    """Return the result of `step_batch` for a model with unilateral contact.
+
+    Without derivatives on flat ground, one call of the kernel computes all gait steps. On uneven
+    ground, further inputs are the friction of the feet that landed earlier, and the increase of the
+    slope to the next line of the ground, rad, or two rises (see `models.select_stance_line`), m.
+
+    - `next_line`: slope of the next line, or two rises; empty if all lines have one slope.
+    """
+    if requested_engine not in ("auto", "lanes") or load_explicit_tableau(options.solver) is None:
+        raise ValueError(
+            f"engine is {requested_engine!r} and solver {options.solver}, but batches with contact "
+            "need 'lanes' and an explicit Runge-Kutta solver: map vrw.walk over the wheels."
+        )
+    if np.ndim(model.restitution):
+        raise ValueError(
+            f"restitution has shape {np.shape(model.restitution)}, but a batch needs one number "
+            "for all elements: call vrw.step_batch for each restitution."
+        )
+    first_values = np.stack([x.select_values(0) for x in inputs])
+    section_states = embed_section_states(first_values, section_states, n_legs)
+    friction = np.asarray(model.friction, section_states.dtype)
+    is_ground_uneven = bool(next_line) or friction.ndim == 2
+    if not (derivative_names or is_ground_uneven or model.leg_period > 1):
+        x, durations, outcome, n_stepped, solver_steps, _ = map(
+            np.asarray, walk_batch(first_values, section_states, n_steps, model, options, n_legs)
+        )
+        solver_index = np.zeros_like(n_stepped)
+        return StepBatchResult(
+            x, durations, outcome, n_stepped, solver_steps, solver_index, "lanes", (options.solver,)
+        )
+    if is_ground_uneven:
+        slope = inputs[PARAMETER_NAMES.index("slope")]
+        if len(next_line) == 1:
+            next_slope = next_line[0]
+            tilt = next_slope._replace(
+                values=next_slope.values - slope.values,
+                list_terms=lambda k: [(k, -1.0), *next_slope.list_terms(k)],
+            )
+            next_line = [tilt]
+        inputs = [
+            *inputs,
+            make_step_input(FRICTION_NAME, friction, n_steps, len(section_states), -1),
+            *(next_line or [StepInput("", np.zeros_like(slope.values))]),
+        ]
+    batch = WalkBatch(section_states.T.copy(), inputs, derivative_names)
+    input_indices = list(batch.input_indices)
+
+    def step_lanes(_: Any, inputs: np.ndarray, x: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
+        if not derivative_names:
+            x, durations, outcome, _, solver_steps, _ = walk_batch(
+                inputs, x.T, 1, model, options, n_legs
+            )
+            outputs: tuple[Any, ...] = x, durations, outcome, solver_steps
+        else:
+            step, jacobian = step_batch_with_jacobian(
+                inputs, x.T, model, options, n_legs, input_indices
+            )
+            columns = np.concatenate([jacobian.section_state, jacobian.durations], 1)
+            outputs = step.section_state, step.durations, step.outcome, step.solver_steps
+            outputs += (columns[:, :, input_indices],)
+        return tuple(np.asarray(x).T for x in outputs)
+
+    batch.take_steps(n_steps, step_lanes, model)
+    return batch.make_batch_result("lanes", (options.solver,))

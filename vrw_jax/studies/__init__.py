@@ -9,4 +9,4 @@ from vrw_jax.studies.scan_execution import (
 )
 from vrw_jax.studies.scan_planning import ScanPlan, plan_scan
 from vrw_jax.studies.tune_maximization import TrialKind
-from vrw_jax.studies.tune_problem import tune
+from vrw_jax.studies.tuning import tune

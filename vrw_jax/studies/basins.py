@@ -26,23 +26,18 @@ from vrw_jax.base.options import EngineName, StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.walker import (
-    check_arguments,
-    check_one_walker,
-    is_own_walker,
-    name_coordinates,
-)
+from vrw_jax.base.walker import check_arguments, check_one_walker, is_own_walker, name_coordinates
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.gaits.gait_walks import find_distinct_orbits, measure_orbit_steps, walk_until_periodic
 from vrw_jax.gaits.walker_finder import HybridGait
+from vrw_jax.models.ladder import collect_provenance_attributes
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,
     POST_LANDING_COMPONENT_NAMES,
     PRE_TOUCHDOWN_COMPONENT_NAMES,
     make_measure_attributes,
 )
-from vrw_jax.models.registry import collect_provenance_attributes
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.stepping import (
     ModelLike,
@@ -151,8 +146,7 @@ def basin(
     )
     walk_variables = {
         "attractor": make_walk_variable(
-            orbit_indices,
-            {"long_name": "orbit that the walk settles on", "flag_none": -1},
+            orbit_indices, {"long_name": "orbit that the walk settles on", "flag_none": -1}
         ),
         "outcome": make_walk_variable(walk_ends.outcome, make_measure_attributes("outcome")),
         "steps": make_walk_variable(
@@ -442,9 +436,7 @@ N_STEPS_PER_ARRIVAL_TEST = 10
 
 
 def walk_until_on_gait(
-    stable_gait: StableGait,
-    start_states: np.ndarray,
-    max_steps: int,
+    stable_gait: StableGait, start_states: np.ndarray, max_steps: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Walk at most `max_steps` gait steps from `start_states`, until the walks are on the gait.
 

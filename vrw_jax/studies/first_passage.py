@@ -32,13 +32,13 @@ from vrw_jax.models.stepping import (
     convert_step_options,
     require_single_wheel,
 )
-from vrw_jax.studies.failure_density import GaussianMixture
 from vrw_jax.studies.rigid_passage import (
     RigidPassage,
     solve_passage_by_interpolation,
     solve_passage_on_slopes,
 )
-from vrw_jax.studies.sampled_passage import ExtinctGroupError, WalkerGroups, sample_passage
+from vrw_jax.studies.sampled_passage import sample_passage
+from vrw_jax.studies.walker_groups import ExtinctGroupError, GaussianMixture, WalkerGroups
 from vrw_jax.wheel.params import (
     PARAMETER_DOMAINS,
     PARAMETER_NAMES,
@@ -60,9 +60,7 @@ N_CHANGED_WHEEL_BISECTIONS = 14
 
 
 def differentiate_log_mean_steps(
-    walker_groups: WalkerGroups,
-    walk_density: GaussianMixture,
-    parameter_names: tuple[str, ...],
+    walker_groups: WalkerGroups, walk_density: GaussianMixture, parameter_names: tuple[str, ...]
 ) -> dict[str, float]:
     """Return the derivatives of the logarithm of the mean number of gait steps, by parameter name.
 
@@ -145,13 +143,10 @@ def differentiate_log_mean_steps(
             )
         return (changed_failure_radii[0] - changed_failure_radii[1]) / (changes[0] - changes[1])
 
-    n_differentiated_walks = np.sum(survives_on_mean_slopes)
+    n_walks = np.sum(survives_on_mean_slopes)
     return {
-        parameter_name: float(
-            np.sum(hazard_rates * differentiate_failure_radii(parameter_name))
-            / n_differentiated_walks
-        )
-        for parameter_name in parameter_names
+        name: float(np.sum(hazard_rates * differentiate_failure_radii(name)) / n_walks)
+        for name in parameter_names
     }
 
 

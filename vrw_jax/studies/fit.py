@@ -28,11 +28,26 @@ from vrw_jax.base.options import StepOptions, list_parameters, parameter
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import is_own_walker, propose_starts
-from vrw_jax.gaits.finder_selection import resolve_finder
-from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_model
-from vrw_jax.studies import fit_data, fit_problem
-from vrw_jax.studies.fit_problem import FitProblem, FitTarget, solve_fits
-from vrw_jax.studies.fit_result import FitResult, make_result, summarize
+from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_finder, resolve_model
+from vrw_jax.studies.fit_problem import (
+    HEIGHT_COLUMN,
+    OFFSET_SUFFIX,
+    START_NAMES,
+    START_PREFIX,
+    TIME_OFFSET,
+    FitProblem,
+    FitTarget,
+    measure_candidates,
+    solve_fits,
+)
+from vrw_jax.studies.fit_result import (
+    DATASET_DIMENSION,
+    FitData,
+    FitResult,
+    make_result,
+    read_data,
+    summarize,
+)
 
 N_STARTS = 8
 """Default number of starts. The first start is the given walker."""
@@ -132,11 +147,11 @@ def fit(
 
 def _read_table(
     data: Any, params: Any, finder: Any, covariance: Any, units: dict[str, str]
-) -> fit_data.FitData:
+) -> FitData:
     """Return the checked data, or raise an error if the model has no data of their kind."""
     model = finder.model
     time_unit = math.sqrt(params.locked_length / params.gravity) if model.is_wheel else None
-    table = fit_data.read_data(data, covariance, units, model.parameter_names, time_unit)
+    table = read_data(data, covariance, units, model.parameter_names, time_unit)
     if table.kind == "gaits" and finder.leg_period > 1 and finder.is_multistable:
         raise ValueError(
             f"the legs alternate, but with a {type(model).__name__} the data of gaits are of one "
@@ -151,7 +166,7 @@ def _read_table(
 
 
 def _make_problem(
-    table: fit_data.FitData,
+    table: FitData,
     params: Any,
     free: Sequence[str],
     finder: Any,
@@ -179,7 +194,7 @@ def _make_problem(
         # Of a full section state, Leg 1 stands on the ground, and the others on their stoppers.
         first_states = first_states[:, [0, 1, 4 + params.n_legs]]
     start_names = [
-        f"{fit_problem.START_PREFIX}{entry}{f'[{walk}]' if len(walks) > 1 else ''}"
+        f"{START_PREFIX}{entry}{f'[{walk}]' if len(walks) > 1 else ''}"
         for walk in range(len(walks))
         for entry in entries
         if has_unknown_starts
@@ -239,7 +254,7 @@ def _fit_from_starts(
     problem: FitProblem,
     targets: FitTarget,
     starts: np.ndarray,
-    table: fit_data.FitData,
+    table: FitData,
     units: dict[str, str],
     params: Any,
     can_replace_guesses: bool,
@@ -252,7 +267,7 @@ def _fit_from_starts(
     domains = problem.finder.model.parameter_domains
     units = {**units, **{name: domain.unit for name, domain in domains.items()}, "time": "s"}
     quantities = [
-        name.removesuffix(fit_problem.OFFSET_SUFFIX).removeprefix(fit_problem.START_PREFIX)
+        name.removesuffix(OFFSET_SUFFIX).removeprefix(START_PREFIX)
         for name in problem.unknown_names
     ]
     unknown_units = tuple(units.get(name.partition("[")[0], "1") for name in quantities)
@@ -288,7 +303,7 @@ def _resolve_walker(
     model = resolve_model(params, model)
     finder = resolve_finder(params, model, None, getattr(model, "leg_period", 1))
     # The landing on both feet of the paper's wheel leaves two of the three entries.
-    return finder, finder.model.units, fit_problem.START_NAMES[:2]
+    return finder, finder.model.units, START_NAMES[:2]
 
 
 def _arrange_steps(
@@ -341,9 +356,9 @@ def _check_unknowns(
     - `described_names`: names of unknowns with bounds or a prior.
     """
     parameter_names = finder.model.parameter_names
-    offset_names = [f"{name}{fit_problem.OFFSET_SUFFIX}" for name in parameter_names]
+    offset_names = [f"{name}{OFFSET_SUFFIX}" for name in parameter_names]
     if table.kind == "series":
-        offset_names.append(fit_problem.TIME_OFFSET)
+        offset_names.append(TIME_OFFSET)
     for name in free:
         require_known_name(name, (*parameter_names, *offset_names), "parameter of the walker")
         if name in table.conditions:
@@ -474,7 +489,7 @@ def _describe_unknowns(
         domain, mean, weight = domains.get(name), 0.0, 0.0
         low, high = (domain.lower_bound, domain.upper_bound) if domain else (-np.inf, np.inf)
         size = 10.0 if domain and domain.unit != "1" else 1.0
-        if name.endswith(fit_problem.OFFSET_SUFFIX):
+        if name.endswith(OFFSET_SUFFIX):
             size = 0.01  # s or rad
         if name in bounds:
             low, high = check_range(f"the range of {name}", bounds[name])
@@ -499,7 +514,7 @@ def _describe_unknowns(
 
 
 def _arrange_conditions(
-    table: fit_data.FitData,
+    table: FitData,
     model: Any,
     walks: np.ndarray,
     row_walks: np.ndarray,
@@ -516,10 +531,10 @@ def _arrange_conditions(
     arranged = {}
     for name, column in table.conditions.items():
         by_walk = [column[row_walks == walk] for walk in range(n_walks)]
-        if name != fit_data.HEIGHT_COLUMN and all(np.ptp(x) == 0.0 for x in by_walk):
+        if name != HEIGHT_COLUMN and all(np.ptp(x) == 0.0 for x in by_walk):
             arranged[name] = np.array([x[0] for x in by_walk])
             continue
-        if row_steps is None or (model.is_wheel and name not in ("slope", fit_data.HEIGHT_COLUMN)):
+        if row_steps is None or (model.is_wheel and name not in ("slope", HEIGHT_COLUMN)):
             raise ValueError(
                 f"{name} varies within a walk, but only the ground may, from step to step: give "
                 "one value for each walk, or number the steps in a column 'step'."
@@ -543,7 +558,7 @@ def _arrange_conditions(
                 )
             # The ground goes on with the last value where a walk has fewer steps.
             values[walk, last_step:] = values[walk, last_step]
-        if name == fit_data.HEIGHT_COLUMN:
+        if name == HEIGHT_COLUMN:
             values = np.concatenate([np.zeros((n_walks, 1)), values], 1)
         arranged[name] = values
     return arranged
@@ -570,7 +585,7 @@ def _choose_starts(
     candidates = np.clip(candidates, problem.lower, problem.upper)
     if n_candidates == n_starts:
         return candidates
-    chi2 = fit_problem.measure_candidates(problem, targets, candidates)
+    chi2 = measure_candidates(problem, targets, candidates)
     best = 1 + np.argsort(np.asarray(chi2)[1:], kind="stable")[: n_starts - 1]
     return candidates[np.append(0, best)]
 
@@ -675,7 +690,7 @@ def compare_laws(
         prediction_errors.append(_predict_left_out(fits[name], n_folds))
     stack = lambda name: np.array([getattr(x, name) for x in fits.values()])
     chi2, n_unknowns = stack("chi2"), np.array([len(x.names) for x in fits.values()])
-    dims = ("law", fit_data.DATASET_DIMENSION)[: chi2.ndim]
+    dims = ("law", DATASET_DIMENSION)[: chi2.ndim]
     aic = (chi2.T + 2.0 * n_unknowns).T
     columns = {
         "chi2": chi2,

@@ -21,7 +21,6 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.walker import compile_step
 from vrw_jax.lanes.batching import map_in_batches, replace_rows, select_tree_rows
-from vrw_jax.studies.fit_data import HEIGHT_COLUMN
 
 FIT_BATCH_SIZES = (8, 256)
 """Numbers of fits that one call computes."""
@@ -44,6 +43,7 @@ STENCIL_SIZE = 6
 DIFFERENCE_STEP = 1e-4
 """Relative change of unknowns for derivatives of samples with unilateral contact, which machine
 code computes without derivatives. The errors of the motion, 1e-9, are divided by it."""
+HEIGHT_COLUMN = "height"
 OFFSET_SUFFIX = "_offset"
 TIME_OFFSET = "time_offset"
 START_PREFIX = "start."

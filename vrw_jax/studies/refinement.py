@@ -1,16 +1,18 @@
-"""Find gaits with unilateral contact by walks and Newton's method, and bound errors of measures.
-
-In a fast walk, the states of the legs decay within a few steps. The remaining motion then drifts
-slowly on one curve for hundreds of steps. A few steps determine the drift per step and its decay. A
-leap in the direction of the drift replaces the remaining steps (projective integration: C. W. Gear
-and I. G. Kevrekidis, SIAM J. Sci. Comput. 24, 2003). A leap ends at the latest at the predicted
-limit of the drift. The state at the end of a walk is the initial guess for the refinement.
+"""Refine gaits with unilateral contact by Newton's method, and bound the errors of their measures.
 
 One walking step with unilateral contact from a section state x yields the defect r = P(x) - x,
 where P is the return map. Newton's correction is d = (I - DP)^-1 r. The gait's step quantities are
 those of this step plus their first-order change due to d. The Jacobian DP of one step is used for
 several corrections (chord iteration). It is computed again if corrections contract slowly or the
 contact codes of the legs change.
+
+The first step starts at the gait of the lower model. Its defect, propagated to the measure by the
+lower model's derivatives, approximates the model error to second order. The estimate is a
+dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica 10, 2001), in which the next model
+replaces the finer mesh. If the error is within the tolerance, the lower model's measure is
+returned. Otherwise Newton's method, starting at the end of that step, finds the gait with
+unilateral contact. If that gait is far from the lower model's gait, a walk to another gait is
+computed.
 """
 
 import functools
@@ -21,9 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.printing import StatusCode
+from vrw_jax.gaits.gait_walks import compute_walk_starts
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
-from vrw_jax.lanes.batching import replace_rows
-from vrw_jax.models.contact_section import LOCKED_CODE_OFFSET
+from vrw_jax.lanes.batching import replace_rows, select_rows_on_device, select_tree_rows
+from vrw_jax.models.contact_record import LOCKED_CODE_OFFSET
 from vrw_jax.studies.fidelity import (
     QUANTITY_NAMES,
     ContactWheelBatch,
@@ -33,155 +37,9 @@ from vrw_jax.studies.fidelity import (
     compute_measure_derivatives,
     evaluate_measures,
     multiply_rows,
+    walk_until_settled,
 )
-
-
-class WalkEnds(NamedTuple):
-    """Full section state and outcome at the end of each walk."""
-
-    has_settled: np.ndarray  # whether the walk has settled, probably near a gait
-    section_states: np.ndarray  # (walks, 4 + 3 n)
-    walk_outcomes: np.ndarray  # STEPPED, or the failure that ended the walk
-    n_steps: np.ndarray  # number of walking steps
-
-
-# Number of walking steps before the first leap.
-N_WARMUP_STEPS = 20
-# Largest number of leaps.
-MAX_LEAPS = 10
-# Number of walking steps after a leap. The value is chosen because five steps miss three of 118
-# gaits, among 451 wheels for which the paper's model has no gait.
-N_STEPS_PER_LEAP = 7
-# Largest length of a leap, in rad, rad/s, m and m/s, chosen because longer leaps skip pairs of
-# close gaits.
-MAX_LEAP_DISTANCE = 0.15
-# Largest ratio of the fade distance to the length of all remaining leaps together. A walk with a
-# larger ratio ends. The fade distance is the distance to the predicted limit of the drift.
-MAX_FADE_DISTANCE_RATIO = 2.0
-# Largest number of remaining leaps at which `MAX_FADE_DISTANCE_RATIO` is tested, chosen because a
-# drift may first grow and then decay.
-MAX_LEAPS_LEFT_TO_GIVE_UP = 3
-
-
-def walk_until_settled(
-    wheel_batch: ContactWheelBatch,
-    wheel_indices: np.ndarray,
-    section_states: np.ndarray,
-) -> WalkEnds:
-    """Return the ends of walks that start at full section states, (walks, 4 + 3 n).
-
-    Each walk settles, fails, or ends without settling after the last leap.
-    """
-    n_walks, n_continuous_entries = len(wheel_indices), section_states.shape[1] - wheel_batch.n_legs
-    loose_step_batch = wheel_batch.make_walk_batch()
-    walk_ends = WalkEnds(
-        np.zeros(n_walks, bool),
-        section_states.copy(),
-        np.full(n_walks, int(Outcome.STEPPED)),
-        np.zeros(n_walks, int),
-    )
-    active_walk_indices, start_states = np.arange(n_walks), section_states
-    n_steps_before_leaps = (
-        N_WARMUP_STEPS,
-        *MAX_LEAPS * (N_STEPS_PER_LEAP,),
-    )
-    for leap_index, n_steps_before_leap in enumerate(n_steps_before_leaps):
-        if not len(active_walk_indices):
-            break
-        walk_ends.n_steps[active_walk_indices] += n_steps_before_leap
-        active_wheel_indices = wheel_indices[active_walk_indices]
-        third_last_step = loose_step_batch.take_steps(
-            active_wheel_indices, start_states, n_steps_before_leap - 2
-        )
-        failed_walk_indices = np.flatnonzero(third_last_step.step_outcomes != Outcome.STEPPED)
-        if len(failed_walk_indices):
-            # A leap failed, or the tolerance of the first steps is too loose.
-            retried_step = (loose_step_batch if leap_index else wheel_batch).take_steps(
-                active_wheel_indices[failed_walk_indices],
-                walk_ends.section_states[active_walk_indices[failed_walk_indices]],
-                n_steps_before_leap - 2,
-            )
-            third_last_step = replace_rows(third_last_step, failed_walk_indices, retried_step)
-        last_steps = [third_last_step]
-        for _ in range(2):
-            last_steps.append(
-                loose_step_batch.take_steps(active_wheel_indices, last_steps[-1].section_states)
-            )
-        step_outcomes = np.stack([step.step_outcomes for step in last_steps])
-        has_stepped = np.all(step_outcomes == Outcome.STEPPED, axis=0)
-        first_failed_step_index = np.argmax(step_outcomes != Outcome.STEPPED, axis=0)
-        walk_ends.walk_outcomes[active_walk_indices] = step_outcomes[
-            first_failed_step_index, np.arange(len(active_walk_indices))
-        ]
-        active_walk_indices = active_walk_indices[has_stepped]
-        last_states = np.stack([step.section_states[has_stepped] for step in last_steps])
-        walk_ends.section_states[active_walk_indices] = last_states[-1]
-        walk_ends.has_settled[active_walk_indices], leap_vectors, fade_distance = (
-            _extrapolate_drift(last_states, n_continuous_entries)
-        )
-        n_remaining_leaps = MAX_LEAPS - leap_index
-        is_walk_continued = ~walk_ends.has_settled[active_walk_indices] & (
-            (n_remaining_leaps > MAX_LEAPS_LEFT_TO_GIVE_UP)
-            | (fade_distance <= MAX_FADE_DISTANCE_RATIO * MAX_LEAP_DISTANCE * n_remaining_leaps)
-        )
-        active_walk_indices = active_walk_indices[is_walk_continued]
-        start_states = walk_ends.section_states[active_walk_indices]
-        # Each walking step first places loaded feet on the slope, so a leap ends at a valid start.
-        start_states[:, :n_continuous_entries] += leap_vectors[is_walk_continued]
-    return walk_ends
-
-
-# Largest drift per walking step, and largest fade distance, in a settled walk.
-MAX_SETTLED_DRIFT = 5e-4
-# Drift per walking step below which errors of the steps dominate.
-DRIFT_NOISE_LEVEL = 1e-5
-
-
-def _extrapolate_drift(
-    last_states: np.ndarray, n_continuous_entries: int
-) -> tuple[np.ndarray, ...]:
-    """Return whether each walk has settled, the leap of each walk, and the fade distance.
-
-    The first `n_continuous_entries` entries of a section state are continuous. A leap starts at the
-    last state. The fade distance is the distance from this state to the predicted limit of the
-    drift. The leap and the fade distance are zero if the contact codes of the legs change.
-
-    - `last_states`: last three section states of each walk, (3, walks, 4 + 3 n).
-    """
-    leg_codes = last_states[:, :, n_continuous_entries:]
-    has_same_leg_codes = np.all(leg_codes == leg_codes[-1], axis=(0, 2))
-    earlier_state_change, last_state_change = np.diff(
-        last_states[:, :, :n_continuous_entries], axis=0
-    )
-    drift_per_step = np.abs(last_state_change).max(1)
-    with np.errstate(all="ignore"):
-        decay_rate = np.nan_to_num(
-            np.sum(earlier_state_change * last_state_change, axis=1)
-            / np.sum(earlier_state_change * earlier_state_change, axis=1)
-        )
-        n_steps_to_fade = np.where(decay_rate < 1.0, decay_rate / (1.0 - decay_rate), np.inf)
-        fade_distance = np.where(
-            drift_per_step < DRIFT_NOISE_LEVEL,
-            0.0,
-            np.abs(n_steps_to_fade) * drift_per_step,
-        )
-        n_leap_steps = np.where(
-            drift_per_step > 0.0,
-            np.minimum(n_steps_to_fade, MAX_LEAP_DISTANCE / drift_per_step),
-            0.0,
-        )
-    # A drift that changes sign at each step leads to a gait of two steps.
-    has_settled = (
-        has_same_leg_codes
-        & (fade_distance < MAX_SETTLED_DRIFT)
-        & (drift_per_step < MAX_SETTLED_DRIFT)
-    )
-    has_leap_vector = has_same_leg_codes & ~has_settled & (decay_rate > 0.0)
-    return (
-        has_settled,
-        np.where(has_leap_vector, n_leap_steps, 0.0)[:, None] * last_state_change,
-        np.where(has_same_leg_codes, fade_distance, 0.0),
-    )
+from vrw_jax.wheel.params import WheelParams
 
 
 class MeasureEstimates(NamedTuple):
@@ -496,3 +354,255 @@ class RefinedGaits:
             # A step that changes the legs' codes gives no bound.
             bounds.append(np.where(estimates.has_same_leg_codes[:, None], bound, np.inf))
         self.numerical_bounds[gaits] = np.max(bounds, axis=0)
+
+
+class MeasureStatus(StatusCode):
+    """Method by which a measure was computed."""
+
+    CHECKED_BY_ONE_STEP = 0, "checked by one step with unilateral contact"
+    CONTINUES_LOWER_GAIT = 1, "the gait that continues the lower model's"
+    REACHED_FROM_LOWER_GAIT = (2, "a gait to which a walk from the lower model's gait leads")
+    REACHED_FROM_START = (
+        3,
+        "a gait to which a walk from a start leads, as the paper's wheel has no gait",
+    )
+    NO_GAIT = 4, "no such gait with unilateral contact"
+    SELECTED_BY_RANK = 5, "one of the attracting gaits"
+
+
+# Ratio of the error bound to the error estimated from one walking step. It is chosen because the
+# bound holds if each Newton correction is at most 3/4 as long as the previous correction.
+REQUEST_SAFETY_FACTOR = 4.0
+# Number of starts of walks, slow starts first, for wheels for which the lower model has no gait. It
+# is chosen because walks from the first two starts reach a gait for 100 of 232 wheels. Walks from
+# further starts reach a gait for no other wheel.
+N_COLD_STARTS = 2
+# Largest accepted distance between the lower model's gait and the gait with unilateral contact, in
+# lengths of the first correction. It is chosen because the sum of corrections that are halved each
+# time is twice the first correction.
+MAX_GAIT_DISTANCE_RATIO = 2.0
+
+
+@dataclass
+class MeasureRequest:
+    """State of the computation of measures for a batch of wheels, with the results so far."""
+
+    measure_names: tuple[str, ...]
+    tol: float
+    relative: bool
+    wheel_batch: ContactWheelBatch
+    params: WheelParams
+
+    def __post_init__(self) -> None:
+        n_wheels = self.wheel_batch.parameter_matrix.shape[1]
+        self.lower_gaits = LowerFidelityGaits.without_gait(n_wheels)
+        fill = lambda value: np.full((n_wheels, len(self.measure_names)), value)
+        all_wheels = np.arange(n_wheels)
+        self.result_arrays = {
+            "values": fill(np.nan),
+            "errors": fill(np.inf),
+            "model_errors": fill(np.nan),
+            "numerical_errors": fill(np.inf),
+            "models": np.full(n_wheels, ModelIndex.NONE),
+            "statuses": np.full(n_wheels, int(MeasureStatus.NO_GAIT)),
+            "n_steps": np.zeros(n_wheels, int),
+            "outcomes": np.full(n_wheels, int(Outcome.NO_CYCLE_FOUND)),
+            "n_gaits": np.zeros(n_wheels, int),
+            "states": self.wheel_batch.embed_paper_states(all_wheels, np.zeros((n_wheels, 3))),
+        }
+
+    def compute_error_goal(self, values: np.ndarray) -> np.ndarray:
+        """Return the allowed absolute errors for measures with the given values."""
+        return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
+
+    def find_unfinished_indices(self) -> np.ndarray:
+        return np.flatnonzero(self.result_arrays["models"] == ModelIndex.NONE)
+
+    def walk_to_gaits(self) -> None:
+        """Compute walks of wheels without a result, and store the measures of the gaits reached."""
+        unfinished = self.find_unfinished_indices()
+        has_lower_gait = self.lower_gaits.model_index[unfinished] != ModelIndex.NONE
+        wheels, unfinished = unfinished[has_lower_gait], unfinished[~has_lower_gait]
+        self._walk_and_record_gaits(
+            wheels, self.lower_gaits.section_states[wheels], MeasureStatus.REACHED_FROM_LOWER_GAIT
+        )
+        walk_starts = compute_walk_starts(select_rows_on_device(self.params, unfinished))
+        for start in walk_starts[:N_COLD_STARTS]:
+            is_missing = self.result_arrays["models"][unfinished] == ModelIndex.NONE
+            self._walk_and_record_gaits(
+                unfinished[is_missing], start[is_missing], MeasureStatus.REACHED_FROM_START
+            )
+
+    def select_gait_by_rank(self, gait_rank: int) -> None:
+        """Store the measures of the gait with the index `gait_rank`, slowest first.
+
+        The gaits are those that walks from all starts reach.
+        """
+        wheels = self.find_unfinished_indices()
+        starts = compute_walk_starts(self.params)
+        gait_wheels, gaits = self._walk_and_refine_gaits(
+            np.tile(wheels, len(starts)), np.concatenate(starts)
+        )
+        selected = []
+        for wheel in wheels:
+            distinct = gaits.find_distinct_gaits(np.flatnonzero(gait_wheels == wheel))
+            self.result_arrays["n_gaits"][wheel] = len(distinct)
+            selected += distinct[gait_rank:][:1] if -len(distinct) <= gait_rank else []
+        self._record_gaits(
+            gait_wheels, gaits, np.array(selected, int), MeasureStatus.SELECTED_BY_RANK
+        )
+
+    def correct_lower_gaits(
+        self,
+        wheel_indices: np.ndarray,
+        find_gaits: Callable[[WheelParams], LowerFidelityGaits],
+        are_rejected_gaits_refined: bool,
+    ) -> None:
+        """Compute one step with unilateral contact from each lower gait, and store measures.
+
+        The measures of a lower gait are stored if the estimated errors are within `tol`. If
+        `are_rejected_gaits_refined` is True, the other lower gaits are the initial guesses for
+        gaits with unilateral contact, whose measures are stored as well.
+        """
+        if not len(wheel_indices):
+            return
+        gaits = find_gaits(select_rows_on_device(self.params, wheel_indices))
+        self.lower_gaits = replace_rows(self.lower_gaits, wheel_indices, gaits)
+        has_gait = np.isfinite(gaits.step_quantities).all(1)
+        wheel_indices, gaits = select_tree_rows((wheel_indices, gaits), has_gait)
+        states, step, estimates = estimate_measures_from_lower_gaits(
+            self.wheel_batch, wheel_indices, gaits, self.measure_names
+        )
+        values = evaluate_measures(self.measure_names, gaits.step_quantities)
+        with np.errstate(all="ignore"):
+            step_change = evaluate_measures(self.measure_names, step.step_quantities) - values
+            total_change = np.abs(step_change) + estimates.correction_effect_on_measures
+            model_error = values - estimates.measure_values
+            sensitivity = np.abs(estimates.measure_jacobian @ gaits.step_quantity_jacobian)
+            numerical_error = (
+                multiply_rows(sensitivity, np.abs(gaits.section_state_error))
+                + estimates.numerical_error_bound
+                + estimates.missed_contact_error_bound
+            )
+            error = (
+                np.abs(model_error) + (REQUEST_SAFETY_FACTOR - 1.0) * total_change + numerical_error
+            )
+            is_accepted = estimates.has_same_leg_codes & np.all(
+                error <= self.compute_error_goal(values), axis=1
+            )
+        self.result_arrays["n_steps"][wheel_indices] += 1
+        lower_results = {
+            "models": gaits.model_index,
+            "values": values,
+            "errors": error,
+            "model_errors": model_error,
+            "numerical_errors": numerical_error,
+            "states": states,
+        }
+        self._record_results(
+            wheel_indices[is_accepted],
+            select_tree_rows(lower_results, is_accepted),
+            MeasureStatus.CHECKED_BY_ONE_STEP,
+        )
+        is_refined = are_rejected_gaits_refined & ~is_accepted & estimates.has_same_leg_codes
+        wheel_indices = wheel_indices[is_refined]
+        refined = self._refine_gaits(wheel_indices, step.section_states[is_refined], False)
+        distances, correction_lengths = (
+            np.linalg.norm(x, axis=1)
+            for x in (
+                (refined.section_states - states[is_refined])[
+                    :, self.wheel_batch.list_paper_state_indices()
+                ],
+                estimates.newton_correction[is_refined],
+            )
+        )
+        is_near = distances <= MAX_GAIT_DISTANCE_RATIO * correction_lengths
+        self._record_gaits(
+            wheel_indices, refined, refined.is_found & is_near, MeasureStatus.CONTINUES_LOWER_GAIT
+        )
+
+    def _refine_gaits(
+        self, wheel_indices: np.ndarray, states: np.ndarray, is_every_gait_compared: bool
+    ) -> RefinedGaits:
+        """Return the gaits near full section states, and add their steps to the results."""
+        gaits = refine_gaits(
+            self.wheel_batch,
+            wheel_indices,
+            states,
+            self.measure_names,
+            self.compute_error_goal,
+            is_every_gait_compared,
+        )
+        np.add.at(self.result_arrays["n_steps"], wheel_indices, gaits.n_steps)
+        return gaits
+
+    def _walk_and_record_gaits(
+        self, wheel_indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
+    ) -> None:
+        """Compute walks from the paper's section states, and store measures of the gaits reached.
+
+        The section states have the shape (wheels, 3).
+        """
+        gait_wheels, gaits = self._walk_and_refine_gaits(wheel_indices, section_states)
+        self._record_gaits(gait_wheels, gaits, gaits.is_found & gaits.is_attracting, status)
+
+    def _walk_and_refine_gaits(
+        self, wheel_indices: np.ndarray, section_states: np.ndarray
+    ) -> tuple[np.ndarray, RefinedGaits]:
+        """Return the gaits at the ends of walks from the paper's section states, after refinement.
+
+        The result is (wheel index of each gait, gaits).
+        """
+        walk_ends = walk_until_settled(
+            self.wheel_batch,
+            wheel_indices,
+            self.wheel_batch.embed_paper_states(wheel_indices, section_states),
+        )
+        np.add.at(self.result_arrays["n_steps"], wheel_indices, walk_ends.n_steps)
+        # A step cannot begin if a wheel has turned more than once in flight.
+        is_reason_unknown = np.isin(walk_ends.walk_outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT))
+        self.result_arrays["outcomes"][wheel_indices] = np.where(
+            is_reason_unknown, Outcome.NO_CYCLE_FOUND, walk_ends.walk_outcomes
+        )
+        wheel_indices = wheel_indices[walk_ends.has_settled]
+        states = walk_ends.section_states[walk_ends.has_settled]
+        return wheel_indices, self._refine_gaits(wheel_indices, states, True)
+
+    def _record_gaits(
+        self,
+        gait_wheels: np.ndarray,
+        gaits: RefinedGaits,
+        selected_gaits: np.ndarray,
+        status: MeasureStatus,
+    ) -> None:
+        """Store the measures of the selected gaits with unilateral contact.
+
+        - `gait_wheels`: index of the wheel of each gait;
+        - `selected_gaits`: indices or mask of the selected gaits.
+        """
+        wheels, values, errors, states = select_tree_rows(
+            (gait_wheels, gaits.values, gaits.error_bounds, gaits.section_states), selected_gaits
+        )
+        lower_values = evaluate_measures(
+            self.measure_names, self.lower_gaits.step_quantities[wheels]
+        )
+        gait_results = {
+            "models": ModelIndex.UNILATERAL,
+            "values": values,
+            "errors": errors,
+            "model_errors": lower_values - values,
+            "numerical_errors": errors,
+            "states": states,
+        }
+        self._record_results(wheels, gait_results, status)
+
+    def _record_results(
+        self, wheel_indices: np.ndarray, results: dict[str, Any], status: MeasureStatus
+    ) -> None:
+        """Store the results of the wheels with the indices `wheel_indices`.
+
+        The keys of `results` are those of `result_arrays`. `status` is the method of the results.
+        """
+        results = results | {"statuses": status, "outcomes": Outcome.STEPPED}
+        for result_name, new_result_values in results.items():
+            self.result_arrays[result_name][wheel_indices] = new_result_values

@@ -21,8 +21,8 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
 from vrw_jax.base.types import Scalar
-from vrw_jax.wheel.ground import compute_line_slope
 from vrw_jax.wheel.params import WheelParams
+from vrw_jax.wheel.transitions import compute_line_slope
 
 MAX_POWER_ITERATIONS = 5000
 """Largest number of power iterations, chosen because it suffices for kappa_2 up to 0.99 kappa_1."""
@@ -261,10 +261,10 @@ def solve_passage_by_interpolation(
     level_rates = lowest + 0.5 * (highest - lowest) * (1.0 + np.cos(rate_angles))
     level_rates = jnp.repeat(level_rates, n_heights)
     deviations = jnp.tile(jnp.asarray(z_max * np.cos(height_angles)), n_rates)
-    zero_rates = jnp.zeros_like(level_rates)
     squared_rates = level_rates
     if has_heights:
-        squared_rates = (level_rates - find_level_rate(zero_rates, deviations)) / retained_fraction
+        rates_from_rest = find_level_rate(jnp.zeros_like(level_rates), deviations)
+        squared_rates = (level_rates - rates_from_rest) / retained_fraction
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(N_DEVIATION_NODES)
 
     def make_deviation_quadrature(
@@ -315,7 +315,6 @@ def solve_passage_by_interpolation(
     rows = jax.vmap(evaluate_state_row)(squared_rates, deviations)
     mean_deviation = jnp.zeros_like(mean_slope)
     start_row = evaluate_state_row(gait_squared_rate, mean_deviation)
-    n_steps_before_start = 0
     if has_heights:
         # The gait lands on a foothold of random height, and the step before is not counted.
         landing_rate = rate_map.compute_rate_after_landing(gait_squared_rate, mean_slope)
@@ -324,13 +323,10 @@ def solve_passage_by_interpolation(
             rate_map.find_flattest_landing_slope(landing_rate),
             lambda slope: landing_rate - rate_map.compute_climb(slope),
         )
-        n_steps_before_start = 1
     states = jnp.stack([squared_rates, ground_sd * deviations][: 1 + has_heights], 1)
     step_distances = jax.vmap(compute_step_distance)(deviations)
     passage = _analyze_passage(*rows, step_distances, start_row, states, 2.0 * ndtr(-z_max))
-    return passage._replace(
-        mean_steps_from_gait=passage.mean_steps_from_gait - n_steps_before_start
-    )
+    return passage._replace(mean_steps_from_gait=passage.mean_steps_from_gait - int(has_heights))
 
 
 def _analyze_passage(

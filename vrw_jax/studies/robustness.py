@@ -30,11 +30,10 @@ from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.branches.branch import Branch
+from vrw_jax.gaits.derivatives import compute_sensitivity_norms
 from vrw_jax.gaits.finder import AbstractGaitFinder
-from vrw_jax.gaits.finder_selection import UserCycleGuess, resolve_finder
-from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
+from vrw_jax.gaits.gait_search import UserCycleGuess, limit_cycle, resolve_finder, resolve_model
 from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.gaits.slope_response import compute_sensitivity_norms
 from vrw_jax.models.stepping import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.studies.basins import (
     MAX_ARRIVAL_DISTANCE,

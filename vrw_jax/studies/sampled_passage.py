@@ -12,21 +12,18 @@ import collections
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.base.options import StepOptions, find_tree_parameter, replace_tree_parameter
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import report_progress
-from vrw_jax.lanes.batching import replace_rows
-from vrw_jax.models.step_batch import step_batch
-from vrw_jax.models.walk_batch import StepBatchResult
-from vrw_jax.studies.failure_density import GaussianMixture, fit_failure_density
+from vrw_jax.studies.walker_groups import (
+    GaussianMixture,
+    StepTransition,
+    WalkerGroups,
+    fit_failure_density,
+)
 
 MAX_BIASED_GROUND_LINES = 12
 """Largest number of lines of the ground whose slopes are drawn with a bias.
@@ -125,10 +122,6 @@ which both feet stick leaves two degrees of freedom.
 """
 
 
-class ExtinctGroupError(ValueError):
-    """Error that is raised if all walkers of a group fail in the same step."""
-
-
 class SampledPassage(NamedTuple):
     """Results of `sample_passage`: first-passage times, estimated from sampled walks."""
 
@@ -146,283 +139,8 @@ class SampledPassage(NamedTuple):
     walk_density: GaussianMixture
 
 
-class StepTransition(NamedTuple):
-    """States of all walkers before and after the steps in which all legs have their turn.
-
-    The states are those of `stack_states_and_ground`.
-    """
-
-    states_before_step: np.ndarray
-    is_walker_alive: np.ndarray
-    ground_deviations: np.ndarray  # of the slopes or heights on which the steps end
-    states_after_step: np.ndarray
-    step_distances: np.ndarray  # mean distance of each step along the mean slope, m
-    n_stepped: np.ndarray  # number of completed steps
-
-
-@dataclass
-class WalkerGroups:
-    """Groups of walkers (simulated wheels) on random slopes or heights, simulated as one batch.
-
-    By the Markov property, the section state and the ground of a walker determine the distribution
-    of later states. The ground is the slope of its line, or the heights of the two last footholds.
-    For a walker of the user, it is the height of the last one.
-    At first, the state of every walker is the section state of the gait. The number of walkers per
-    group is rounded up to a power of two, because a digital net has such a number of points.
-    """
-
-    params: Any
-    gait_state: np.ndarray
-    ground_sd: float  # of slopes, rad, or of heights, m
-    model: Any
-    step_options: StepOptions
-    n_walkers: int
-    random: np.random.Generator
-    n_groups: int = 32
-    """Number of independent groups of walkers.
-
-    The value is chosen because the quantile for 99 % of Student's distribution is then within 7 %
-    of that of the normal distribution.
-    """
-    negligible_ground_line_effect: float = 0.01
-    """Relative effect of a line's slope below which the slope is drawn without bias.
-
-    A line joins two footholds. The effect is that on a later state, divided by that on the next
-    state. The result has no bias for any value. The value is chosen because likelihood ratios are
-    then similar.
-    """
-    min_forgetting_steps: int = 6
-    """Smallest number of gait steps after which the effect of the start is considered to have
-    decayed.
-    """
-    min_effective_failures: float = 100.0
-    """Smallest effective number of sampled failures for which an error is estimated.
-
-    The value is chosen because a few likelihood ratios dominate smaller samples. The spread of
-    these ratios is then no estimate of the error.
-    """
-    sd_name: str = "slope_sd"  # or "height_sd"
-
-    @property
-    def has_heights(self) -> bool:
-        """Return whether heights of footholds are random, instead of slopes."""
-        return self.sd_name == "height_sd"
-
-    @property
-    def leg_period(self) -> int:
-        """Return the number of steps after which the legs are in the same roles again.
-
-        So many steps are one step of the survival operator.
-        """
-        return self.model.leg_period
-
-    @property
-    def n_continuous_entries(self) -> int:
-        """Return the number of components of a section state that are no codes."""
-        if not self.model.is_wheel:
-            return len(self.gait_state)
-        return int(self.model.count_continuous_section_entries(self.params))
-
-    def __post_init__(self) -> None:
-        self.n_walkers_per_group = 1 << (-(-self.n_walkers // self.n_groups) - 1).bit_length()
-        self.n_walkers = self.n_groups * self.n_walkers_per_group
-        self.n_steps = 0
-        # total weight of walks that failed, by outcome and number of legs that had their turn
-        self.weight_by_outcome: Any = collections.Counter()
-        self.restart_at_gait()
-
-    def run_walks(
-        self, ground_deviations: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, StepBatchResult]:
-        """Return whether walks fail in their last step, whether they fail, and their results.
-
-        The walks begin at the current states of the walkers. Walk i begins at walker i modulo the
-        number of walkers.
-
-        - `ground_deviations`: standardized deviations of the slopes or heights on which the wheels
-          land, shape (walks, lines).
-        """
-        walker_indices = np.arange(len(ground_deviations)) % self.n_walkers
-        walk_results = self.run_walks_with_changes(
-            self.params, self.states[walker_indices], self.ground[walker_indices], ground_deviations
-        )
-        has_failed = walk_results.outcome != Outcome.STEPPED
-        self.n_steps += int(np.sum(walk_results.n_stepped) + np.sum(has_failed))
-        is_in_last_step = walk_results.n_stepped >= ground_deviations.shape[1] - self.leg_period
-        return has_failed & is_in_last_step, has_failed, walk_results
-
-    def run_walks_with_changes(
-        self,
-        params: Any,
-        section_states: np.ndarray,
-        start_ground: np.ndarray,
-        ground_deviations: np.ndarray,
-    ) -> StepBatchResult:
-        """Return the results of walks of the wheel `params` from given states on given ground."""
-        ground = np.concatenate([start_ground, self.compute_ground(params, ground_deviations)], 1)
-        heights = ground if self.has_heights else None
-        if heights is None and not self.model.is_wheel:
-            params = replace_tree_parameter(params, self.model.ground["slope"], ground[:, 1:])
-        elif heights is None:
-            params = eqx.tree_at(lambda wheel_on_lines: wheel_on_lines.slope, params, ground)
-        return step_batch(
-            params,
-            section_states,
-            ground_deviations.shape[1],
-            model=self.model,
-            options=self.step_options,
-            heights=heights,
-        )
-
-    def compute_ground(self, params: Any, ground_deviations: np.ndarray) -> np.ndarray:
-        """Return slopes (rad) or heights (m) for their standardized deviations."""
-        mean = 0.0
-        if not self.has_heights:
-            name = "slope" if self.model.is_wheel else self.model.ground["slope"]
-            mean = float(jax.tree.leaves(params)[find_tree_parameter(params, name)])
-        return mean + self.ground_sd * ground_deviations
-
-    def run_biased_walks(
-        self, walk_density: GaussianMixture, slope_deviations: np.ndarray
-    ) -> np.ndarray:
-        """Return the failure weights of one walk from every walker, shape (walkers,).
-
-        The weight of a walk is the likelihood ratio if the walk fails in its last step, and 0
-        otherwise. The mean weight is the probability of a failure in the last step.
-
-        - `walk_density`: density from which the slope deviations are drawn;
-        - `slope_deviations`: standardized deviations of the slopes, shape (walkers, lines).
-        """
-        has_failed_in_last_step, _, walk_results = self.run_walks(slope_deviations)
-        nominal_density = GaussianMixture.make_isotropic_gaussian(slope_deviations.shape[1], 1.0)
-        likelihood_ratios = np.exp(
-            nominal_density.compute_log_density(slope_deviations)
-            - walk_density.compute_log_density(slope_deviations)
-        )
-        failure_importance_weights = np.where(has_failed_in_last_step, likelihood_ratios, 0.0)
-        self.add_failure_weights(walk_results, failure_importance_weights)
-        return failure_importance_weights
-
-    def add_failure_weights(self, walk_results: StepBatchResult, walk_weights: np.ndarray) -> None:
-        """Add the weights of failed walks to `weight_by_outcome`."""
-        turns = walk_results.n_stepped % self.leg_period
-        for turn in range(self.leg_period):
-            weights = np.where(turns == turn, walk_weights, 0.0)
-            for outcome_code in np.unique(walk_results.outcome[weights > 0.0]):
-                outcome_weight = float(np.sum(weights[walk_results.outcome == outcome_code]))
-                self.weight_by_outcome[int(outcome_code), turn] += outcome_weight
-
-    def compute_mean_last_turn(self) -> float:
-        """Return the mean number of steps without failure since the legs began their turns."""
-        total = self.weight_by_outcome.total()
-        turns = (turn * weight for (_, turn), weight in self.weight_by_outcome.items())
-        return sum(turns) / total if total else 0.0
-
-    def restart_at_gait(self) -> None:
-        """Reset all walkers to the section state of the gait, on a line of the mean slope, or from
-        the mean line to a foothold of random height.
-        """
-        self.states = np.tile(self.gait_state, (self.n_walkers, 1))
-        start_deviations = np.zeros(
-            (self.n_walkers, 1 + (self.has_heights and self.model.is_wheel))
-        )
-        if self.has_heights:
-            start_deviations[:, -1] = self.random.standard_normal(self.n_walkers)
-        self.ground = self.compute_ground(self.params, start_deviations)
-
-    def stack_states_and_ground(self) -> np.ndarray:
-        """Return section states with the ground as last components, shape (walkers, components)."""
-        return np.concatenate([self.states, self.ground], 1)
-
-    def compute_step_distances(self, states_after_step: np.ndarray) -> np.ndarray:
-        """Return the distance of each step along the mean slope, m; NaN for a walker of the user.
-
-        - `states_after_step`: as in `StepTransition`, shape (steps, components).
-        """
-        if not self.model.is_wheel:
-            return np.full(len(states_after_step), np.nan)
-        foot_distances = np.asarray(
-            self.model.compute_foot_distance(
-                self.params, jnp.asarray(states_after_step[:, : self.states.shape[1]].T)
-            )
-        )
-        if self.has_heights:
-            rises = states_after_step[:, -1] - states_after_step[:, -2]
-            return np.sqrt(foot_distances**2 - rises**2)
-        return foot_distances * np.cos(states_after_step[:, -1] - float(self.params.slope))
-
-    def step_and_replace_failures(self) -> StepTransition:
-        """Simulate one gait step of every walker, and replace walkers that fail by copies of
-        survivors.
-
-        Raise `ExtinctGroupError` if no walker of a group survived.
-        """
-        states_before_step = self.stack_states_and_ground()
-        ground_deviations = self.random.standard_normal((self.n_walkers, self.leg_period))
-        _, has_failed, walk_results = self.run_walks(ground_deviations)
-        self.add_failure_weights(walk_results, has_failed.astype(float))
-        step_distances = self.measure_step_distances(
-            ground_deviations, walk_results.section_state, ~has_failed
-        )
-        source_indices = np.arange(self.n_walkers).reshape(self.n_groups, -1)
-        for indices_of_group, has_walk_failed in zip(
-            source_indices, has_failed.reshape(source_indices.shape), strict=True
-        ):
-            if np.all(has_walk_failed):
-                raise ExtinctGroupError
-            indices_of_group[has_walk_failed] = self.random.choice(
-                indices_of_group[~has_walk_failed], np.sum(has_walk_failed)
-            )
-        self.states = walk_results.section_state[source_indices.ravel()]
-        ground = np.concatenate(
-            [self.ground, self.compute_ground(self.params, ground_deviations)], 1
-        )
-        self.ground = ground[source_indices.ravel(), self.leg_period :]
-        return StepTransition(
-            states_before_step,
-            ~has_failed,
-            ground_deviations,
-            self.stack_states_and_ground(),
-            step_distances,
-            walk_results.n_stepped,
-        )
-
-    def measure_step_distances(
-        self, ground_deviations: np.ndarray, end_states: np.ndarray, is_alive: np.ndarray
-    ) -> np.ndarray:
-        """Return the mean distance of the steps of each walker, 0 for those that fail, m."""
-        distances = np.zeros(len(is_alive))
-        for k in range(1, self.leg_period + 1):
-            # JAX compiles for each number of walkers, so that those that failed are included.
-            states, deviations = end_states, ground_deviations[:, :k]
-            if k < self.leg_period:
-                walks = self.run_walks_with_changes(
-                    self.params, *(x[is_alive] for x in (self.states, self.ground, deviations))
-                )
-                states = replace_rows(end_states, is_alive, walks.section_state)
-            ground = np.concatenate([self.ground, self.compute_ground(self.params, deviations)], 1)
-            with np.errstate(invalid="ignore"):
-                walked = self.compute_step_distances(np.concatenate([states, ground], 1))
-            distances += np.where(is_alive, walked, 0.0)
-        return distances / self.leg_period
-
-    def advance_without_counting(self, n_steps: int = 1) -> collections.Counter:
-        """Advance all walkers by `n_steps` gait steps, and return their failures by outcome.
-
-        The failures are not added to `weight_by_outcome`.
-        """
-        weight_by_outcome, self.weight_by_outcome = self.weight_by_outcome, collections.Counter()
-        for _ in range(n_steps):
-            self.step_and_replace_failures()
-        n_failures, self.weight_by_outcome = self.weight_by_outcome, weight_by_outcome
-        return n_failures
-
-
 def sample_passage(
-    walker_groups: WalkerGroups,
-    spectral_radius: float,
-    relative_tolerance: float,
-    max_steps: int,
+    walker_groups: WalkerGroups, spectral_radius: float, relative_tolerance: float, max_steps: int
 ) -> SampledPassage:
     """Return first-passage times, estimated from walks of groups of walkers.
 
@@ -445,7 +163,6 @@ def sample_passage(
         count_decay_steps(walker_groups.negligible_ground_line_effect, spectral_radius),
         MAX_BIASED_GROUND_LINES // leg_period,
     )
-    n_biased_ground_lines = leg_period * n_biased_steps
     max_start_effect = MAX_START_EFFECT_PER_TOL * relative_tolerance
     n_forgetting_steps = int(
         np.clip(
@@ -462,18 +179,14 @@ def sample_passage(
         late_transitions = step_transitions[-max(N_KAPPA_2_STEPS, n_forgetting_steps // 2) :]
         kappa_1 = float(np.mean([transition.is_walker_alive for transition in late_transitions]))
         kappa_2 = _estimate_kappa_2(
-            late_transitions,
-            walker_groups.n_continuous_entries,
-            walker_groups.ground.shape[1],
+            late_transitions, walker_groups.n_continuous_entries, walker_groups.ground.shape[1]
         )
         # The effect of the start, divided by the survival probability, decays by this factor.
         start_effect_factor = 1.0 if np.isnan(kappa_2) else max(kappa_2 / kappa_1, spectral_radius)
         n_decay_steps = count_decay_steps(max_start_effect, start_effect_factor) + 1
         # The number of steps is at most doubled, because more transitions improve kappa_2.
         n_required_steps = min(
-            n_decay_steps - n_biased_steps,
-            MAX_FORGETTING_STEPS,
-            2 * n_forgetting_steps,
+            n_decay_steps - n_biased_steps, MAX_FORGETTING_STEPS, 2 * n_forgetting_steps
         )
         if n_required_steps <= n_forgetting_steps:
             break
@@ -482,7 +195,6 @@ def sample_passage(
             n_completed_steps += surviving_fraction * np.mean(step_transitions[-1].n_stepped)
             surviving_fraction *= np.mean(step_transitions[-1].is_walker_alive)
     walker_groups.weight_by_outcome.clear()
-    walk_density = GaussianMixture.make_isotropic_gaussian(n_biased_ground_lines, 1.0)
     estimate_probability = functools.partial(
         _estimate_failure_probability,
         walker_groups,
@@ -490,43 +202,17 @@ def sample_passage(
         relative_tolerance=relative_tolerance,
         max_steps=max_steps,
     )
-    count_failures = lambda: (~walker_groups.step_and_replace_failures().is_walker_alive).astype(
-        float
-    )
-    failure_probability, relative_error, start_effect = 0.0, np.inf, 0.0
     n_effective_lines = count_decay_steps(
         walker_groups.negligible_ground_line_effect, start_effect_factor
     )
     n_failures_over_lines = n_effective_lines * np.mean(~step_transitions[-1].is_walker_alive)
-    are_failures_counted = n_failures_over_lines > MIN_FAILURES_FOR_COUNTING
-    if not are_failures_counted:
-        failure_density = fit_failure_density(
-            lambda slope_deviations: walker_groups.run_walks(slope_deviations)[:2],
-            n_biased_ground_lines,
-            walker_groups.random,
-            max_walks_per_stage=walker_groups.n_walkers,
-        )
-        if failure_density is not None:
-            walk_density = failure_density
-            failure_probability, relative_error, start_effect = estimate_probability(
-                _make_weight_sampler(walker_groups, walk_density),
-                n_biased_steps,
-                advance_walkers=walker_groups.advance_without_counting,
-            )
-            if np.isfinite(relative_error) and _has_missed_failures(
-                walker_groups, failure_probability * (1.0 + relative_error)
-            ):
-                relative_error = np.inf
-        n_expected_failures = failure_probability * (max_steps - walker_groups.n_steps)
-        are_failures_counted = (
-            not np.isfinite(relative_error)
-            and n_expected_failures > walker_groups.min_effective_failures
-        )
-    if are_failures_counted:
-        walker_groups.weight_by_outcome.clear()
-        failure_probability, relative_error, start_effect = estimate_probability(
-            count_failures, 1, are_walkers_advanced=True
-        )
+    failure_probability, relative_error, start_effect, walk_density = _weigh_or_count_failures(
+        walker_groups,
+        estimate_probability,
+        leg_period * n_biased_steps,
+        n_failures_over_lines > MIN_FAILURES_FOR_COUNTING,
+        max_steps,
+    )
     if np.isnan(kappa_2):
         relative_error = np.inf
     mean_step_distance, step_distance_error = _estimate_step_distance(
@@ -561,6 +247,52 @@ def sample_passage(
     )
 
 
+def _weigh_or_count_failures(
+    walker_groups: WalkerGroups,
+    estimate_probability: Callable,
+    n_ground_lines: int,
+    is_failure_frequent: Any,
+    max_steps: int,
+) -> tuple[float, float, float, GaussianMixture]:
+    """Return the result of `_estimate_failure_probability`, and the density of sampled walks.
+
+    Frequent failures are counted, and rare ones are made frequent by importance sampling. If its
+    error is unknown, failures are counted too, if enough of them are expected.
+    """
+    density = GaussianMixture.make_isotropic_gaussian(n_ground_lines, 1.0)
+    probability, error, start_effect = 0.0, np.inf, 0.0
+    if not is_failure_frequent:
+        failure_density = fit_failure_density(
+            lambda deviations: walker_groups.run_walks(deviations)[:2],
+            n_ground_lines,
+            walker_groups.random,
+            max_walks_per_stage=walker_groups.n_walkers,
+        )
+        if failure_density is not None:
+            density = failure_density
+            probability, error, start_effect = estimate_probability(
+                _make_weight_sampler(walker_groups, density),
+                n_ground_lines // walker_groups.leg_period,
+                advance_walkers=walker_groups.advance_without_counting,
+            )
+            if np.isfinite(error) and _has_missed_failures(
+                walker_groups, probability * (1.0 + error)
+            ):
+                error = np.inf
+        n_expected_failures = probability * (max_steps - walker_groups.n_steps)
+        is_failure_frequent = (
+            not np.isfinite(error) and n_expected_failures > walker_groups.min_effective_failures
+        )
+    if is_failure_frequent:
+        walker_groups.weight_by_outcome.clear()
+        probability, error, start_effect = estimate_probability(
+            lambda: 1.0 - walker_groups.step_and_replace_failures().is_walker_alive,
+            1,
+            are_walkers_advanced=True,
+        )
+    return probability, error, start_effect, density
+
+
 def _estimate_failure_probability(
     walker_groups: WalkerGroups,
     failure_weight_sampler: Callable[[], np.ndarray],
@@ -592,99 +324,76 @@ def _estimate_failure_probability(
       follows the first error tests, because rounds from the same starts cannot reduce the part of
       the error that is due to the choice of these starts.
     """
-    from scipy import stats  # This import is slow.
-
-    first_fractions = FIRST_ERROR_TEST_FRACTIONS
-
-    def compute_student_t_quantile(error_test_number: int) -> float:
-        n_later_tests = error_test_number - len(first_fractions)
-        miss_fraction = (
-            (1.0 - sum(first_fractions)) / 2.0**n_later_tests
-            if n_later_tests > 0
-            else first_fractions[error_test_number - 1]
-        )
-        miss_probability = (1.0 - CONFIDENCE_LEVEL) * miss_fraction
-        return float(stats.t.isf(0.5 * miss_probability, walker_groups.n_groups - 1))
-
-    weight_sum_by_group, n_sampling_rounds = np.zeros(walker_groups.n_groups), 0
-    weight_moments = np.zeros(3)
+    n_groups = walker_groups.n_groups
+    weight_sum_by_group, n_rounds, weight_moments = np.zeros(n_groups), 0, np.zeros(3)
     failure_probability, relative_error = 0.0, np.inf
-    start_effect_factor, n_steps_before_walks = start_effect_decay
-    start_effect = start_effect_factor ** (n_steps_before_walks + n_ground_lines)
+    start_effect_factor, n_decay_steps = start_effect_decay
+    n_decay_steps += n_ground_lines
+    start_effect = start_effect_factor**n_decay_steps
     n_error_tests, n_rounds_at_error_test = 0, MIN_SAMPLING_ROUNDS
-    while n_sampling_rounds == 0 or (
+    while n_rounds == 0 or (
         relative_error > relative_tolerance and walker_groups.n_steps < max_steps
     ):
-        while n_sampling_rounds < n_rounds_at_error_test and (
-            n_sampling_rounds < MIN_SAMPLING_ROUNDS or walker_groups.n_steps < max_steps
+        while n_rounds < n_rounds_at_error_test and (
+            n_rounds < MIN_SAMPLING_ROUNDS or walker_groups.n_steps < max_steps
         ):
             report_progress(f"{walker_groups.n_walkers:,} walks of {walker_groups.n_steps:,} steps")
-            if n_error_tests >= len(first_fractions):
+            if n_error_tests >= len(FIRST_ERROR_TEST_FRACTIONS):
                 advance_walkers()
-            walk_weights = failure_weight_sampler()
-            weight_sum_by_group += walk_weights.reshape(walker_groups.n_groups, -1).mean(1)
-            weight_moments += (
-                np.sum(walk_weights),
-                np.sum(walk_weights**2),
-                np.sum(walk_weights > 0.0),
-            )
-            n_sampling_rounds += 1
-        failure_weight_sum, squared_weight_sum, n_failing_walks = weight_moments
-        n_rounds_at_error_test = 2 * n_sampling_rounds
-        if failure_weight_sum == 0.0:
+            weights = failure_weight_sampler()
+            weight_sum_by_group += weights.reshape(n_groups, -1).mean(1)
+            weight_moments += np.sum(weights), np.sum(weights**2), np.sum(weights > 0.0)
+            n_rounds += 1
+        weight_sum, squared_weight_sum, n_failing_walks = weight_moments
+        n_rounds_at_error_test = 2 * n_rounds
+        if weight_sum == 0.0:
             continue
-        last_step_failure_probability = float(np.mean(weight_sum_by_group)) / n_sampling_rounds
+        mean_sum = np.mean(weight_sum_by_group)
         failure_probability, error_amplification = _solve_failure_probability(
-            last_step_failure_probability, n_ground_lines
+            float(mean_sum) / n_rounds, n_ground_lines
         )
-        n_effective_failures = failure_weight_sum**2 / squared_weight_sum
+        n_effective_failures = weight_sum**2 / squared_weight_sum
         if n_effective_failures < (MIN_EFFECTIVE_FAILURE_FRACTION * n_failing_walks):
             return failure_probability, np.inf, start_effect
         if n_effective_failures < walker_groups.min_effective_failures:
             continue
         n_error_tests += 1
-        relative_standard_error = (
-            error_amplification
-            * np.std(weight_sum_by_group, ddof=1)
-            / np.sqrt(walker_groups.n_groups)
-            / np.mean(weight_sum_by_group)
+        standard_error = (
+            error_amplification * np.std(weight_sum_by_group, ddof=1) / np.sqrt(n_groups) / mean_sum
         )
         if are_walkers_advanced:
-            start_effect = float(
-                np.mean(
-                    start_effect_factor
-                    ** (n_steps_before_walks + n_ground_lines + np.arange(n_sampling_rounds))
-                )
-            )
-        relative_error = float(
-            compute_student_t_quantile(n_error_tests) * relative_standard_error + start_effect
+            start_effects = start_effect_factor ** (n_decay_steps + np.arange(n_rounds))
+            start_effect = float(np.mean(start_effects))
+        quantile, next_quantile = (
+            _compute_student_t_quantile(n, n_groups) for n in (n_error_tests, n_error_tests + 1)
         )
+        relative_error = float(quantile * standard_error + start_effect)
         tolerated_sampling_error = relative_tolerance - start_effect
-        can_start_effect_decay = are_walkers_advanced and start_effect_factor < 1.0
-        if tolerated_sampling_error <= 0.0 and not can_start_effect_decay:
-            break
         if tolerated_sampling_error > 0.0:
-            sampling_error_ratio = (
-                compute_student_t_quantile(n_error_tests + 1)
-                * relative_standard_error
-                / tolerated_sampling_error
-            )
-            n_rounds_at_error_test = int(
-                np.ceil(
-                    n_sampling_rounds
-                    * max(
-                        N_ROUNDS_SAFETY_FACTOR * sampling_error_ratio**2,
-                        MIN_ROUND_COUNT_RATIO,
-                    )
-                )
-            )
+            error_ratio = next_quantile * standard_error / tolerated_sampling_error
+            growth = max(N_ROUNDS_SAFETY_FACTOR * error_ratio**2, MIN_ROUND_COUNT_RATIO)
+            n_rounds_at_error_test = int(np.ceil(n_rounds * growth))
+        elif not (are_walkers_advanced and start_effect_factor < 1.0):
+            break
     return failure_probability, relative_error, start_effect
 
 
+def _compute_student_t_quantile(error_test_number: int, n_groups: int) -> float:
+    """Return the half width of the interval of an error test, in standard errors."""
+    from scipy import stats  # This import is slow.
+
+    fractions = FIRST_ERROR_TEST_FRACTIONS
+    n_later_tests = error_test_number - len(fractions)
+    miss_fraction = (
+        (1.0 - sum(fractions)) / 2.0**n_later_tests
+        if n_later_tests > 0
+        else fractions[error_test_number - 1]
+    )
+    return float(stats.t.isf(0.5 * (1.0 - CONFIDENCE_LEVEL) * miss_fraction, n_groups - 1))
+
+
 def _step_until_start_is_forgotten(
-    walker_groups: WalkerGroups,
-    n_steps: int,
-    relative_tolerance: float,
+    walker_groups: WalkerGroups, n_steps: int, relative_tolerance: float
 ) -> tuple[float, float, list[StepTransition]]:
     """Return the fraction of walks from the gait that survive, the mean number of steps that they
     complete, and the transitions of the walkers.

@@ -30,8 +30,13 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import format_quantity
-from vrw_jax.studies.store_integrity import read_scan_manifest
 from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES
+
+JsonObject = dict[str, Any]
+"""Object of JSON: settings, attributes or metadata by name."""
+
+MANIFEST_ATTRIBUTE = "scan"
+"""Name of the attribute of a store that contains the settings of the scan."""
 
 ParameterSamples = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
@@ -205,9 +210,7 @@ def _parse_value_columns(
 
 
 def grid(
-    values: Mapping[str, ParameterValues] | None = None,
-    /,
-    **parameters: ParameterValues,
+    values: Mapping[str, ParameterValues] | None = None, /, **parameters: ParameterValues
 ) -> SampleDesign:
     """Return the design that contains every combination of parameter values.
 
@@ -237,9 +240,7 @@ def grid(
 
 
 def samples(
-    values: Mapping[str, ParameterValues] | None = None,
-    /,
-    **parameters: ParameterValues,
+    values: Mapping[str, ParameterValues] | None = None, /, **parameters: ParameterValues
 ) -> SampleDesign:
     """Return the design that contains a list of samples, such as `samples({"damping": [100],
     "slope": [0.29]})`.
@@ -404,6 +405,17 @@ def _draw_box_samples(
     return SampleDesign(dict(zip(ranges, columns, strict=True)), kind)
 
 
+def read_scan_manifest(
+    store_attributes: Any, attribute_name: str = MANIFEST_ATTRIBUTE
+) -> JsonObject:
+    """Return the settings of the scan from the attributes of a store or a labeled result.
+
+    - `attribute_name`: attribute that contains the table; by default that of the settings.
+    """
+    stored_table = store_attributes.get(attribute_name, {})
+    return dict(json.loads(stored_table) if isinstance(stored_table, str) else stored_table)
+
+
 MIN_SALTELLI_ROWS = 64
 """Smallest number of rows of a `saltelli` design, chosen because indices from fewer rows are noise.
 """
@@ -446,8 +458,7 @@ def sobol_indices(
         measures: names of variables of the scan.
 
     Returns:
-        A dataset that contains `first_order`, `total`, the bounds of their intervals and
-        `is_constant_measure`.
+        A dataset of `first_order`, `total`, the bounds of their intervals, `is_constant_measure`.
 
     Raises:
         TypeError, ValueError: if an argument is invalid, if too few rows remain, or if the samples
@@ -460,97 +471,83 @@ def sobol_indices(
         [0.8, 0.2]
     """
     check_type("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
-    design_settings = read_scan_manifest(scan.attrs).get("design", {})
-    if design_settings.get("kind") != SALTELLI_DESIGN_KIND:
+    design = read_scan_manifest(scan.attrs).get("design", {})
+    if design.get("kind") != SALTELLI_DESIGN_KIND:
         raise ValueError(
-            f"the scan's samples are of kind {design_settings.get('kind')!r}, but Sobol' indices "
+            f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices "
             "need those of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
         )
-    swept_parameters = list(design_settings["swept"])
     measure_names = list(check_names("measures", measures))
-    for measure_name in ("outcome", *measure_names):
-        if measure_name not in scan or scan[measure_name].dims != ("sample",):
+    for name in ("outcome", *measure_names):
+        if name not in scan or scan[name].dims != ("sample",):
             raise ValueError(
-                f"{measure_name!r} is no measure of this "
-                f"scan{format_name_suggestion(measure_name, map(str, scan))}: ask for one that was "
-                "scanned."
+                f"{name!r} is no measure of this scan{format_name_suggestion(name, map(str, scan))}"
+                ": ask for one that was scanned."
             )
-    sample_positions = _locate_design_samples(scan, swept_parameters, design_settings["shape"][0])
-    is_present = sample_positions >= 0
-    has_gait = is_present & (scan.outcome.values[sample_positions] == Outcome.STEPPED)
-    measure_values = np.stack(
-        [scan[measure_name].values[sample_positions] for measure_name in measure_names], axis=1
-    )
-    is_missing = has_gait[:, None] & ~np.isfinite(measure_values)
-    is_complete_row = has_gait.all(axis=0) & ~is_missing.any(axis=(0, 1))
-    complete_rows = np.flatnonzero(is_complete_row)
-    n_saltelli_rows = (1 << len(complete_rows).bit_length()) >> 1  # largest power of 2, or 0
-    missing_sample_counts = {"absent": is_present.size - is_present.sum()} | {
-        f"NaN or infinite in {measure_name}": n_missing
-        for measure_name, n_missing in zip(measure_names, is_missing.sum(axis=(0, 2)), strict=True)
-    }
-    missing_samples_text = ", ".join(
-        f"{n_missing:,} {reason}"
-        for reason, n_missing in missing_sample_counts.items()
-        if n_missing
-    )
-    if n_saltelli_rows < MIN_SALTELLI_ROWS:
-        samples_note = f" (samples: {missing_samples_text})" if missing_samples_text else ""
+    positions = _locate_design_samples(scan, design["swept"], design["shape"][0])
+    is_present = positions >= 0
+    has_gait = is_present & (scan.outcome.values[positions] == Outcome.STEPPED)
+    values = np.stack([scan[name].values[positions] for name in measure_names], axis=1)
+    is_missing = has_gait[:, None] & ~np.isfinite(values)
+    is_complete = has_gait.all(axis=0) & ~is_missing.any(axis=(0, 1))
+    complete_rows = np.flatnonzero(is_complete)
+    n_rows = (1 << len(complete_rows).bit_length()) >> 1  # largest power of 2, or 0
+    reasons = "absent", *(f"NaN or infinite in {name}" for name in measure_names)
+    counts = np.sum(~is_present), *is_missing.sum(axis=(0, 2))
+    missing_text = ", ".join(f"{n:,} {x}" for n, x in zip(counts, reasons, strict=True) if n)
+    if n_rows < MIN_SALTELLI_ROWS:
         raise ValueError(
-            f"only {len(complete_rows)} of {len(is_complete_row)} rows walk "
-            f"throughout{samples_note}, but indices need {MIN_SALTELLI_ROWS}: narrow "
-            "the ranges to where there are gaits, or take more rows."
+            f"only {len(complete_rows)} of {len(is_complete)} rows walk throughout"
+            f"{f' (samples: {missing_text})' if missing_text else ''}, but indices need "
+            f"{MIN_SALTELLI_ROWS}: narrow the ranges to where there are gaits, or take more rows."
         )
-    if missing_samples_text:
+    if missing_text:
         warnings.warn(
-            f"of {is_present.size:,} samples, {missing_samples_text}: their rows are omitted, and "
-            f"the indices are those of {n_saltelli_rows:,} of {len(is_complete_row):,} rows.",
+            f"of {is_present.size:,} samples, {missing_text}: their rows are omitted, and "
+            f"the indices are those of {n_rows:,} of {len(is_complete):,} rows.",
             stacklevel=2,
         )
-    measure_values = measure_values[..., complete_rows[:n_saltelli_rows]]
-
-    random_generator = np.random.default_rng(0)  # The same scan gives the same intervals.
-    roundoff_spreads = MAX_ROUNDOFF_SPREAD * np.abs(measure_values).max(axis=(0, 2))
-    sobol_index_estimates = _estimate_sobol_indices(measure_values, roundoff_spreads)
-    resampled_index_estimates = [
-        _estimate_sobol_indices(
-            measure_values[..., random_generator.integers(0, n_saltelli_rows, n_saltelli_rows)],
-            roundoff_spreads,
+    variables = _compute_index_variables(values[..., complete_rows[:n_rows]])
+    is_constant = variables["is_constant_measure"][1]
+    if is_constant.any():
+        warnings.warn(
+            f"{', '.join(np.array(measure_names)[is_constant])}: constant over these samples but "
+            "for round-off, so that there is no variance to share, and the indices are 0.",
+            stacklevel=2,
         )
+    return xr.Dataset(
+        variables,
+        {"measure": measure_names, "parameter": design["swept"]},
+        {"rows": n_rows, "left_out": 1.0 - len(complete_rows) / len(is_complete)},
+    )
+
+
+def _compute_index_variables(values: np.ndarray) -> dict[str, tuple]:
+    """Return the variables of `sobol_indices` for the measures of complete rows.
+
+    - `values`: measures of the samples, shape (2 + parameters, measures, rows).
+    """
+    random, n_rows = np.random.default_rng(0), values.shape[-1]  # equal intervals for equal scans
+    roundoff_spreads = MAX_ROUNDOFF_SPREAD * np.abs(values).max(axis=(0, 2))
+    resampled = [
+        _estimate_sobol_indices(values[..., random.integers(0, n_rows, n_rows)], roundoff_spreads)
         for _ in range(N_BOOTSTRAP_RESAMPLES)
     ]
-    lower_bounds, upper_bounds = np.quantile(
-        resampled_index_estimates, CONFIDENCE_INTERVAL_QUANTILES, axis=0
-    )
-    is_constant_measure = _detect_constant_measures(measure_values, roundoff_spreads)
-    if is_constant_measure.any():
-        warnings.warn(
-            f"{', '.join(np.array(measure_names)[is_constant_measure])}: constant over these "
-            "samples but for round-off, so that there is no variance to share, and the indices are "
-            "0.",
-            stacklevel=2,
-        )
+    lower, upper = np.quantile(resampled, CONFIDENCE_INTERVAL_QUANTILES, axis=0)
+    estimates = _estimate_sobol_indices(values, roundoff_spreads)
+    tables = {"": estimates, "_lower": lower, "_upper": upper}
     variables: dict[str, tuple] = {
         f"{name}{suffix}": (
             ("measure", "parameter"),
-            values[i],
+            table[i],
             {"units": "1", "long_name": f"{name.replace('_', '-')} Sobol' index"},
         )
         for i, name in enumerate(("first_order", "total"))
-        for suffix, values in (
-            ("", sobol_index_estimates), ("_lower", lower_bounds), ("_upper", upper_bounds),
-        )
-    }  # fmt: skip
-    variables["is_constant_measure"] = (
-        "measure",
-        is_constant_measure,
-        {"long_name": "varies by round-off alone"},
-    )
-    return xr.Dataset(
-        variables,
-        {"measure": measure_names, "parameter": swept_parameters},
-        {"rows": n_saltelli_rows, "left_out": 1.0 - len(complete_rows) / len(is_complete_row)},
-    )
+        for suffix, table in tables.items()
+    }
+    is_constant = _detect_constant_measures(values, roundoff_spreads)
+    description = {"long_name": "varies by round-off alone"}
+    return variables | {"is_constant_measure": ("measure", is_constant, description)}
 
 
 def _locate_design_samples(

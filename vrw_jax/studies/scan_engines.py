@@ -35,12 +35,8 @@ from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.gaits.collocation_finder import KinkedGaitFinder
 from vrw_jax.gaits.finder import MeasureReader, confirm_outcome_by_step, evaluate_on_gaits
-from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.further_search import (
-    MAX_UNREFINED_MESH_ERROR,
-    MeshSearch,
-    search_further,
-)
+from vrw_jax.gaits.further_search import MAX_UNREFINED_MESH_ERROR, MeshSearch, search_further
+from vrw_jax.gaits.gait_search import make_finder
 from vrw_jax.gaits.gait_walks import find_slow_gaits
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_sequence import CollocationState
@@ -66,7 +62,7 @@ from vrw_jax.studies.measure_catalog import (
     parse_derivative,
 )
 from vrw_jax.studies.scan_design import ParameterSamples
-from vrw_jax.studies.tolerance_request import measure_to_tolerance
+from vrw_jax.studies.tolerances import measure_to_tolerance
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_NAMES,

@@ -36,10 +36,11 @@ from vrw_jax.branches.special_point_curves import (
 )
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.models.registry import describe_accepted_models
+from vrw_jax.models.ladder import describe_accepted_models
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
-from vrw_jax.studies.scan_design import ParameterSamples, SampleDesign
+from vrw_jax.studies.scan_design import MANIFEST_ATTRIBUTE, ParameterSamples, SampleDesign
 from vrw_jax.studies.scan_planning import (
+    PROVENANCE_ATTRIBUTE,
     ChunkExecutor,
     ChunkResult,
     ScanPlan,
@@ -48,14 +49,12 @@ from vrw_jax.studies.scan_planning import (
     plan_scan,
 )
 from vrw_jax.studies.scan_store import (
-    PROVENANCE_ATTRIBUTE,
     MemoryResultStore,
     ResultStore,
     ZarrResultStore,
     create_empty_store,
     read_stored_manifest,
 )
-from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE
 from vrw_jax.wheel.params import WheelParams
 
 ProgressCallback = Callable[["ScanProgress"], None]

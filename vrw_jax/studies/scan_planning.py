@@ -5,6 +5,7 @@ that identify the scan.
 from __future__ import annotations
 
 import json
+import math
 import platform
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -22,17 +23,13 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure, find_own_measures, name_measures
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.walker import check_parameters, is_own_walker
-from vrw_jax.gaits.finder_selection import make_finder
+from vrw_jax.gaits.gait_search import make_finder
 from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.walker_finder import ParameterizedWalker, make_walker_finder
 from vrw_jax.lanes.disk_cache import compute_source_digest
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
-from vrw_jax.models.measures import (
-    MARGIN_MEASURES,
-    describe_parameter,
-    make_locked_leg_coordinate,
-)
-from vrw_jax.models.registry import collect_provenance_attributes, describe_accepted_models
+from vrw_jax.models.ladder import collect_provenance_attributes, describe_accepted_models
+from vrw_jax.models.measures import MARGIN_MEASURES, describe_parameter, make_locked_leg_coordinate
 from vrw_jax.models.stepping import (
     convert_model_argument,
     convert_step_options,
@@ -50,16 +47,20 @@ from vrw_jax.studies.measure_catalog import (
     parse_derivative,
     select_measure_catalog,
 )
-from vrw_jax.studies.scan_design import ParameterSamples, SampleDesign
-from vrw_jax.studies.scan_engines import EvaluationRequest, SampleEvaluator, make_scan_engine
-from vrw_jax.studies.scan_store import (
-    PROVENANCE_ATTRIBUTE,
-    REQUESTED_MEASURES_ATTRIBUTE,
-    ResultLayout,
-    choose_chunk_shape,
+from vrw_jax.studies.scan_design import (
+    MANIFEST_ATTRIBUTE,
+    JsonObject,
+    ParameterSamples,
+    SampleDesign,
 )
-from vrw_jax.studies.store_integrity import MANIFEST_ATTRIBUTE, JsonObject
+from vrw_jax.studies.scan_engines import EvaluationRequest, SampleEvaluator, make_scan_engine
 from vrw_jax.wheel.params import FRICTION_NAME, LAW_NAMES, WheelParams, check_parameter_name
+
+PROVENANCE_ATTRIBUTE = "provenance"
+"""Name of the attribute of a store that describes the origin of the results."""
+
+REQUESTED_MEASURES_ATTRIBUTE = "asked"
+"""Name of the attribute of a store that lists the requested measures."""
 
 MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples in a scan.
@@ -113,6 +114,70 @@ ChunkExecutor = Callable[["ScanPlan", Sequence[int]], Iterator[ChunkResult]]
 """Function that computes the chunks with the given indices, and yields a `ChunkResult` for each
 chunk in any order.
 """
+
+
+ChunkRegion = tuple[slice, ...]
+"""Slices that select the samples of a chunk, one for each sample axis."""
+
+
+@dataclass(frozen=True)
+class ResultLayout:
+    """Description of a result: its sample axes, chunks, variables and coordinates.
+
+    The variables have the shape of the whole result and contain missing values, which occupy no
+    memory.
+    """
+
+    sample_shape: tuple[int, ...]
+    chunk_shape: tuple[int, ...]
+    empty_variables: Mapping[str, xr.Variable]
+    result_coordinates: Mapping[str, xr.Variable]
+
+    @property
+    def n_chunks(self) -> int:
+        """Return the number of chunks of the result."""
+        return math.prod(self._chunks_per_axis)
+
+    @property
+    def _chunks_per_axis(self) -> tuple[int, ...]:
+        n_chunks_by_axis = np.ceil(np.divide(self.sample_shape, self.chunk_shape))
+        return tuple(n_chunks_by_axis.astype(int).tolist())
+
+    def compute_chunk_region(self, chunk_index: int) -> ChunkRegion:
+        """Return the slices that select the samples of a chunk, one for each sample axis."""
+        chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
+        chunk_starts = np.multiply(chunk_indices, self.chunk_shape)
+        chunk_ends = np.minimum(chunk_starts + self.chunk_shape, self.sample_shape)
+        return tuple(map(slice, chunk_starts.tolist(), chunk_ends.tolist()))
+
+    def compute_chunk_sample_shape(self, chunk_index: int) -> tuple[int, ...]:
+        """Return the number of samples in a chunk along each sample axis.
+
+        A chunk at the end of an axis may be smaller than others.
+        """
+        return tuple(
+            chunk_slice.stop - chunk_slice.start
+            for chunk_slice in self.compute_chunk_region(chunk_index)
+        )
+
+    @property
+    def bytes_per_sample(self) -> int:
+        """Return the number of bytes that the uncompressed results of one sample occupy."""
+        n_bytes = sum(variable.nbytes for variable in self.empty_variables.values())
+        return n_bytes // math.prod(self.sample_shape)
+
+
+def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) -> tuple[int, ...]:
+    """Return the shape of chunks that contain at most `max_chunk_samples` samples.
+
+    A chunk spans the whole length of the last axes.
+    """
+    chunk_shape: list[int] = []
+    for axis_length in reversed(sample_shape):
+        chunk_length = min(axis_length, max_chunk_samples)
+        max_chunk_samples //= chunk_length  # It stays at least 1.
+        chunk_shape.insert(0, chunk_length)
+    return tuple(chunk_shape)
 
 
 @dataclass(frozen=True)
@@ -426,8 +491,7 @@ def _make_result_layout(
             return measure.variable_attributes
         parameter_name = derivative.parameter_name
         return derivative.describe_variable(
-            measure,
-            describe_parameter(parameter_name, domains[parameter_name]),
+            measure, describe_parameter(parameter_name, domains[parameter_name])
         )
 
     def make_empty_variable(variable_name: str) -> xr.Variable:
@@ -439,9 +503,7 @@ def _make_result_layout(
         if variable_name in MARGIN_MEASURES and MARGIN_MEASURES[variable_name].leg_dimension:
             dimension_names, shape = (*dimension_names, "leg"), (*shape, locked_leg_coordinate.size)
         return xr.Variable(
-            dimension_names,
-            np.broadcast_to(missing_value, shape),
-            describe_variable(variable_name),
+            dimension_names, np.broadcast_to(missing_value, shape), describe_variable(variable_name)
         )
 
     result_coordinates = design.make_result_coordinates()

@@ -2,9 +2,15 @@
 
 A store is a Zarr group with one array per variable, divided into the scan's chunks, so that
 `xarray.open_zarr` reads it. The store is built in a temporary folder, which is then renamed. The
-data of a chunk are written before its mark, which is a digest of the data (see `integrity`). Every
-file is written under a temporary name and renamed. Whenever the process dies, a chunk is therefore
-either marked and complete, or it is computed again.
+data of a chunk are written before its mark. Every file is written under a temporary name and
+renamed. Whenever the process dies, a chunk is therefore either marked and complete, or it is
+computed again.
+
+The mark of a chunk is a digest of the scan's settings, of the chunk's index and of the files that
+contain its variables. A mark states that the chunk is written, and reveals a damaged, truncated,
+deleted or moved file. All marks are in one Zarr group. The attributes of this group list the scan's
+variables, so that variables of other origin are ignored. The attributes also contain a copy of the
+store's attributes.
 """
 
 from __future__ import annotations
@@ -15,8 +21,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,96 +30,206 @@ import numpy as np
 from vrw_jax.base.checks import check_bool, check_path
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.studies.measure_catalog import ValuesByVariable, canonicalize_variable_name
-from vrw_jax.studies.store_integrity import (
-    CHECKSUM_ARRAY_NAME,
-    CHECKSUM_GROUP_NAME,
-    COORDINATE_DIGESTS_KEY,
-    DIGEST_SIZE_BYTES,
-    MANIFEST_ATTRIBUTE,
-    METADATA_FILE_NAME,
-    SCAN_VARIABLES_KEY,
-    STORE_ATTRIBUTES_KEY,
-    ZARR_READ_ERRORS,
-    JsonObject,
-    StoredMetadata,
-    add_attribute_seal,
-    compute_hex_digest,
-    digest_coordinate_values,
-    lock_store,
-    read_scan_manifest,
+from vrw_jax.studies.scan_design import MANIFEST_ATTRIBUTE, JsonObject, read_scan_manifest
+from vrw_jax.studies.scan_planning import (
+    PROVENANCE_ATTRIBUTE,
+    REQUESTED_MEASURES_ATTRIBUTE,
+    ResultLayout,
 )
 
-if TYPE_CHECKING:
-    import zarr
+CHECKSUM_GROUP_NAME = "bookkeeping"
+"""Name of the Zarr group that contains the marks of chunks. Users of the store do not see it."""
 
-PROVENANCE_ATTRIBUTE = "provenance"
-"""Name of the attribute of a store that describes the origin of the results."""
+CHECKSUM_ARRAY_NAME = "bookkeeping/digest"
+"""Name of the Zarr array that contains the marks of chunks."""
 
-REQUESTED_MEASURES_ATTRIBUTE = "asked"
-"""Name of the attribute of a store that lists the requested measures."""
+DIGEST_SIZE_BYTES = 16
+"""Size of a digest, bytes, chosen because the marks in existing stores have this size."""
 
-ChunkRegion = tuple[slice, ...]
-"""Slices that select the samples of a chunk, one for each sample axis."""
+SCAN_VARIABLES_KEY = "variables"
+"""Key of the scan's variable names, in the attributes of the Zarr group of marks."""
+
+STORE_ATTRIBUTES_KEY = "attributes"
+"""Key of the copy of the store's attributes, in the attributes of the Zarr group of marks."""
+
+COORDINATE_DIGESTS_KEY = "coordinates"
+"""Key of the digests of the coordinates, in the attributes of the Zarr group of marks."""
+
+ATTRIBUTE_SEAL_KEY = "seal"
+"""Key of the digest of all other attributes, in the attributes of the Zarr group of marks."""
+
+METADATA_FILE_NAME = "zarr.json"
+"""Name of the file that contains the metadata of a Zarr array or group."""
 
 
-@dataclass(frozen=True)
-class ResultLayout:
-    """Description of a result: its sample axes, chunks, variables and coordinates.
+def add_attribute_seal(chunk_mark_attributes: JsonObject) -> JsonObject:
+    """Return the attributes of the Zarr group of marks, with their digest added under
+    `ATTRIBUTE_SEAL_KEY`.
+    """
+    unsealed = {k: x for k, x in chunk_mark_attributes.items() if k != ATTRIBUTE_SEAL_KEY}
+    seal = compute_hex_digest(json.dumps(unsealed, sort_keys=True).encode())
+    return unsealed | {ATTRIBUTE_SEAL_KEY: seal}
 
-    The variables have the shape of the whole result and contain missing values, which occupy no
-    memory.
+
+def compute_store_digest(store_path: Path) -> str:
+    """Return a digest of the marks of all chunks of a store in hexadecimal digits.
+
+    It changes with every setting and every result of the scan.
+    """
+    mark_paths = sorted(filter(Path.is_file, (store_path / CHECKSUM_ARRAY_NAME).rglob("*")))
+    return compute_hex_digest(b"".join(map(Path.read_bytes, mark_paths)))
+
+
+def digest_coordinate_values(coordinate_values: np.ndarray) -> str:
+    """Return the digest of a coordinate's type, shape and values, in hexadecimal digits."""
+    return compute_hex_digest(
+        f"{coordinate_values.dtype.str} {coordinate_values.shape} ".encode()
+        + coordinate_values.tobytes()
+    )
+
+
+def read_metadata_file(metadata_path: Path) -> JsonObject:
+    """Return the content of a metadata file, or an empty dictionary if the file cannot be read."""
+    try:
+        metadata = json.loads(metadata_path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return metadata if isinstance(metadata, dict) else {}
+
+
+def _select_dictionary(metadata: JsonObject, key: str) -> JsonObject:
+    """Return an entry of metadata, or an empty dictionary if it is damaged or missing."""
+    entry = metadata.get(key)
+    return entry if isinstance(entry, dict) else {}
+
+
+class StoredMetadata:
+    """Metadata of a store. Each array's metadata has two copies: a separate file, and a part of one
+    file for all arrays.
     """
 
-    sample_shape: tuple[int, ...]
-    chunk_shape: tuple[int, ...]
-    empty_variables: Mapping[str, xr.Variable]
-    result_coordinates: Mapping[str, xr.Variable]
-
-    @property
-    def n_chunks(self) -> int:
-        """Return the number of chunks of the result."""
-        return math.prod(self._chunks_per_axis)
-
-    @property
-    def _chunks_per_axis(self) -> tuple[int, ...]:
-        n_chunks_by_axis = np.ceil(np.divide(self.sample_shape, self.chunk_shape))
-        return tuple(n_chunks_by_axis.astype(int).tolist())
-
-    def compute_chunk_region(self, chunk_index: int) -> ChunkRegion:
-        """Return the slices that select the samples of a chunk, one for each sample axis."""
-        chunk_indices = np.unravel_index(chunk_index, self._chunks_per_axis)
-        chunk_starts = np.multiply(chunk_indices, self.chunk_shape)
-        chunk_ends = np.minimum(chunk_starts + self.chunk_shape, self.sample_shape)
-        return tuple(map(slice, chunk_starts.tolist(), chunk_ends.tolist()))
-
-    def compute_chunk_sample_shape(self, chunk_index: int) -> tuple[int, ...]:
-        """Return the number of samples in a chunk along each sample axis.
-
-        A chunk at the end of an axis may be smaller than others.
+    def __init__(self, store_path: Path) -> None:
+        self._store_path = store_path
+        self.root_metadata = self._read_array_metadata("")
+        consolidated = _select_dictionary(self.root_metadata, "consolidated_metadata")
+        self.consolidated_metadata = _select_dictionary(consolidated, "metadata")
+        """Metadata of all arrays and groups by name, from the one file for all arrays."""
+        group = _select_dictionary(self.consolidated_metadata, CHECKSUM_GROUP_NAME)
+        copies = [
+            _select_dictionary(metadata, "attributes")
+            for metadata in (group, self._read_array_metadata(CHECKSUM_GROUP_NAME))
+        ]
+        usable = [copy for copy in copies if isinstance(copy.get(SCAN_VARIABLES_KEY), list)]
+        intact = (copy for copy in usable if copy == add_attribute_seal(copy))
+        self.mark_attributes: JsonObject = next(intact, (*usable, {})[0])
+        """Attributes of the Zarr group of marks, from the intact copy; empty if both copies are
+        lost.
         """
-        return tuple(
-            chunk_slice.stop - chunk_slice.start
-            for chunk_slice in self.compute_chunk_region(chunk_index)
+        self._root_attributes = _select_dictionary(self.root_metadata, "attributes")
+        sealed_attributes = self.mark_attributes.get(STORE_ATTRIBUTES_KEY, {})
+        self.store_attributes: JsonObject = self._root_attributes | sealed_attributes
+        """Attributes of the store, completed from the copy in the Zarr group of marks."""
+        self._do_mark_attributes_differ = (
+            bool(self.consolidated_metadata and usable) and copies[0] != copies[1]
         )
 
     @property
-    def bytes_per_sample(self) -> int:
-        """Return the number of bytes that the uncompressed results of one sample occupy."""
-        n_bytes = sum(variable.nbytes for variable in self.empty_variables.values())
-        return n_bytes // math.prod(self.sample_shape)
+    def coordinate_digests(self) -> dict[str, str]:
+        """Return the digests of the coordinates by their names."""
+        return _select_dictionary(self.mark_attributes, COORDINATE_DIGESTS_KEY)
+
+    @property
+    def scan_variable_names(self) -> list[str]:
+        """Return the names of the arrays that the scan wrote, without coordinates, sorted."""
+        return sorted(self.mark_attributes.get(SCAN_VARIABLES_KEY, ()))
+
+    def find_damaged_metadata(self) -> list[str]:
+        """Return the names of the arrays whose two copies of the metadata differ.
+
+        The list contains "attributes" if the two copies of the store's attributes differ.
+        """
+        names = *self.coordinate_digests, *self.scan_variable_names, CHECKSUM_ARRAY_NAME
+        damaged = [
+            name
+            for name in (names if self.consolidated_metadata else ())
+            if self._read_array_metadata(name) != self.consolidated_metadata.get(name)
+        ]
+        if self._do_mark_attributes_differ:
+            damaged.append(CHECKSUM_GROUP_NAME)
+        attributes = self.store_attributes.items()
+        if any(self._root_attributes.get(name, x) != x for name, x in attributes):
+            damaged.append("attributes")
+        return damaged
+
+    def restore_from_intact_store(self, intact_metadata: StoredMetadata) -> None:
+        """Write the two copies of all metadata anew, from the metadata of an intact new store for
+        the same scan.
+        """
+        intact = intact_metadata.consolidated_metadata
+        restored = intact | {
+            CHECKSUM_GROUP_NAME: intact[CHECKSUM_GROUP_NAME] | {"attributes": self.mark_attributes}
+        }
+        # The first operand sets the order, in which arrays that the scan did not write come last.
+        # The last operand sets the metadata.
+        consolidated = _consolidate_metadata(restored | self.consolidated_metadata | restored)
+        root = intact_metadata.root_metadata | {"attributes": self.store_attributes} | consolidated
+        for name, metadata in (restored | {"": root}).items():
+            path = self._store_path / name / METADATA_FILE_NAME
+            if read_metadata_file(path) != metadata:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                temporary_path = path.with_name(f"{METADATA_FILE_NAME}.partial")
+                temporary_path.write_text(json.dumps(metadata, indent=2), encoding="utf-8")
+                temporary_path.replace(path)
+
+    def _read_array_metadata(self, array_name: str) -> JsonObject:
+        return read_metadata_file(self._store_path / array_name / METADATA_FILE_NAME)
 
 
-def choose_chunk_shape(sample_shape: tuple[int, ...], max_chunk_samples: int) -> tuple[int, ...]:
-    """Return the shape of chunks that contain at most `max_chunk_samples` samples.
+def _consolidate_metadata(metadata: JsonObject) -> JsonObject:
+    """Return the entry of the root's metadata that contains the metadata of all arrays."""
+    entry = {"kind": "inline", "must_understand": False, "metadata": metadata}
+    return {"consolidated_metadata": entry}
 
-    A chunk spans the whole length of the last axes.
+
+def compute_hex_digest(digested_bytes: bytes) -> str:
+    """Return the digest of `digested_bytes` in hexadecimal digits."""
+    return hashlib.blake2b(digested_bytes, digest_size=DIGEST_SIZE_BYTES).hexdigest()
+
+
+ZARR_READ_ERRORS = (OSError, ValueError, RuntimeError)
+"""Exceptions that zarr and its codecs raise for a file that they cannot decode."""
+
+
+@contextlib.contextmanager
+def lock_store(store_path: Path) -> Iterator[None]:
+    """Return a context that locks a store against other writers.
+
+    Raise a ValueError if another scan has locked the store.
     """
-    chunk_shape: list[int] = []
-    for axis_length in reversed(sample_shape):
-        chunk_length = min(axis_length, max_chunk_samples)
-        max_chunk_samples //= chunk_length  # It stays at least 1.
-        chunk_shape.insert(0, chunk_length)
-    return tuple(chunk_shape)
+    try:
+        import fcntl
+        import os
+    except ImportError:  # Windows has no such locks.
+        yield
+        return
+    file_descriptor = os.open(store_path, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(file_descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as lock_error:
+            raise ValueError(
+                f"another scan is at work on {store_path}: wait until it has ended, then run the "
+                "same again, or give another place."
+            ) from lock_error
+        except OSError:
+            pass  # The file system has no locks.
+        yield
+    finally:
+        os.close(file_descriptor)
+
+
+if TYPE_CHECKING:
+    import zarr
 
 
 class MemoryResultStore:
@@ -126,10 +241,7 @@ class MemoryResultStore:
         self._result_layout = result_layout
         self._is_chunk_done = np.zeros(result_layout.n_chunks, bool)
         try:
-            dataset_variables = {
-                variable_name: empty_variable.copy(deep=True)
-                for variable_name, empty_variable in result_layout.empty_variables.items()
-            }
+            variables = {k: x.copy(deep=True) for k, x in result_layout.empty_variables.items()}
         except MemoryError as memory_error:
             n_samples = math.prod(result_layout.sample_shape)
             raise ValueError(
@@ -138,7 +250,7 @@ class MemoryResultStore:
                 "memory holds: give a store, whose chunks go to the disk."
             ) from memory_error
         self._dataset = xr.Dataset(
-            dataset_variables, dict(result_layout.result_coordinates), store_attributes
+            variables, dict(result_layout.result_coordinates), store_attributes
         )
 
     def find_missing_chunks(self) -> list[int]:
@@ -363,14 +475,8 @@ def open_scan(path: str | Path, *, verify: bool = True) -> xr.Dataset:
             f"{store.damage_description}: run the scan again, which computes these anew, or read "
             "the rest with open_scan(path, verify=False)."
         )
-    dataset = dataset.assign_attrs(
-        {
-            attribute_name: attribute_value
-            for attribute_name, attribute_value in stored_metadata.store_attributes.items()
-            if attribute_name != "coordinates"
-        }
-    )
-    return _arrange_requested_variables(dataset)
+    attributes = {k: x for k, x in stored_metadata.store_attributes.items() if k != "coordinates"}
+    return _arrange_requested_variables(dataset.assign_attrs(attributes))
 
 
 ZARR_METADATA_ERRORS = (
@@ -390,18 +496,14 @@ def _open_zarr_group(
 
     import zarr  # This import is slow.
 
-    def open_with_all_arrays(uses_consolidated_metadata: bool | None) -> zarr.Group:
+    names = *stored_metadata.coordinate_digests, *stored_metadata.scan_variable_names
+
+    def open_with_all_arrays(use_consolidated: bool | None) -> zarr.Group:
         zarr_group = zarr.open_group(
-            store_path,
-            mode=access_mode,
-            zarr_format=3,
-            use_consolidated=uses_consolidated_metadata,
+            store_path, mode=access_mode, zarr_format=3, use_consolidated=use_consolidated
         )
-        for array_name in (
-            *stored_metadata.coordinate_digests,
-            *stored_metadata.scan_variable_names,
-        ):
-            _select_zarr_array(zarr_group, array_name)
+        for name in names:
+            _select_zarr_array(zarr_group, name)
         return zarr_group
 
     try:
@@ -417,32 +519,25 @@ def _arrange_requested_variables(stored_dataset: xr.Dataset) -> xr.Dataset:
     A file name cannot be "d speed / d damping", so the array of such a variable has another name in
     a store.
     """
-    requested_measures_text = stored_dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
-    requested_measures = (
-        str(requested_measures_text).split(", ")
-        if requested_measures_text
-        else read_scan_manifest(stored_dataset.attrs).get("measures", [])
-    )
-    requested_name_by_variable: dict[str, str] = {}
-    for requested_measure in requested_measures:
-        requested_name_by_variable.setdefault(
-            canonicalize_variable_name(requested_measure), requested_measure
-        )
-    new_name_by_variable = {
-        variable_name: requested_name_by_variable.get(variable_name, variable_name)
-        for variable_name in (*requested_name_by_variable, *map(str, stored_dataset.data_vars))
-        if variable_name in stored_dataset
+    text = stored_dataset.attrs.get(REQUESTED_MEASURES_ATTRIBUTE)
+    manifest = {} if text else read_scan_manifest(stored_dataset.attrs)
+    requested = str(text).split(", ") if text else manifest.get("measures", [])
+    names: dict[str, str] = {}
+    for measure in requested:
+        names.setdefault(canonicalize_variable_name(measure), measure)
+    new_names = {
+        name: names.get(name, name)
+        for name in (*names, *map(str, stored_dataset.data_vars))
+        if name in stored_dataset
     }
-    return stored_dataset[list(new_name_by_variable)].rename(new_name_by_variable)
+    return stored_dataset[list(new_names)].rename(new_names)
 
 
 def _read_scan_metadata(store_path: Path) -> StoredMetadata:
     """Return the metadata of a store. Raise a ValueError if the folder contains no scan."""
     stored_metadata = StoredMetadata(store_path)
-    if (
-        stored_metadata.root_metadata.get("node_type") != "group"
-        or stored_metadata.root_metadata.get("zarr_format") != 3
-    ):
+    root = stored_metadata.root_metadata
+    if root.get("node_type") != "group" or root.get("zarr_format") != 3:
         raise ValueError(
             f"{store_path} is no scan's store: give the folder that `vrw scan` wrote, or a new "
             "place."
@@ -466,10 +561,8 @@ def read_stored_manifest(store_path: Path) -> dict | None:
         return None
     store_attributes = _read_scan_metadata(store_path).store_attributes
     try:
-        return {
-            attribute_name: read_scan_manifest(store_attributes, attribute_name)
-            for attribute_name in (MANIFEST_ATTRIBUTE, PROVENANCE_ATTRIBUTE)
-        }
+        attributes = MANIFEST_ATTRIBUTE, PROVENANCE_ATTRIBUTE
+        return {name: read_scan_manifest(store_attributes, name) for name in attributes}
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{store_path} has damaged attributes ({error}): give another place for this scan."
@@ -545,17 +638,14 @@ def _create_zarr_arrays(
             compressors=array_compressors,
             attributes=empty_variable.attrs,
         )
-    chunk_mark_attributes = add_attribute_seal(
-        {
-            SCAN_VARIABLES_KEY: list(result_layout.empty_variables),
-            COORDINATE_DIGESTS_KEY: {
-                coordinate_name: digest_coordinate_values(coordinate.values)
-                for coordinate_name, coordinate in result_coordinates.items()
-            },
-            STORE_ATTRIBUTES_KEY: group_attributes,
-        }
-    )
-    zarr_group.create_group(CHECKSUM_GROUP_NAME, attributes=chunk_mark_attributes).create_array(
+    digests = {name: digest_coordinate_values(x.values) for name, x in result_coordinates.items()}
+    mark_attributes = {
+        SCAN_VARIABLES_KEY: list(result_layout.empty_variables),
+        COORDINATE_DIGESTS_KEY: digests,
+        STORE_ATTRIBUTES_KEY: group_attributes,
+    }
+    mark_attributes = add_attribute_seal(mark_attributes)
+    zarr_group.create_group(CHECKSUM_GROUP_NAME, attributes=mark_attributes).create_array(
         "digest",
         shape=(result_layout.n_chunks, DIGEST_SIZE_BYTES),
         chunks=(1, DIGEST_SIZE_BYTES),
@@ -564,20 +654,8 @@ def _create_zarr_arrays(
     )
     # All metadata are written into one file in this order, because zarr's function sorts them and
     # warns.
-    metadata_by_name = {
-        array_name: json.loads((store_path / array_name / METADATA_FILE_NAME).read_text())
-        for array_name in (
-            *result_coordinates,
-            *result_layout.empty_variables,
-            CHECKSUM_GROUP_NAME,
-            CHECKSUM_ARRAY_NAME,
-        )
-    }
-    root_metadata_path = store_path / METADATA_FILE_NAME
-    root_metadata = json.loads(root_metadata_path.read_text())
-    root_metadata["consolidated_metadata"] = {
-        "kind": "inline",
-        "must_understand": False,
-        "metadata": metadata_by_name,
-    }
-    root_metadata_path.write_text(json.dumps(root_metadata, indent=2))
+    variables = result_layout.empty_variables
+    read = lambda name: json.loads((store_path / name / METADATA_FILE_NAME).read_text())
+    names = *result_coordinates, *variables, CHECKSUM_GROUP_NAME, CHECKSUM_ARRAY_NAME
+    root_metadata = read("") | _consolidate_metadata({name: read(name) for name in names})
+    (store_path / METADATA_FILE_NAME).write_text(json.dumps(root_metadata, indent=2))

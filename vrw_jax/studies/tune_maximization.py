@@ -9,6 +9,11 @@ every free parameter is between 0 and 1.
 A margin is a minimum over time. Where several instants have the same minimum, its gradient jumps,
 and SLSQP does not satisfy the first-order condition. Cutting planes then continue the maximization:
 each step maximizes the linear model from the values and gradients of all nearby trials.
+
+Many starts are explored before the maximization. In the exploration, optax's Adam maximizes an
+augmented Lagrangian in one batch. Its first-order optimizer steps bring every start near a local
+optimum. The maximization continues from the best start. If a trial has no gait, the parameters of
+its start do not change, and its step size is halved.
 """
 
 import enum
@@ -16,13 +21,14 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
 from vrw_jax.gaits.finder import Gait
-from vrw_jax.studies.tune_objective import compute_max_violation, compute_slack_scales
+from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
 
 
 class TuneStatus(StatusCode):
@@ -92,22 +98,11 @@ class MaximizationResult(NamedTuple):
     trial_kinds: list[TrialKind]
 
 
-class _LostBranchError(Exception):
-    """Exception that signals a trial without a usable gait. Its argument is the trial."""
+class _SearchEndedError(Exception):
+    """Exception that ends a run of SLSQP. Its arguments are the status and the last trial.
 
-
-class _EvaluationLimitReachedError(Exception):
-    """Exception that signals that the allowed number of gaits has been evaluated."""
-
-
-class _OptimumReachedError(Exception):
-    """Exception that signals a trial that satisfies the first-order condition and the
-    constraints. Its argument is the trial.
+    The status BRANCH_ENDED is that of a trial without a usable gait.
     """
-
-
-class _SlowConvergenceError(Exception):
-    """Exception that signals that SLSQP has used its evaluations, as it does at kinks."""
 
 
 FULL_TRUST_BOX_RADIUS = 1.0
@@ -149,6 +144,28 @@ smooth function has over `MAX_PIECE_DISTANCE`.
 PRICE_ACCURACY = 1e-2
 """Relative width of a price's range below which the price is unique."""
 
+
+def compute_slack_scales(constraint_slacks: np.ndarray, slack_jacobian: np.ndarray) -> np.ndarray:
+    """Return the scale of each slack.
+
+    The scale is the norm of the slack's gradient with respect to normalized parameters, that is,
+    the change of the slack per width between the bounds. A slack that is always 0 has the scale 1.
+    """
+    slack_scales = np.maximum(
+        np.linalg.norm(slack_jacobian, axis=-1), 1e-3 * np.abs(constraint_slacks)
+    )
+    return np.where(slack_scales == 0.0, 1.0, slack_scales)
+
+
+def compute_max_violation(constraint_slacks: np.ndarray, slack_scales: np.ndarray) -> Any:
+    """Return the largest violation of a constraint, in widths between the bounds, or 0 if there is
+    none.
+
+    The result is NaN if the wheel has no gait.
+    """
+    return np.max(-constraint_slacks / slack_scales, axis=-1, initial=0.0)
+
+
 TrialEvaluator = Callable[[np.ndarray, EvaluatedTrial | None], EvaluatedTrial]
 """Function that evaluates the trial with given normalized parameters. If a neighboring trial is
 given, the search for the gait begins at its gait.
@@ -162,14 +179,14 @@ class _TrialRecord:
     """
 
     def __init__(
-        self,
-        trial_evaluator: TrialEvaluator,
-        start_trial: EvaluatedTrial,
-        max_evaluations: int,
+        self, evaluate_trial: TrialEvaluator, start_trial: EvaluatedTrial, max_evaluations: int
     ) -> None:
-        self._evaluate_trial_gait, self._max_evaluations = trial_evaluator, max_evaluations
+        self._evaluate_trial, self._max_evaluations = evaluate_trial, max_evaluations
         start_key = start_trial.normalized_parameters.tobytes()
         self.trials, self.kinds = {start_key: start_trial}, {start_key: TrialKind.START}
+        self.slack_scales = compute_slack_scales(
+            start_trial.constraint_slacks, start_trial.slack_jacobian
+        )
 
     def evaluate_trial_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
         """Return the trial with these normalized parameters, and evaluate it if it is not yet
@@ -178,27 +195,24 @@ class _TrialRecord:
         Raise an exception if the trial is unusable, or if the allowed number of evaluations is
         reached.
         """
-        trial_key = normalized_parameters.tobytes()
-        if trial_key not in self.trials:
+        key = normalized_parameters.tobytes()
+        if key not in self.trials:
             if len(self.trials) >= self._max_evaluations:
-                raise _EvaluationLimitReachedError
+                raise _SearchEndedError(TuneStatus.MAX_EVALUATIONS_REACHED, None)
             nearest_trial = min(
                 self.usable_trials,
                 key=lambda trial: float(
                     np.linalg.norm(trial.normalized_parameters - normalized_parameters)
                 ),
             )
-            self.trials[trial_key] = self._evaluate_trial_gait(
-                np.array(normalized_parameters), nearest_trial
-            )
-            self.kinds[trial_key] = TrialKind.TRIAL
+            self.trials[key] = self._evaluate_trial(np.array(normalized_parameters), nearest_trial)
+            self.kinds[key] = TrialKind.TRIAL
             report_progress(f"{len(self.trials):,} gaits evaluated")
-        trial = self.trials[trial_key]
+        trial = self.trials[key]
         if not trial.is_usable_trial:
-            self.kinds[trial_key] = (
-                TrialKind.NOT_FINITE if trial.has_gait_on_branch else TrialKind.LOST
-            )
-            raise _LostBranchError(trial)
+            has_gait = trial.has_gait_on_branch
+            self.kinds[key] = TrialKind.NOT_FINITE if has_gait else TrialKind.LOST
+            raise _SearchEndedError(TuneStatus.BRANCH_ENDED, trial)
         return trial
 
     @property
@@ -206,170 +220,127 @@ class _TrialRecord:
         """Return all trials with a usable gait, in order."""
         return [trial for trial in self.trials.values() if trial.is_usable_trial]
 
-    @property
-    def gradient_norm(self) -> float:
-        """Return the largest norm of the objective's gradient, which is the objective's scale.
-
-        The gradient at an optimum within the bounds vanishes.
-        """
-        return max(map(_compute_gradient_norm, self.usable_trials))
-
     def evaluate_iterate_once(self, normalized_parameters: np.ndarray) -> EvaluatedTrial:
         """Return the trial with these normalized parameters, and record it as an iterate."""
-        trial = self.evaluate_trial_once(normalized_parameters)
-        trial_key = normalized_parameters.tobytes()
-        if self.kinds[trial_key] != TrialKind.START:
-            self.kinds[trial_key] = TrialKind.ITERATE
+        trial, key = (
+            self.evaluate_trial_once(normalized_parameters),
+            normalized_parameters.tobytes(),
+        )
+        if self.kinds[key] != TrialKind.START:
+            self.kinds[key] = TrialKind.ITERATE
         return trial
+
+    def compute_violation(self, trial: EvaluatedTrial) -> float:
+        """Return the largest violation of a constraint, in widths between the bounds."""
+        return float(compute_max_violation(trial.constraint_slacks, self.slack_scales))
+
+    def find_end_status(self, trial: EvaluatedTrial) -> TuneStatus:
+        """Return the status of a maximization that finds no better trial than this one."""
+        if self.compute_violation(trial) > 10.0 * ACTIVE_BOUND_TOLERANCE:
+            return TuneStatus.NO_FEASIBLE_GAIT
+        conditions = compute_optimality_conditions(trial, self.usable_trials)
+        return TuneStatus.CONVERGED if conditions.are_satisfied else TuneStatus.STALLED
 
 
 def maximize_objective(
     trial_evaluator: TrialEvaluator,
     start_trial: EvaluatedTrial,
-    *,
     tolerance: float,
     max_evaluations: int,
 ) -> MaximizationResult:
     """Maximize the objective locally from `start_trial`, subject to slacks of at least 0."""
+    record = _TrialRecord(trial_evaluator, start_trial, max_evaluations)
+    best_trial, status = _maximize_by_slsqp(record, start_trial, tolerance)
+    if status == TuneStatus.CONVERGED and record.find_end_status(best_trial) != status:
+        best_trial, status = _maximize_by_cutting_planes(record, tolerance)
+        if status == TuneStatus.CONVERGED:
+            status = record.find_end_status(best_trial)
+    if status != TuneStatus.CONVERGED:
+        trials = record.usable_trials
+        feasible = [x for x in trials if record.compute_violation(x) <= ACTIVE_BOUND_TOLERANCE]
+        best_trial = (
+            max(feasible, key=lambda trial: trial.objective)
+            if feasible
+            else min(trials, key=record.compute_violation)
+        )
+    return MaximizationResult(
+        best_trial, status, [*record.trials.values()], [*record.kinds.values()]
+    )
+
+
+def _maximize_by_slsqp(
+    record: _TrialRecord, start_trial: EvaluatedTrial, tolerance: float
+) -> tuple[EvaluatedTrial, TuneStatus]:
+    """Return the trial at which SLSQP ends, in boxes that shrink around unusable trials."""
     from scipy.optimize import minimize  # This import is slow.
 
-    trial_record = _TrialRecord(trial_evaluator, start_trial, max_evaluations)
-    gradient_norm = _compute_gradient_norm(start_trial)
-    slack_scales = compute_slack_scales(start_trial.constraint_slacks, start_trial.slack_jacobian)
-
-    compute_violation_of = lambda trial: compute_max_violation(
-        trial.constraint_slacks, slack_scales
-    )
-    active_bound_tolerance = ACTIVE_BOUND_TOLERANCE
+    gradient_norm, slack_scales = _compute_gradient_norm(start_trial), record.slack_scales
 
     def record_iterate(trial_parameters: np.ndarray) -> None:
         """Record an iterate of the present box, and stop if it is an optimum."""
-        trial = trial_record.evaluate_iterate_once(trial_parameters)
+        trial = record.evaluate_iterate_once(trial_parameters)
         if (
-            compute_violation_of(trial) <= active_bound_tolerance
+            record.compute_violation(trial) <= ACTIVE_BOUND_TOLERANCE
             and compute_optimality_conditions(trial, [trial]).kkt_residual <= tolerance
         ):
-            raise _OptimumReachedError(trial)
-        trust_box_iterates.append(trial)
+            raise _SearchEndedError(TuneStatus.CONVERGED, trial)
+        iterates.append(trial)
 
     def evaluate_loss(trial_parameters: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the function that SLSQP minimizes, and its gradient."""
-        n_box_trials = len(trial_record.trials) - n_trials_before_trust_box
-        if n_box_trials > MAX_SLSQP_EVALUATIONS:
-            raise _SlowConvergenceError
-        trial = trial_record.evaluate_trial_once(trial_parameters)
+        if len(record.trials) - n_earlier_trials > MAX_SLSQP_EVALUATIONS:  # as at kinks
+            raise _SearchEndedError(TuneStatus.CONVERGED, center)
+        trial = record.evaluate_trial_once(trial_parameters)
         return -trial.objective / gradient_norm, -trial.objective_gradient / gradient_norm
 
-    def find_end_status(trial: EvaluatedTrial) -> TuneStatus:
-        """Return the status of a maximization that finds no better trial than this one."""
-        if compute_violation_of(trial) > 10.0 * active_bound_tolerance:
-            return TuneStatus.NO_FEASIBLE_GAIT
-        conditions = compute_optimality_conditions(trial, trial_record.usable_trials)
-        return TuneStatus.CONVERGED if conditions.are_satisfied else TuneStatus.STALLED
-
+    evaluate = record.evaluate_trial_once
     slack_constraints = {
         "type": "ineq",
-        "fun": lambda trial_parameters: (
-            trial_record.evaluate_trial_once(trial_parameters).constraint_slacks / slack_scales
-        ),
-        "jac": lambda trial_parameters: (
-            trial_record.evaluate_trial_once(trial_parameters).slack_jacobian
-            / slack_scales[:, None]
-        ),
+        "fun": lambda x: evaluate(x).constraint_slacks / slack_scales,
+        "jac": lambda x: evaluate(x).slack_jacobian / slack_scales[:, None],
     }
-    center_trial = start_trial
-    trust_box_radius = max_trust_box_radius = FULL_TRUST_BOX_RADIUS
-    tune_status, n_trials_before_trust_box = TuneStatus.CONVERGED, 0
+    center, n_earlier_trials = start_trial, 0
+    radius = max_radius = FULL_TRUST_BOX_RADIUS
     while True:
         # If this box had no new evaluation, the next box is smaller, because the search would be
         # repeated.
-        if len(trial_record.trials) == n_trials_before_trust_box:
-            max_trust_box_radius *= 0.5
-        n_trials_before_trust_box = len(trial_record.trials)
-        trust_box_radius = min(trust_box_radius, max_trust_box_radius)
-        if trust_box_radius < MIN_TRUST_BOX_RADIUS:
-            tune_status = TuneStatus.BRANCH_ENDED
-            break
-        lower_trust_box_side = np.maximum(
-            center_trial.normalized_parameters - trust_box_radius, 0.0
-        )
-        upper_trust_box_side = np.minimum(
-            center_trial.normalized_parameters + trust_box_radius, 1.0
-        )
-        trust_box_iterates = [center_trial]
+        if len(record.trials) == n_earlier_trials:
+            max_radius *= 0.5
+        n_earlier_trials = len(record.trials)
+        radius = min(radius, max_radius)
+        if radius < MIN_TRUST_BOX_RADIUS:
+            return center, TuneStatus.BRANCH_ENDED
+        x, iterates = center.normalized_parameters, [center]
+        lower, upper = np.maximum(x - radius, 0.0), np.minimum(x + radius, 1.0)
+        is_largest = radius >= max_radius
         try:
-            slsqp_result = minimize(
+            result = minimize(
                 evaluate_loss,
-                center_trial.normalized_parameters,
+                x,
                 jac=True,
-                bounds=list(zip(lower_trust_box_side, upper_trust_box_side, strict=True)),
+                bounds=list(zip(lower, upper, strict=True)),
                 constraints=slack_constraints,
                 method="SLSQP",
                 options={
-                    "ftol": FINE_OBJECTIVE_TOLERANCE
-                    if trust_box_radius >= max_trust_box_radius
-                    else COARSE_OBJECTIVE_TOLERANCE,
+                    "ftol": FINE_OBJECTIVE_TOLERANCE if is_largest else COARSE_OBJECTIVE_TOLERANCE,
                     "maxiter": 100,
                 },
                 callback=record_iterate,
             )
-            end_trial = trial_record.evaluate_iterate_once(
-                np.clip(slsqp_result.x, lower_trust_box_side, upper_trust_box_side)
-            )
-        except _LostBranchError as lost_branch:
-            center_trial = trust_box_iterates[-1]
-            (lost_trial,) = lost_branch.args
-            distances_to_lost_trial = np.abs(
-                lost_trial.normalized_parameters - center_trial.normalized_parameters
-            )
-            trust_box_radius = 0.5 * float(np.max(distances_to_lost_trial))
+            center = record.evaluate_iterate_once(np.clip(result.x, lower, upper))
+        except _SearchEndedError as ended:
+            status, trial = ended.args
+            if status != TuneStatus.BRANCH_ENDED:
+                return center if trial is None else trial, status
+            center = iterates[-1]
+            distances = np.abs(trial.normalized_parameters - center.normalized_parameters)
+            radius = 0.5 * float(np.max(distances))
             continue
-        except _OptimumReachedError as reached_optimum:
-            (center_trial,) = reached_optimum.args
-            break
-        except _EvaluationLimitReachedError:
-            tune_status = TuneStatus.MAX_EVALUATIONS_REACHED
-            break
-        except _SlowConvergenceError:
-            break
-        has_reached_inner_box_side = (
-            end_trial.normalized_parameters <= lower_trust_box_side + 1e-9
-        ) & (lower_trust_box_side > 0.0)
-        has_reached_inner_box_side |= (
-            end_trial.normalized_parameters >= upper_trust_box_side - 1e-9
-        ) & (upper_trust_box_side < 1.0)
-        center_trial = end_trial
-        if trust_box_radius >= FULL_TRUST_BOX_RADIUS:
-            break
-        trust_box_radius = (
-            min(2.0 * trust_box_radius, FULL_TRUST_BOX_RADIUS)
-            if has_reached_inner_box_side.any()
-            else FULL_TRUST_BOX_RADIUS
-        )
-    if (
-        tune_status == TuneStatus.CONVERGED
-        and find_end_status(center_trial) != TuneStatus.CONVERGED
-    ):
-        center_trial, tune_status = _maximize_by_cutting_planes(
-            trial_record, slack_scales, tolerance
-        )
-        if tune_status == TuneStatus.CONVERGED:
-            tune_status = find_end_status(center_trial)
-    best_trial = center_trial
-    if tune_status != TuneStatus.CONVERGED:
-        feasible_trials = [
-            trial
-            for trial in trial_record.usable_trials
-            if compute_violation_of(trial) <= active_bound_tolerance
-        ]
-        best_trial = (
-            max(feasible_trials, key=lambda trial: trial.objective)
-            if feasible_trials
-            else min(trial_record.usable_trials, key=compute_violation_of)
-        )
-    return MaximizationResult(
-        best_trial, tune_status, [*trial_record.trials.values()], [*trial_record.kinds.values()]
-    )
+        if radius >= FULL_TRUST_BOX_RADIUS:
+            return center, TuneStatus.CONVERGED
+        x = center.normalized_parameters
+        is_on_inner_side = (x <= lower + 1e-9) & (lower > 0.0) | (x >= upper - 1e-9) & (upper < 1.0)
+        radius = 2.0 * radius if is_on_inner_side.any() else FULL_TRUST_BOX_RADIUS
 
 
 def _compute_gradient_norm(trial: EvaluatedTrial) -> float:
@@ -379,7 +350,7 @@ def _compute_gradient_norm(trial: EvaluatedTrial) -> float:
 
 
 def _maximize_by_cutting_planes(
-    trial_record: _TrialRecord, slack_scales: np.ndarray, tolerance: float
+    record: _TrialRecord, tolerance: float
 ) -> tuple[EvaluatedTrial, TuneStatus]:
     """Continue the maximization from the best recorded trial, where functions have kinks.
 
@@ -387,51 +358,41 @@ def _maximize_by_cutting_planes(
     A step without a gain shrinks the box, and its trial improves the model. The method is that of
     bundles with a trust region (Kiwiel, Methods of Descent for Nondifferentiable Optimization).
     """
-    gradient_norm = trial_record.gradient_norm
-
-    def compute_merit(trial: EvaluatedTrial) -> float:
-        return float(
-            trial.objective / gradient_norm
-            - VIOLATION_PENALTY * compute_max_violation(trial.constraint_slacks, slack_scales)
-        )
-
-    trust_box_radius = CUTTING_PLANE_BOX_RADIUS
-    center_trial, is_box_lost = max(trial_record.usable_trials, key=compute_merit), False
-    n_null_steps = 0
-    while trust_box_radius >= MIN_TRUST_BOX_RADIUS:
-        model_step, predicted_gain = _maximize_linear_model(
-            center_trial, trial_record.usable_trials, trust_box_radius, gradient_norm, slack_scales
-        )
-        if predicted_gain <= tolerance * trust_box_radius:
-            trust_box_radius *= 0.1
+    # The gradient at an optimum within the bounds vanishes, so that the largest is the scale.
+    gradient_norm = max(map(_compute_gradient_norm, record.usable_trials))
+    compute_merit = lambda trial: float(
+        trial.objective / gradient_norm - VIOLATION_PENALTY * record.compute_violation(trial)
+    )
+    radius, n_null_steps, is_box_lost = CUTTING_PLANE_BOX_RADIUS, 0, False
+    center = max(record.usable_trials, key=compute_merit)
+    while radius >= MIN_TRUST_BOX_RADIUS:
+        step, predicted_gain = _maximize_linear_model(record, center, radius, gradient_norm)
+        if predicted_gain <= tolerance * radius:
+            radius *= 0.1
             continue
         try:
-            trial = trial_record.evaluate_iterate_once(
-                np.clip(center_trial.normalized_parameters + model_step, 0.0, 1.0)
+            trial = record.evaluate_iterate_once(
+                np.clip(center.normalized_parameters + step, 0.0, 1.0)
             )
-        except _LostBranchError:
-            is_box_lost, trust_box_radius = True, 0.5 * trust_box_radius
+        except _SearchEndedError as ended:
+            if ended.args[0] != TuneStatus.BRANCH_ENDED:
+                return center, ended.args[0]
+            is_box_lost, radius = True, 0.5 * radius
             continue
-        except _EvaluationLimitReachedError:
-            return center_trial, TuneStatus.MAX_EVALUATIONS_REACHED
-        gain = compute_merit(trial) - compute_merit(center_trial)
+        gain = compute_merit(trial) - compute_merit(center)
         n_null_steps += 1
         if gain > 0.1 * predicted_gain:
-            center_trial, is_box_lost, n_null_steps = trial, False, 0
+            center, is_box_lost, n_null_steps = trial, False, 0
         # Each trial adds tangents to the model, at most one for each instant and parameter.
-        if n_null_steps > len(model_step):
-            trust_box_radius, n_null_steps = 0.5 * trust_box_radius, 0
+        if n_null_steps > len(step):
+            radius, n_null_steps = 0.5 * radius, 0
         elif gain > 0.75 * predicted_gain:
-            trust_box_radius = min(2.0 * trust_box_radius, CUTTING_PLANE_BOX_RADIUS)
-    return center_trial, TuneStatus.BRANCH_ENDED if is_box_lost else TuneStatus.CONVERGED
+            radius = min(2.0 * radius, CUTTING_PLANE_BOX_RADIUS)
+    return center, TuneStatus.BRANCH_ENDED if is_box_lost else TuneStatus.CONVERGED
 
 
 def _maximize_linear_model(
-    center_trial: EvaluatedTrial,
-    trials: list[EvaluatedTrial],
-    trust_box_radius: float,
-    gradient_norm: float,
-    slack_scales: np.ndarray,
+    record: _TrialRecord, center: EvaluatedTrial, radius: float, gradient_norm: float
 ) -> tuple[np.ndarray, float]:
     """Return the step from the center that maximizes the linear model, and the gain of merit.
 
@@ -440,40 +401,31 @@ def _maximize_linear_model(
     """
     from scipy.optimize import linprog  # This import is slow.
 
-    center, n_free = center_trial.normalized_parameters, center_trial.normalized_parameters.size
+    x, scales = center.normalized_parameters, record.slack_scales
     rows, right_hand_sides = [], []
-    violation = compute_max_violation(center_trial.constraint_slacks, slack_scales)
-    for trial in trials:
-        distance = center - trial.normalized_parameters
-        if np.max(np.abs(distance)) > 2.0 * trust_box_radius:
+    for trial in record.usable_trials:
+        distance = x - trial.normalized_parameters
+        if np.max(np.abs(distance)) > 2.0 * radius:
             continue
-        objective_excess = (
-            trial.objective + trial.objective_gradient @ distance - center_trial.objective
-        )
+        objective_excess = trial.objective + trial.objective_gradient @ distance - center.objective
         rows.append(np.r_[-trial.objective_gradient / gradient_norm, 1.0, 0.0])
         right_hand_sides.append(max(objective_excess / gradient_norm, 0.0))
-        slacks_at_center = np.maximum(
-            trial.constraint_slacks + trial.slack_jacobian @ distance,
-            center_trial.constraint_slacks,
-        )
-        for slack, slack_gradient, slack_scale in zip(
-            slacks_at_center, trial.slack_jacobian, slack_scales, strict=True
-        ):
-            rows.append(np.r_[-slack_gradient / slack_scale, 0.0, -1.0])
-            right_hand_sides.append(slack / slack_scale)
-    penalty = VIOLATION_PENALTY
-    lower_sides = np.maximum(-center, -trust_box_radius)
-    upper_sides = np.minimum(1.0 - center, trust_box_radius)
+        slacks = trial.constraint_slacks + trial.slack_jacobian @ distance
+        slacks = np.maximum(slacks, center.constraint_slacks) / scales
+        right_hand_sides += slacks.tolist()
+        rows += [np.r_[row, 0.0, -1.0] for row in -trial.slack_jacobian / scales[:, None]]
+    lower_sides, upper_sides = np.maximum(-x, -radius), np.minimum(1.0 - x, radius)
     # The unknowns are the step, the gain of the objective, and the largest violation.
     solution = linprog(
-        np.r_[np.zeros(n_free), -1.0, penalty],
+        np.r_[np.zeros(x.size), -1.0, VIOLATION_PENALTY],
         np.array(rows),
         right_hand_sides,
         bounds=[*zip(lower_sides, upper_sides, strict=True), (None, None), (0.0, None)],
     )
     if solution.x is None:  # The box is smaller than the tolerances of the linear program.
-        return np.zeros(n_free), 0.0
-    return solution.x[:n_free], float(-solution.fun + penalty * violation)
+        return np.zeros(x.size), 0.0
+    violation = record.compute_violation(center)
+    return solution.x[: x.size], float(-solution.fun + VIOLATION_PENALTY * violation)
 
 
 class OptimalityConditions(NamedTuple):
@@ -506,14 +458,13 @@ def compute_optimality_conditions(
     """
     from scipy.optimize import linprog, nnls  # This import is slow.
 
-    parameters, n_free = trial.normalized_parameters, trial.normalized_parameters.size
+    parameters, tolerance = trial.normalized_parameters, ACTIVE_BOUND_TOLERANCE
+    n_free, identity = parameters.size, np.eye(parameters.size)
     slack_scales = compute_slack_scales(trial.constraint_slacks, trial.slack_jacobian)
-    tolerance = ACTIVE_BOUND_TOLERANCE
     gradient_norm = max(map(_compute_gradient_norm, evaluated_trials))
     objective_pieces, *constraint_pieces = _collect_gradient_pieces(
         trial, evaluated_trials, np.r_[gradient_norm, slack_scales]
     )
-    identity_matrix = np.eye(n_free)
     limit_pieces = [
         *(
             [piece / scale for piece in pieces] if abs(slack) <= 10.0 * tolerance * scale else []
@@ -521,11 +472,8 @@ def compute_optimality_conditions(
                 constraint_pieces, slack_scales, trial.constraint_slacks, strict=True
             )
         ),
-        *([row] * bool(u <= tolerance) for row, u in zip(identity_matrix, parameters, strict=True)),
-        *(
-            [-row] * bool(u >= 1.0 - tolerance)
-            for row, u in zip(identity_matrix, parameters, strict=True)
-        ),
+        *([identity[i]] * bool(u <= tolerance) for i, u in enumerate(parameters)),
+        *([-identity[i]] * bool(u >= 1.0 - tolerance) for i, u in enumerate(parameters)),
     ]
     n_limits, n_weights = len(limit_pieces), len(objective_pieces)
     # The weights of the objective's gradients have the sum 1. Each gradient of a limit has a price.
@@ -533,13 +481,11 @@ def compute_optimality_conditions(
         *(gradient / gradient_norm for gradient in objective_pieces),
         *(gradient for pieces in limit_pieces for gradient in pieces),
     ]
-    is_weight = np.arange(len(gradients)) < n_weights
+    is_weight, columns = np.arange(len(gradients)) < n_weights, np.transpose(gradients)
     limit_indices = np.repeat(np.arange(n_limits), [len(pieces) for pieces in limit_pieces])
-    weights_and_prices, _ = nnls(
-        np.vstack([np.transpose(gradients), is_weight]), np.r_[np.zeros(n_free), 1.0]
-    )
+    weights_and_prices, _ = nnls(np.vstack([columns, is_weight]), np.r_[np.zeros(n_free), 1.0])
     weights_and_prices /= weights_and_prices[:n_weights].sum()
-    imbalance = np.transpose(gradients) @ weights_and_prices
+    imbalance = columns @ weights_and_prices
     price_of_limit = np.hstack(
         [np.zeros((n_limits, n_weights)), np.arange(n_limits)[:, None] == limit_indices]
     )
@@ -550,7 +496,7 @@ def compute_optimality_conditions(
         for end, sign in enumerate((1.0, -1.0)):
             solution = linprog(
                 sign * price_of_limit[limit_index],
-                np.vstack([np.transpose(gradients), -np.transpose(gradients)]),
+                np.vstack([columns, -columns]),
                 np.full(2 * n_free, max_imbalance),
                 is_weight[None].astype(float),
                 [1.0],
@@ -599,3 +545,122 @@ def _collect_gradient_pieces(
             ):
                 function_pieces.append(gradient)
     return pieces
+
+
+N_FIRST_ORDER_STEPS = 25
+"""Number of first-order optimizer steps."""
+FIRST_OPTIMIZER_STEP_LENGTH = 0.06
+"""Length of Adam's first step, in widths between the bounds."""
+GRADIENT_DECAY = 0.7
+"""Decay rate of Adam's running average of the gradient."""
+SQUARED_GRADIENT_DECAY = 0.9
+"""Decay rate of Adam's running average of the squared gradient."""
+PENALTY_WEIGHT = 4.0
+"""Penalty on a violation of one width between the bounds, in units of the objective."""
+
+
+class ExplorationResult(NamedTuple):
+    """Results of the exploration. Each array has a leading axis over starts."""
+
+    normalized_starts: np.ndarray  # (n_starts, n_free_parameters): starts in widths of the bounds
+    normalized_parameters: np.ndarray
+    objective: np.ndarray  # objective at the end; NaN if no gait was found
+    max_violations: np.ndarray  # largest violation of a constraint, in widths of the bounds
+    penalized_objectives: np.ndarray  # objective minus the penalty on the violation
+    n_lost_trials: np.ndarray  # number of trials that lost the gait or its branch
+    n_evaluations: int  # number of evaluated gaits
+
+    @property
+    def best_start_index(self) -> int:
+        """Return the index of the start with the highest penalized objective.
+
+        The maximization continues from the end of this start's exploration.
+        """
+        return int(np.nanargmax(self.penalized_objectives))
+
+
+def explore_starts(
+    evaluate_trials: TrialEvaluator, normalized_starts: np.ndarray
+) -> ExplorationResult:
+    """Take first-order optimizer steps from every start, and return the parameters and gaits at the
+    ends.
+
+    - `evaluate_trials`: function that evaluates a batch of trials;
+    - `normalized_starts`: normalized parameters of the starts, (n_starts, n_free_parameters).
+    """
+    import optax  # This import is slow.
+
+    n_starts = len(normalized_starts)
+    current_trials = evaluate_trials(normalized_starts, None)
+    has_active_gait = current_trials.is_usable_trial
+    if not has_active_gait.any():
+        raise ValueError(
+            f"none of {n_starts} starts within the bounds has a gait with a finite objective: "
+            "narrow the bounds around wheels that walk, such as WheelParams()."
+        )
+    slack_scales = np.median(
+        compute_slack_scales(current_trials.constraint_slacks, current_trials.slack_jacobian)[
+            has_active_gait
+        ],
+        axis=0,
+    )
+    objective_gradient_norm = np.median(
+        np.linalg.norm(current_trials.objective_gradient[has_active_gait], axis=1)
+    )
+    objective_gradient_norm = objective_gradient_norm or 1.0  # if the objective is constant
+    optimizer_step_lengths = np.full((n_starts, 1), FIRST_OPTIMIZER_STEP_LENGTH)
+    optimizer = optax.scale_by_adam(b1=GRADIENT_DECAY, b2=SQUARED_GRADIENT_DECAY)
+    optimizer_state = optimizer.init(jnp.asarray(normalized_starts))
+    constraint_multipliers = np.zeros((n_starts, len(slack_scales)))
+    n_lost_trials = np.zeros(n_starts, int)
+    for step_index in range(N_FIRST_ORDER_STEPS):
+        penalty_weights = np.maximum(
+            0.0,
+            constraint_multipliers
+            - PENALTY_WEIGHT * current_trials.constraint_slacks / slack_scales,
+        )
+        constraint_multipliers = np.where(
+            has_active_gait[:, None], penalty_weights, constraint_multipliers
+        )
+        penalty_gradient = np.einsum(
+            "lc,lcf->lf", penalty_weights / slack_scales, current_trials.slack_jacobian
+        )
+        ascent_direction = np.where(
+            has_active_gait[:, None],
+            current_trials.objective_gradient / objective_gradient_norm + penalty_gradient,
+            0.0,
+        )
+        adam_update, optimizer_state = optimizer.update(
+            jnp.asarray(ascent_direction), optimizer_state
+        )
+        trial_step_lengths = (
+            optimizer_step_lengths * 0.5 * (1.0 + np.cos(np.pi * step_index / N_FIRST_ORDER_STEPS))
+        )
+        trial_parameters = np.clip(
+            current_trials.normalized_parameters + trial_step_lengths * np.asarray(adam_update),
+            0.0,
+            1.0,
+        )
+        new_trials = evaluate_trials(trial_parameters, current_trials)
+        is_trial_accepted = new_trials.is_usable_trial & has_active_gait
+        n_lost_trials += has_active_gait & ~is_trial_accepted
+        optimizer_step_lengths = np.where(
+            is_trial_accepted[:, None], optimizer_step_lengths, 0.5 * optimizer_step_lengths
+        )
+        current_trials = select_tree_rows(
+            concatenate_tree_rows(current_trials, new_trials),
+            np.arange(n_starts) + np.where(is_trial_accepted, n_starts, 0),
+        )
+    end_objectives = np.where(has_active_gait, current_trials.objective, np.nan)
+    max_violations = compute_max_violation(current_trials.constraint_slacks, slack_scales)
+    penalized_objectives = end_objectives - PENALTY_WEIGHT * np.abs(end_objectives) * max_violations
+    n_evaluations = n_starts * (N_FIRST_ORDER_STEPS + 1)
+    return ExplorationResult(
+        normalized_starts,
+        current_trials.normalized_parameters,
+        end_objectives,
+        max_violations,
+        penalized_objectives,
+        n_lost_trials,
+        n_evaluations,
+    )

@@ -1,7 +1,6 @@
-"""Tuning of a wheel: maximization of an objective for its gait, with margins as constraints.
+"""Objective, constraints and trials of tuning, from a user's specification.
 
-Gradients are exact. Without margins as constraints, the maximization would increase double support
-until the foot scuffs.
+Gradients are exact. The objective and the constraints are functions of a gait.
 """
 
 from __future__ import annotations
@@ -9,54 +8,41 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import operator
-import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.base.checks import (
-    check_int,
     check_names,
-    check_positive,
     check_range,
     check_real,
     check_reals,
     check_type,
     format_value,
     require_known_name,
-    require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import check_parameters, is_own_walker
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
-    Gait,
     GaitFunction,
+    GaitMeasureReader,
     evaluate_on_gait,
     evaluate_on_gaits,
     is_same_branch,
 )
-from vrw_jax.gaits.finder_selection import make_finder
-from vrw_jax.gaits.gait_search import resolve_model
-from vrw_jax.gaits.margin_defaults import default_margins
-from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.gait_search import make_finder, resolve_model
+from vrw_jax.gaits.options import CycleOptions, default_margins
 from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder
-from vrw_jax.models.measures import (
-    MARGIN_MEASURES,
-    SELECTION_MARGIN_NAMES,
-    describe_parameter,
-    make_flag_attributes,
-    make_measure_attributes,
-)
-from vrw_jax.models.registry import collect_provenance_attributes
+from vrw_jax.models.measures import SELECTION_MARGIN_NAMES
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,
@@ -65,197 +51,197 @@ from vrw_jax.models.stepping import (
     require_legs_in_turn_by_collocation,
     require_single_wheel,
 )
-from vrw_jax.studies.optimum_curve import follow_optimum
 from vrw_jax.studies.tune_maximization import (
     EvaluatedTrial,
+    ExplorationResult,
     MaximizationResult,
     OptimalityConditions,
-    TrialKind,
     compute_optimality_conditions,
-    maximize_objective,
-)
-from vrw_jax.studies.tune_objective import (
-    UPPER_BOUND_PREFIX,
-    ConstraintSpecification,
-    CycleObjective,
-    ObjectiveAndConstraints,
-    WeightedMeasureSum,
-    WheelObjective,
-    compute_max_violation,
-    compute_slack_scales,
-    parse_constraint_margins,
-    restore_sign_of_bound,
-    zero_objective,
-)
-from vrw_jax.studies.tune_result import (
-    ActiveConstraint,
-    ExplorationResult,
-    TuneResult,
-    WalkValidation,
     explore_starts,
 )
-from vrw_jax.wheel.params import (
-    FRICTION_NAME,
-    PARAMETER_NAMES,
-    check_parameter_name,
-)
+from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES, WheelParams, check_parameter_name
 
 ParameterBounds = Mapping[str, tuple[float, float]]
 """Lower and upper bound of each free parameter, by the parameter's name."""
 
+ConstraintSpecification = Mapping[str, float | tuple[float | None, float | None]] | Sequence[str]
+
+UPPER_BOUND_PREFIX = "-"
+"""Prefix that marks an upper bound on a measure, which is a lower bound on its negative."""
+
+
+@dataclass(frozen=True)
+class WeightedMeasureSum:
+    """Objective that is a weighted sum of measures of the cycle and the step."""
+
+    measure_reader: GaitMeasureReader
+    measure_weights: tuple[tuple[str, float], ...]
+
+    def __call__(self, cycle: Any, step: Any) -> Array:
+        weighted_measures = [
+            measure_weight * self.measure_reader(measure_name, cycle, step)
+            for measure_name, measure_weight in self.measure_weights
+        ]
+        return sum(weighted_measures[1:], start=weighted_measures[0])
+
+
+@dataclass(frozen=True)
+class CycleObjective:
+    """Objective that a user's function computes from the cycle alone."""
+
+    cycle_function: Callable[[Any], Array]
+
+    def __call__(self, cycle: Any, step: Any) -> Array:
+        return self.cycle_function(cycle)
+
+
+@dataclass(frozen=True)
+class WheelObjective:
+    """Objective of `tune` that a function computes from the parameters of the wheel.
+
+    `tune` calls the function with the `WheelParams` of each trial wheel, and does not compile the
+    function. The function may therefore sample walks, as `first_passage` does. JAX differentiates
+    the function with respect to the free parameters.
+
+    - `wheel_function`: function of `WheelParams` that returns one number.
+
+    Examples:
+        >>> life = lambda params: jnp.log(vrw.first_passage(params, 0.01).mean_steps)
+        >>> bounds = {"damping": (190.0, 205.0)}
+        >>> tuned = vrw.tune(vrw.WheelParams(), vrw.WheelObjective(life), ["damping"], bounds)
+        >>> float(tuned.params.damping)
+        190.0
+    """
+
+    wheel_function: Callable[[WheelParams], Any]
+
+    @property
+    def label(self) -> str:
+        """Return the name of the function, or "objective" if the function has no name."""
+        return getattr(self.wheel_function, "__name__", "objective")
+
+    def evaluate_with_gradient(
+        self, params: WheelParams, free_parameters: Sequence[str]
+    ) -> tuple[float, np.ndarray]:
+        """Return the objective of a wheel, and its derivatives with respect to the free parameters,
+        shape (free,).
+        """
+        select_free_values = lambda wheel_params: [
+            getattr(wheel_params, parameter_name) for parameter_name in free_parameters
+        ]
+
+        def evaluate_free_values(free_values: list[Array]) -> Array:
+            objective_value = self.wheel_function(
+                eqx.tree_at(select_free_values, params, free_values)
+            )
+            _check_objective_value(objective_value)
+            return jnp.asarray(objective_value)
+
+        objective_value, free_gradient = jax.value_and_grad(evaluate_free_values)(
+            select_free_values(params)
+        )
+        return float(objective_value), np.array(free_gradient, float)
+
+
 ObjectiveSpecification = str | Measure | Mapping[str, float] | Callable[..., Array] | WheelObjective
 
 
-N_STEPS_OF_WALK = 10
-"""Number of steps of the walk that validates a tuned wheel."""
-RELATIVE_START_DISPLACEMENT = 1e-5
-"""Relative displacement of the start from the limit cycle."""
-CONSTRAINT_VALUE_TOLERANCE = 1e-3
-"""Accepted violation of a constraint, as a fraction of its value. This tolerance and the next are
-chosen because of two effects. The optimum satisfies a constraint within 1e-6 of its change
-between the bounds, and the start is displaced. Each effect is some thousandths of a take-off
-margin.
-"""
-DEFAULT_MARGIN_TOLERANCE = 1e-2
-"""Accepted violation, as a fraction of the constraint's default margin."""
+def _check_objective_value(objective_value: Any) -> None:
+    """Raise an error if the value of an objective is not one real number."""
+    if jnp.shape(check_reals("objective", objective_value, "return one number")):
+        raise ValueError(
+            f"objective returns an array of shape {jnp.shape(objective_value)}, but what is "
+            "maximised is one number: reduce it, as by jnp.min or jnp.sum."
+        )
 
 
-@announce_wait("the gait, objective and constraints with derivatives", "25 s")
-def tune(
-    params: Any,
-    objective: ObjectiveSpecification,
-    free: Sequence[str],
-    bounds: ParameterBounds,
-    constraints: ConstraintSpecification | None = None,
-    *,
-    model: ModelLike | None = None,
-    options: StepOptions | None = None,
-    cycle_options: CycleOptions | None = None,
-    tolerance: float = 1e-6,
-    max_evaluations: int = 200,
-    n_starts: int = 1,
-    seed: int = 0,
-    along: tuple[str, Any] | None = None,
-) -> Any:
-    """Return the wheel near `params` whose gait maximizes an objective under constraints.
+def zero_objective(cycle: Any, step: Any) -> Array:
+    """Return 0 for any gait, in place of an objective that is not compiled."""
+    return jnp.zeros(())
 
-    The default constraints are all margins that gaits of the model can satisfy (`default_margins`).
-    An empty mapping {} means no constraints. A constraint may be violated by 1e-6 of its change
-    between the bounds. The method is local and ends at an optimum on the branch of `params`. If
-    `n_starts` is above 1, the search begins with `params` and random wheels within the bounds. 25
-    first-order optimizer steps improve all starts in one batch, and the maximization continues from
-    the best.
 
-    With unilateral contact (`UnilateralWheel`) the objective is a measure of a step, a weighted sum
-    of measures, or a `WheelObjective`. A walk from the start finds the first gait. There are no
-    default constraints, and constraints are on measures of a step, for example
-    {"slip": (0.0, 0.05)}. The model "auto" is the model that is selected for the gait of the start.
-    If this is the paper's model, its margins are the constraints, so that the model stays valid.
+@dataclass(frozen=True)
+class ObjectiveAndConstraints:
+    """Function that returns the objective and the constraints of a gait as one array, objective
+    first.
 
-    For a walker of yours, which needs `starts`, the measures are the period, the section
-    coordinates and its own `measures`. There are no default constraints.
-
-    Args:
-        params: the start, one wheel, or the parameters of a walker of yours.
-        objective: quantity to maximize: name of a measure, a measure of your own (`vrw.measure`),
-            weights of measures by name, or a function of a LimitCycle. A function of two arguments
-            also gets the cycle's StepResult. A `WheelObjective` is a function of the wheel that is
-            not compiled.
-        free: names of the parameters that may change.
-        bounds: lower and upper bound of each free parameter.
-        constraints: lower bounds of measures by name, or pairs of lower and upper bounds, of which
-            one may be None: (None, 0.6). A sequence of names means lower bounds of 0.
-        model: the model; the paper's, `ViscoelasticWheel()`, by default.
-        options: numerical options of the walking steps.
-        cycle_options: options of the gait search.
-        tolerance: tolerance of the first-order condition, relative to the objective's gradient.
-        max_evaluations: largest number of evaluated gaits.
-        n_starts: number of starts; the maximization continues from the best.
-        seed: seed of the random starts.
-        along: name and values of another parameter, along which the optimum is followed, such as
-            ("slope", np.linspace(0.30, 0.05, 26)).
-
-    Returns:
-        A `TuneResult`, whose `status` is CONVERGED at an optimum. With `along`, an `OptimumCurve`,
-        with the optimum at each value, and the values at which the active limits change.
-
-    Raises:
-        TypeError, ValueError: if an argument is invalid; the message names the remedy.
-
-    Examples:
-        >>> bounds = {"damping": (100.0, 215.0)}
-        >>> result = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
-        >>> print(result.status.name, f"{result.value:.3f}", [c.name for c in result.active])
-        CONVERGED 0.534 ['damping']
+    A constraint is a measure with a lower bound. A constraint whose name has the prefix
+    `UPPER_BOUND_PREFIX` is a measure with an upper bound.
     """
-    require_untraced_arguments("vrw.tune", "maximize by your own loop over vrw.limit_cycle", params)
-    max_evaluations = check_int("max_evaluations", max_evaluations)
-    n_starts = check_int("n_starts", n_starts)
-    tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
-    if isinstance(objective, WheelObjective) and n_starts > 1:
-        raise ValueError(
-            f"n_starts is {n_starts}, but a WheelObjective cannot be evaluated for a batch of "
-            "wheels: give n_starts=1, and call vrw.tune for each start."
-        )
-    start_seconds = time.perf_counter()
-    tune_problem = make_tune_problem(
-        params,
-        objective,
-        free,
-        bounds,
-        constraints,
-        model=model,
-        options=options,
-        cycle_options=cycle_options,
-    )
-    curve_arguments = None if along is None else _check_along(tune_problem, along)
-    exploration_result = (
-        tune_problem.explore_random_starts(n_starts, seed) if n_starts > 1 else None
-    )
-    tune_problem.gait_finder.precompile_programs(params)
-    start_trial = tune_problem.evaluate_start_trial(
-        tune_problem.normalized_start
-        if exploration_result is None
-        else exploration_result.normalized_parameters[exploration_result.best_start_index]
-    )
-    if curve_arguments is not None:
-        return follow_optimum(
-            tune_problem, *curve_arguments, start_trial, tolerance, max_evaluations
-        )
-    compilation_end_seconds = time.perf_counter()
-    maximization_result = maximize_objective(
-        tune_problem.evaluate_trial,
-        start_trial,
-        tolerance=tolerance,
-        max_evaluations=max_evaluations,
-    )
-    return tune_problem.make_tune_result(
-        maximization_result, start_seconds, compilation_end_seconds, exploration_result
-    )
+
+    objective_function: GaitFunction
+    measure_reader: GaitMeasureReader
+    constraint_names: tuple[str, ...]
+
+    def __call__(self, cycle: Any, step: Any) -> Array:
+        objective_value = self.objective_function(cycle, step)
+        _check_objective_value(objective_value)
+        constraint_values = []
+        for constraint_name in self.constraint_names:
+            measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
+            measure_value = jnp.ravel(self.measure_reader(measure_name, cycle, step))
+            constraint_values.append(
+                measure_value if measure_name == constraint_name else -measure_value
+            )
+        return jnp.concatenate([jnp.ravel(objective_value), *constraint_values])
 
 
-def _check_along(problem: TuneProblem, along: Any) -> tuple[str, list[float]]:
-    """Return the name and the values of the parameter along which an optimum is followed."""
-    check_type("along", along, tuple, 'write along=("slope", (0.30, 0.25, 0.20))')
-    if len(along) != 2:
-        raise ValueError(
-            f"along has {len(along)} entries, but it is a parameter and its values: write "
-            'along=("slope", (0.30, 0.25, 0.20)).'
+def parse_constraint_margins(
+    params: Any, constraints: ConstraintSpecification | None, gait_finder: AbstractGaitFinder
+) -> dict[str, float]:
+    """Return the smallest allowed value of each constrained measure, by name.
+
+    The name of a measure with an upper bound has the prefix `UPPER_BOUND_PREFIX`. Its value is then
+    the smallest allowed value of the negative measure.
+    """
+    if constraints is None:
+        model, readable = gait_finder.model, gait_finder.readable_measures
+        if not model.is_wheel or model.batch_kernel != "phases":
+            return {}
+        return {name: x for name, x in default_margins(params).items() if name in readable}
+    constraint_margins = {}
+    if isinstance(constraints, Mapping):
+        for measure_name, bound_or_range in constraints.items():
+            if not isinstance(bound_or_range, tuple):
+                constraint_margins[measure_name] = check_real(
+                    f"the margin of {measure_name}", bound_or_range
+                )
+                continue
+            if bound_or_range == (None, None):
+                raise ValueError(
+                    f"the range of {measure_name} is (None, None), which bounds nothing: give a "
+                    "lower or an upper bound, as in (None, 0.6), or leave the constraint out."
+                )
+            if len(bound_or_range) != 2 or None not in bound_or_range:
+                bound_or_range = check_range(f"the range of {measure_name}", bound_or_range)
+            lower_limit, upper_limit = bound_or_range
+            if upper_limit is not None:
+                upper_bound = check_real(f"the upper end of {measure_name}", upper_limit)
+                constraint_margins[UPPER_BOUND_PREFIX + measure_name] = -upper_bound
+            if lower_limit is not None:
+                constraint_margins[measure_name] = check_real(
+                    f"the lower end of {measure_name}", lower_limit
+                )
+    else:
+        constraint_margins = dict.fromkeys(check_names("constraints", constraints), 0.0)
+    if "clearance_sls1" in constraint_margins:
+        # The take-off acceleration has a nonzero derivative if the clearance has none.
+        constraint_margins.setdefault("takeoff_acceleration", 0.0)
+    for measure_name in constraint_margins:
+        require_known_name(
+            measure_name.removeprefix(UPPER_BOUND_PREFIX),
+            gait_finder.readable_measures,
+            "measure for a constraint",
         )
-    name, values = along
-    check_parameter_name(name, problem.gait_finder.model.parameter_names, "parameter")
-    if name in problem.free_parameters:
-        raise ValueError(
-            f"along is {name!r}, which is free, but the optimum is followed along a parameter that "
-            "is not: take it out of free."
-        )
-    numbers = check_reals("the values in along", values)
-    if numbers.ndim != 1 or numbers.size < 2:
-        raise ValueError(
-            f"the values in along have shape {numbers.shape}, but a curve needs a row of at least "
-            "two: write np.linspace(0.30, 0.05, 26)."
-        )
-    return name, np.asarray(numbers).tolist()
+    return constraint_margins
+
+
+def restore_sign_of_bound(constraint_name: str, lower_bound: float) -> float:
+    """Return the bound on a measure, converted from the smallest allowed value of a constraint.
+
+    The sign changes if the name of the constraint has the prefix of upper bounds.
+    """
+    return float(-lower_bound if constraint_name.startswith(UPPER_BOUND_PREFIX) else lower_bound)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -326,8 +312,7 @@ class TuneProblem:
     def make_wheel(self, normalized_parameters: np.ndarray) -> Any:
         """Return the wheel with these normalized free parameters, and with its laws."""
         model, params = self.gait_finder.model.from_parameter_values(
-            jnp.asarray(self.denormalize_parameters(normalized_parameters)),
-            self.gait_finder.n_legs,
+            jnp.asarray(self.denormalize_parameters(normalized_parameters)), self.gait_finder.n_legs
         )
         return model.attach_laws(params)
 
@@ -439,11 +424,15 @@ class TuneProblem:
 
     def explore_random_starts(self, n_starts: int, seed: int) -> ExplorationResult:
         """Explore from this wheel and from random wheels in one batch, and return the ends."""
-        random_normalized_starts = np.random.default_rng(seed).uniform(
-            size=(n_starts - 1, len(self.free_parameters))
-        )
+        if self.wheel_objective is not None:
+            raise ValueError(
+                f"n_starts is {n_starts}, but a WheelObjective cannot be evaluated for a batch of "
+                "wheels: give n_starts=1, and call vrw.tune for each start."
+            )
+        shape = n_starts - 1, len(self.free_parameters)
+        random_starts = np.random.default_rng(seed).uniform(size=shape)
         return explore_starts(
-            self.evaluate_trial, np.vstack([self.normalized_start, random_normalized_starts])
+            self.evaluate_trial, np.vstack([self.normalized_start, random_starts])
         )
 
     def compute_conditions_per_unit(self, result: MaximizationResult) -> OptimalityConditions:
@@ -456,199 +445,6 @@ class TuneProblem:
         limit_widths = np.r_[np.ones(len(self.constraint_names)), np.tile(self.bound_widths, 2)]
         return conditions._replace(price_ranges=conditions.price_ranges / limit_widths[:, None])
 
-    def make_tune_result(
-        self,
-        maximization_result: MaximizationResult,
-        start_seconds: float,
-        compilation_end_seconds: float,
-        exploration_result: ExplorationResult | None,
-    ) -> TuneResult:
-        """Return the `TuneResult` for a maximization, with active constraints and a validation
-        walk.
-        """
-        best_trial = maximization_result.best_trial
-        best_gait = best_trial.gait
-        params = self.make_wheel(best_trial.normalized_parameters)
-        model: Any = self.gait_finder.model
-        laws = getattr(params, "laws", None)
-        if laws is not None:
-            model = model.with_laws(laws)
-        unit_by_parameter = {name: x.unit for name, x in model.parameter_domains.items()}
-        conditions = self.compute_conditions_per_unit(maximization_result)
-        limited_names = (*self.constraint_names, *self.free_parameters * 2)
-        limits = [*self.min_constraint_values, *self.lower_bounds, *self.upper_bounds]
-        price_ranges = conditions.price_ranges
-        if not conditions.are_satisfied:
-            price_ranges[price_ranges[:, 1] > 0.0] = np.nan
-        active_constraints = [
-            ActiveConstraint(
-                limited_name.removeprefix(UPPER_BOUND_PREFIX),
-                restore_sign_of_bound(limited_name, limit),
-                unit_by_parameter.get(limited_name)
-                or self.gait_finder.get_measure(limited_name).unit,
-                low if low == high else np.nan,
-                (low, high),
-            )
-            for limited_name, limit, (low, high) in zip(
-                limited_names, limits, price_ranges.tolist(), strict=True
-            )
-            if high != 0.0
-        ]
-        kink_names = [
-            limited_name.removeprefix(UPPER_BOUND_PREFIX)
-            for limited_name in (self.objective_label, *self.constraint_names)
-        ]
-        end_seconds = time.perf_counter()
-        walk_validation = self._validate_tuned_wheel_by_walking(params, best_gait)
-        step_measures = self.gait_finder.measure_step(params, best_gait.cycle, best_gait.step)
-        return TuneResult(
-            params=params if laws is None else params.attach_laws(None),
-            model=model,
-            status=maximization_result.status,
-            objective=self.objective_label,
-            value=float(best_trial.objective),
-            start_value=float(maximization_result.evaluated_trials[0].objective),
-            cycle=best_gait.cycle,
-            step=best_gait.step,
-            active=tuple(active_constraints),
-            kkt_residual=conditions.kkt_residual,
-            kinks=tuple(np.array(kink_names)[conditions.has_kink].tolist()),
-            violated_margins=tuple(
-                measure_name
-                for measure_name in MARGIN_MEASURES
-                if measure_name in step_measures
-                and measure_name not in self.constraint_margins
-                and np.min(step_measures[measure_name]) < 0.0
-            ),
-            validation=walk_validation,
-            path=self._make_path_dataset(maximization_result),
-            n_evaluations=len(maximization_result.evaluated_trials)
-            + (0 if exploration_result is None else exploration_result.n_evaluations),
-            n_backtracks=sum(
-                trial_kind in (TrialKind.LOST, TrialKind.NOT_FINITE)
-                for trial_kind in maximization_result.trial_kinds
-            ),
-            seconds=end_seconds - start_seconds,
-            compile_seconds=compilation_end_seconds - start_seconds,
-            exploration=exploration_result,
-        )
-
-    def _validate_tuned_wheel_by_walking(self, params: Any, gait: Gait) -> WalkValidation:
-        """Simulate a walk that starts near the section state of the gait, and return its
-        validation.
-        """
-        cycle_section_state = np.array(gait.cycle.section_state)
-        # The state is scaled down, not up, because no leg may be beyond its stopper.
-        section_state = cycle_section_state * (1.0 - RELATIVE_START_DISPLACEMENT)
-        is_gait_feasible, walk_outcome, n_steps_walked = True, Outcome.STEPPED, 0
-        default_margins_by_name = default_margins(params) if self.gait_finder.model.is_wheel else {}
-        for _ in range(N_STEPS_OF_WALK):
-            step_result = self.gait_finder.take_gait_step(params, jnp.asarray(section_state))
-            walk_outcome = Outcome(int(step_result.outcome))
-            if walk_outcome != Outcome.STEPPED:
-                break
-            step_measures = self.gait_finder.measure_step(params, section_state, step_result)
-            n_steps_walked, section_state = n_steps_walked + 1, np.array(step_result.section_state)
-            for constraint_name, min_constraint_value in self.constraint_margins.items():
-                measure_name = constraint_name.removeprefix(UPPER_BOUND_PREFIX)
-                if measure_name not in step_measures:
-                    continue
-                constraint_value = np.asarray(step_measures[measure_name])
-                if measure_name != constraint_name:
-                    constraint_value = -constraint_value
-                default_margin = abs(default_margins_by_name.get(constraint_name, 0.0))
-                violation_tolerance = (
-                    CONSTRAINT_VALUE_TOLERANCE * np.max(np.abs(constraint_value))
-                    + DEFAULT_MARGIN_TOLERANCE * default_margin
-                )
-                is_gait_feasible &= bool(
-                    np.all(constraint_value >= min_constraint_value - violation_tolerance)
-                )
-        final_state_distance = float(np.max(np.abs(section_state - cycle_section_state)))
-        return WalkValidation(
-            n_steps_walked,
-            walk_outcome,
-            final_state_distance,
-            is_gait_feasible and walk_outcome == Outcome.STEPPED,
-        )
-
-    def _make_path_dataset(self, maximization_result: MaximizationResult) -> xr.Dataset:
-        """Return a dataset that lists all trials of a maximization in order."""
-        trials = maximization_result.evaluated_trials
-        normalized_parameters = np.array([trial.normalized_parameters for trial in trials])
-        parameter_values = self.lower_bounds + normalized_parameters * self.bound_widths
-        min_constraint_values = self.min_constraint_values
-        constraint_slacks = np.array([trial.constraint_slacks for trial in trials])
-        slack_scales = compute_slack_scales(trials[0].constraint_slacks, trials[0].slack_jacobian)
-        trial_outcomes = [
-            trial.outcome if trial.is_on_branch else Outcome.NO_CYCLE_FOUND for trial in trials
-        ]
-        domains = self.gait_finder.model.parameter_domains
-        objective_attributes = {"long_name": self.objective_label}
-        if self.objective_label in self.gait_finder.differentiable_measures:
-            objective_attributes["units"] = self.gait_finder.get_measure(self.objective_label).unit
-        path_dataset_variables: dict[str, Any] = {
-            name: (
-                "evaluation",
-                values,
-                describe_parameter(name, domains[name]).variable_attributes,
-            )
-            for name, values in zip(self.free_parameters, parameter_values.T, strict=True)
-        }
-        path_dataset_variables |= {
-            "objective": (
-                "evaluation",
-                [trial.objective for trial in trials],
-                objective_attributes,
-            ),
-            "constraint_value": (
-                ("evaluation", "constraint"),
-                constraint_slacks + min_constraint_values,
-            ),
-            "margin": ("constraint", min_constraint_values, {"long_name": "least value allowed"}),
-            "breach": (
-                "evaluation",
-                compute_max_violation(constraint_slacks, slack_scales),
-                {"long_name": "largest breach of a constraint, in widths of the bounds"},
-            ),
-            "kind": (
-                "evaluation",
-                np.array(maximization_result.trial_kinds, int),
-                make_flag_attributes(TrialKind.__members__),
-            ),
-            "outcome": (
-                "evaluation",
-                np.array(trial_outcomes, int),
-                make_measure_attributes("outcome"),
-            ),
-            "on_branch": ("evaluation", np.array([trial.is_on_branch for trial in trials])),
-        }
-        constraint_units = [
-            self.gait_finder.get_measure(constraint_name).unit
-            for constraint_name in self.constraint_names
-        ]
-        path_dataset_coordinates = {
-            "evaluation": np.arange(len(trials)),
-            "constraint": list(self.constraint_names),
-            "constraint_unit": ("constraint", constraint_units),
-            "free_parameter": list(self.free_parameters),
-        }
-        path_dataset_attributes = {
-            "title": f"Path of tuning {self.objective_label} over "
-            f"{', '.join(self.free_parameters)}",
-            "lower": self.lower_bounds.tolist(),
-            "upper": self.upper_bounds.tolist(),
-            "ending": maximization_result.status.name,
-        }
-        provenance_attributes = collect_provenance_attributes(
-            self.params, self.gait_finder.model, self.gait_finder.step_options
-        )
-        return xr.Dataset(
-            path_dataset_variables,
-            path_dataset_coordinates,
-            path_dataset_attributes | provenance_attributes,
-        )
-
 
 def make_tune_problem(
     params: Any,
@@ -656,7 +452,6 @@ def make_tune_problem(
     free: Sequence[str],
     bounds: ParameterBounds,
     constraints: ConstraintSpecification | None,
-    *,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,
@@ -828,3 +623,27 @@ def _check_parameter_bounds(
             )
     bound_pairs = np.array([bounds[parameter_name] for parameter_name in free_parameters], float)
     return free_parameters, *bound_pairs.T
+
+
+def check_along(problem: TuneProblem, along: Any) -> tuple[str, list[float]]:
+    """Return the name and the values of the parameter along which an optimum is followed."""
+    check_type("along", along, tuple, 'write along=("slope", (0.30, 0.25, 0.20))')
+    if len(along) != 2:
+        raise ValueError(
+            f"along has {len(along)} entries, but it is a parameter and its values: write "
+            'along=("slope", (0.30, 0.25, 0.20)).'
+        )
+    name, values = along
+    check_parameter_name(name, problem.gait_finder.model.parameter_names, "parameter")
+    if name in problem.free_parameters:
+        raise ValueError(
+            f"along is {name!r}, which is free, but the optimum is followed along a parameter that "
+            "is not: take it out of free."
+        )
+    numbers = check_reals("the values in along", values)
+    if numbers.ndim != 1 or numbers.size < 2:
+        raise ValueError(
+            f"the values in along have shape {numbers.shape}, but a curve needs a row of at least "
+            "two: write np.linspace(0.30, 0.05, 26)."
+        )
+    return name, np.asarray(numbers).tolist()

@@ -2,8 +2,6 @@
 
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.wheel.dynamics import Motion, compute_landing_foot_height, compute_rear_foot_height
-from vrw_jax.wheel.ground import GroundAhead
-from vrw_jax.wheel.outcomes import ContactMode
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
     PARAMETER_DOMAINS,
@@ -15,3 +13,4 @@ from vrw_jax.wheel.params import (
     stack_parameters,
 )
 from vrw_jax.wheel.phases import PAPER_PHASES, PhaseInstant, PhaseMargins, make_paper_phases
+from vrw_jax.wheel.transitions import ContactMode, GroundAhead

@@ -31,8 +31,8 @@ from vrw_jax.wheel.dynamics import (
     compute_rear_foot_height,
 )
 from vrw_jax.wheel.laws import OneSidedLegForce, count_kinks, evaluate_leg_kinks
-from vrw_jax.wheel.outcomes import are_coordinates_at_rest
 from vrw_jax.wheel.params import Symbols, compute_wheel_units
+from vrw_jax.wheel.transitions import are_coordinates_at_rest
 
 SHARED_FAILURE_OUTCOMES = (Outcome.FELL_BACK, Outcome.COLLAPSED, Outcome.LEG_1_LIFTED_OFF)
 """Outcomes with which any phase can end instead of the regular end."""

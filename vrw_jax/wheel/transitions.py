@@ -1,16 +1,29 @@
-"""Collisions between the phases: the landing of a foot, and the collision of Leg 2 with its
-stopper.
+"""Landings on even and uneven ground, the collision of Leg 2 with its stopper, and rest.
 
 The landing follows Section 3.4.1 of the paper, with the procedure of its Section 5.1. The collision
 with the stopper follows Section 3.4.2 of the paper.
+
+On uneven ground, straight lines join the footholds, and both feet of a double support stand on one
+of them. The slopes of the lines are given, or the heights of the footholds above a mean line. A
+slope between two heights depends on the distance of the feet, and therefore on the motion.
+
+For a wheel at rest, round-off decides which guard ends the step, or whether any guard does. The
+outcome therefore depends only on the state at the end of the step. It is the same with every
+engine.
 """
 
+import functools
+import operator
+from collections.abc import Iterable, Sequence
+from enum import IntEnum
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.base.elementwise import compute_arcsine, compute_sine_cosine
+from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.types import Elementwise
 from vrw_jax.wheel.dynamics import (
     EquationTerms,
@@ -285,28 +298,17 @@ def compute_hub_velocity_jump(
 
 
 def compute_locked_leg_impulses(
-    s: Symbols,
-    motion: Motion,
-    hub_velocity_jump: tuple[Elementwise, Elementwise],
-    leg_numbers: range,
-) -> Float[Array, "n_legs_asked ..."]:
-    """Return the impulse that the stopper exerts on the mass of each leg of `leg_numbers`, N s.
+    s: Symbols, motion: Motion, hub_velocity_jump: tuple[Elementwise, Elementwise]
+) -> Float[Array, "n_locked ..."]:
+    """Return the impulse that the stopper exerts on the mass of each of legs 3 to n, N s.
 
     The impulse follows from the jump of the hub's velocity. It is negative if the collision throws
     the leg off its stopper, because the preload of a spring resists no impulse.
     """
-    leg_angles = s.alpha * (
-        np.asarray(leg_numbers).reshape(-1, *(1,) * jnp.ndim(motion.sin_theta)) - 1
-    )
-    radial_velocity_jump = (
-        hub_velocity_jump[0] * motion.sin_theta + hub_velocity_jump[1] * motion.cos_theta
-    )
-    transverse_velocity_jump = (
-        hub_velocity_jump[0] * motion.cos_theta - hub_velocity_jump[1] * motion.sin_theta
-    )
-    return s.m * (
-        radial_velocity_jump * np.cos(leg_angles) + transverse_velocity_jump * np.sin(leg_angles)
-    )
+    leg_angles = s.alpha * np.arange(2, s.n).reshape(-1, *(1,) * jnp.ndim(motion.sin_theta))
+    (x, z), sin, cos = hub_velocity_jump, motion.sin_theta, motion.cos_theta
+    radial_jump, transverse_jump = x * sin + z * cos, x * cos - z * sin
+    return s.m * (radial_jump * np.cos(leg_angles) + transverse_jump * np.sin(leg_angles))
 
 
 def compute_landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, FootForce]:
@@ -324,3 +326,127 @@ def compute_landing_forces(s: Symbols, landing: Landing) -> tuple[FootForce, Foo
     acceleration = solve_double_support(s, landing.foot_distance, motion)
     rear_force = compute_rear_foot_force(s, motion, acceleration)
     return compute_fore_foot_force(s, motion, acceleration, rear_force), rear_force
+
+
+def compute_line_slope(
+    mean_slope: Elementwise, rise: Elementwise, foot_distance: Elementwise
+) -> Elementwise:
+    """Return the slope of the line from one foothold to the next one, rad.
+
+    - `mean_slope`: slope of the line from which heights are measured, rad;
+    - `rise`: height of the next foothold minus that of the foothold, m;
+    - `foot_distance`: distance between both footholds, m.
+    """
+    return mean_slope - compute_arcsine(rise / foot_distance)
+
+
+class GroundAhead(NamedTuple):
+    """Ground ahead of a step, seen from the line under both feet of its double support.
+
+    The reference line begins under the foot of Leg 1. It is the next line of the ground if slopes
+    are given, and parallel to the mean line if heights are given.
+    """
+
+    tilt: Elementwise  # angle by which the reference line is steeper, rad
+    rise: Elementwise | None = None  # height of the next foothold above it, m; None for slopes
+
+    def compute_next_line_tilt(self, foot_distance: Elementwise) -> Elementwise:
+        """Return the angle by which the next line of the ground is steeper, rad.
+
+        - `foot_distance`: distance between the next foothold and the foot of Leg 1, m.
+        """
+        if self.rise is None:
+            return self.tilt
+        return compute_line_slope(self.tilt, self.rise, foot_distance)
+
+
+def compute_foot_distance(s: Symbols, theta: Elementwise) -> Elementwise:
+    """Return the distance between both feet at the touchdown with the angle theta, m."""
+    return s.L0 * s.sin_alpha / compute_sine_cosine(theta)[1]
+
+
+def compute_foot_distance_for_length(s: Symbols, L1: Elementwise) -> Elementwise:
+    """Return the distance between the foot of Leg 1 and the foot that lands next, m."""
+    return jnp.sqrt(L1 * L1 + s.L0 * s.L0 - 2.0 * s.L0 * s.cos_alpha * L1)
+
+
+POSSIBLE_OUTCOMES_AT_REST = (Outcome.FELL_BACK, Outcome.NO_TOUCHDOWN_IN_TIME, Outcome.SOLVER_FAILED)
+"""Outcomes with which a step can end before the wheel is recognized to be at rest."""
+
+MAX_REST_SPEED = 1e-8
+"""Largest speed of a wheel at rest, in the wheel's own units. The value is chosen because it is a
+thousand times the error of a solver step at the default tolerances.
+"""
+REST_SPEED_PER_ATOL = 10.0
+"""Upper bound on the speed of a wheel at rest, divided by the absolute tolerance. The larger of
+this bound and `MAX_REST_SPEED` is used. The value is chosen because the errors of solver steps stay
+below one tolerance.
+"""
+MAX_REST_ACCELERATION = 1e-4
+"""Largest acceleration of a wheel at rest, in the wheel's own units. The value is chosen because it
+lies between two scales: errors of the accelerations of stiff legs are below 1e-5, and accelerations
+of wheels that fall back are near 1.
+"""
+
+
+def are_rates_negligible(
+    coordinate_rates: Iterable[Elementwise], rate_units: Iterable[Elementwise], atol: Elementwise
+) -> Bool[Array, "..."]:
+    """Return whether all rates are 0 within the accuracy of the solver steps.
+
+    - `rate_units`: the wheel's own unit of each rate;
+    - `atol`: absolute tolerance in the wheel's own units.
+    """
+    max_speed = jnp.maximum(MAX_REST_SPEED, REST_SPEED_PER_ATOL * atol)
+    return _are_quantities_small(coordinate_rates, rate_units, max_speed)
+
+
+def are_coordinates_at_rest(
+    coordinate_rates: Iterable[Elementwise],
+    coordinate_accelerations: Iterable[Elementwise],
+    rate_units: Sequence[Elementwise] | Array,
+    time_unit: Elementwise,
+    atol: Elementwise,
+) -> Bool[Array, "..."]:
+    """Return whether rates and accelerations of all coordinates are negligible.
+
+    - `rate_units`, `time_unit`: the wheel's own units of the rates and of time;
+    - `atol`: absolute tolerance in the wheel's own units.
+    """
+    return are_rates_negligible(coordinate_rates, rate_units, atol) & _are_quantities_small(
+        coordinate_accelerations, rate_units, MAX_REST_ACCELERATION / time_unit
+    )
+
+
+def _are_quantities_small(
+    quantities: Iterable[Elementwise],
+    quantity_units: Iterable[Elementwise],
+    max_value_in_units: Elementwise,
+) -> Bool[Array, "..."]:
+    is_quantity_small = [
+        jnp.abs(x) <= max_value_in_units * quantity_unit
+        for x, quantity_unit in zip(quantities, quantity_units, strict=True)
+    ]
+    return functools.reduce(operator.and_, is_quantity_small)
+
+
+def replace_rest_outcome(
+    step_outcome: Int[Array, "..."], is_at_rest: Bool[Array, "..."]
+) -> Int[Array, "..."]:
+    """Return the outcomes of steps. The outcome is CAME_TO_REST if the wheel is at rest at the
+    end.
+    """
+    has_rest_outcome = functools.reduce(
+        operator.or_,
+        [step_outcome == possible_outcome for possible_outcome in POSSIBLE_OUTCOMES_AT_REST],
+    )
+    return jnp.where(has_rest_outcome & is_at_rest, jnp.int32(Outcome.CAME_TO_REST), step_outcome)
+
+
+class ContactMode(IntEnum):
+    """Contact mode of a foot. Section states and trajectories contain these integers."""
+
+    OFF = 0  # in the air
+    STICK = 1  # at rest on the ground
+    SLIP_DOWN = 2  # sliding downhill
+    SLIP_UP = 3  # sliding uphill

@@ -1,19 +1,24 @@
-"""Compute measures to within a tolerance, from the simplest model whose error can be bounded.
+"""Compute measures and their means to within a tolerance.
 
-One walking step with unilateral contact starts at the gait of the lower model. The defect of this
-step, propagated to the measure by the lower model's derivatives, approximates the model error to
-second order. The estimate is a dual-weighted residual (R. Becker and R. Rannacher, Acta Numerica
-10, 2001), in which the next model replaces the finer mesh. If the error is within the tolerance,
-the lower model's measure is returned. Otherwise Newton's method, starting at the end of that step,
-finds the gait with unilateral contact. If that gait is far from the lower model's gait, a walk to
-another gait is computed.
+Measures of each wheel are computed with the simplest model whose error can be bounded. For means
+over many wheels with unilateral contact, the paper's model is a control variate.
+
+The measure is computed with the paper's model for all wheels. Only the difference from the measure
+with unilateral contact is sampled (M. B. Giles, Acta Numerica 24, 2015; B. Peherstorfer, K. Willcox
+and M. Gunzburger, SIAM Review 60, 2018). A pilot sample of wheels determines which control variate
+reduces the total cost most, its weight, and the number of further wheels.
+
+The measures of the pilot's wheels enter the sum directly, and further wheels are drawn from the
+remaining wheels. The weight is therefore never applied to the measures from which it was computed,
+and the mean is unbiased. If some wheels have no gait, the mean is a ratio of sums over all wheels.
+Its bias is then inversely proportional to the number of sampled wheels.
 """
 
 import functools
 import math
+import operator
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +28,7 @@ import numpy as np
 from vrw_jax.base.checks import (
     check_bool,
     check_choice,
+    check_int,
     check_names,
     check_positive,
     check_type,
@@ -34,19 +40,13 @@ from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.printing import (
     AbstractPrintable,
     LabelAndText,
-    StatusCode,
     describe_step_ending,
     format_each_batch_element,
     format_outcome_counts,
 )
 from vrw_jax.base.progress import announce_wait
-from vrw_jax.gaits.gait_search import GaitChoice, parse_gait_choice
-from vrw_jax.gaits.gait_walks import compute_walk_starts
-from vrw_jax.lanes.batching import (
-    replace_rows,
-    select_rows_on_device,
-    select_tree_rows,
-)
+from vrw_jax.gaits.gait_walks import GaitChoice, parse_gait_choice
+from vrw_jax.lanes.batching import select_rows_on_device, select_tree_rows
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.studies.fidelity import (
     MEASURE_FUNCTIONS,
@@ -54,39 +54,19 @@ from vrw_jax.studies.fidelity import (
     TIGHT_TOLERANCE,
     VERY_TIGHT_TOLERANCE,
     ContactWheelBatch,
-    LowerFidelityGaits,
     ModelIndex,
     compute_static_leg_contraction,
     evaluate_measures,
     find_paper_gaits,
     find_rigid_gaits,
-    multiply_rows,
 )
 from vrw_jax.studies.refinement import (
-    RefinedGaits,
+    REQUEST_SAFETY_FACTOR,
+    MeasureRequest,
+    MeasureStatus,
     estimate_measures_from_lower_gaits,
-    refine_gaits,
-    walk_until_settled,
 )
 from vrw_jax.wheel.params import FRICTION_NAME, WheelParams, convert_friction
-
-
-class MeasureStatus(StatusCode):
-    """Method by which a measure was computed."""
-
-    CHECKED_BY_ONE_STEP = 0, "checked by one step with unilateral contact"
-    CONTINUES_LOWER_GAIT = 1, "the gait that continues the lower model's"
-    REACHED_FROM_LOWER_GAIT = (
-        2,
-        "a gait to which a walk from the lower model's gait leads",
-    )
-    REACHED_FROM_START = (
-        3,
-        "a gait to which a walk from a start leads, as the paper's wheel has no gait",
-    )
-    NO_GAIT = 4, "no such gait with unilateral contact"
-    SELECTED_BY_RANK = 5, "one of the attracting gaits"
-
 
 MODEL_LABELS = ("no model", "the rigid wheel", "the paper's wheel", "unilateral contact")
 """Labels of the models in printed results, in the order of `ModelIndex`."""
@@ -337,7 +317,7 @@ def measure_to_tolerance(
     step_options = StepOptions(rtol=solver_tolerance, atol=solver_tolerance)
     step_options.check_tolerances(np.dtype(float))
     wheel_batch = ContactWheelBatch.from_params(params, friction_by_wheel, stoppers, step_options)
-    measure_request = _MeasureRequest(measure_names, tol, relative, wheel_batch, params)
+    measure_request = MeasureRequest(measure_names, tol, relative, wheel_batch, params)
     if gait_rank is None:
         with np.errstate(all="ignore"):
             contraction = compute_static_leg_contraction(params)
@@ -388,246 +368,298 @@ def broadcast_params_and_friction(
     broadcast_to_batch = lambda wheel_argument_array: np.broadcast_to(
         np.asarray(wheel_argument_array, float), (n_wheels,)
     )
-    return (
-        jax.tree.map(broadcast_to_batch, params),
-        broadcast_to_batch(friction),
-        batch_shape,
+    return (jax.tree.map(broadcast_to_batch, params), broadcast_to_batch(friction), batch_shape)
+
+
+CONTROL_VARIATES = {
+    "no control": 0.0,
+    "the paper's gaits": 1.0,
+    "the paper's gaits with one contact step": 2.0,
+}
+"""Costs per wheel of the control variates, in steps with unilateral contact, by name. The sampling
+uses the control variate whose plan has the lowest cost.
+
+In batches, the paper's gait costs as much as one walking step with unilateral contact.
+"""
+
+
+class MultifidelityMean(AbstractPrintable):
+    """Mean of a measure over wheels with unilateral contact.
+
+    - `measure`: name of the measure;
+    - `value`: mean, in the measure's unit;
+    - `error`: two standard errors of the mean, plus the mean of the error bounds for the gaits;
+    - `n_gaits`: number of sampled wheels that have a gait with unilateral contact;
+    - `n_high_fidelity`: number of wheels computed with unilateral contact, including the pilot
+      sample;
+    - `control`: name of the control variate;
+    - `weight`: weight of the control variate;
+    - `cost`: total cost in walking steps with unilateral contact, including the equivalent cost of
+      the control variate;
+    - `cost_high_fidelity_only`: expected cost of a mean with the same error, computed without a
+      control variate, in walking steps.
+
+    Examples:
+        >>> wheels = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 60))
+        >>> mean = vrw.multifidelity_mean("speed", wheels, 1e-2, friction=15.0, pilot=12)
+        >>> bool(mean.n_high_fidelity < 60)
+        True
+    """
+
+    value: float
+    error: float
+    n_gaits: float
+    n_high_fidelity: float
+    weight: float
+    cost: float
+    cost_high_fidelity_only: float
+    measure: str = eqx.field(static=True)
+    control: str = eqx.field(static=True)
+
+    @property
+    def ending(self) -> str:
+        """Return a sentence with the number of wheels computed with unilateral contact."""
+        return (
+            f"{self.n_high_fidelity:.0f} wheels were computed with unilateral contact; "
+            f"{self.n_gaits:.0f} of them have a gait."
+        )
+
+    def summary_rows(self) -> list[LabelAndText]:
+        measure_unit = MEASURES[self.measure].display_unit
+        return [
+            (f"mean {self.measure}", f"{self.value:.6g} ± {self.error:.1g} {measure_unit}".strip()),
+            (
+                "with unilateral contact",
+                f"{self.n_high_fidelity:.0f} wheels, {self.n_gaits:.0f} of them with a gait",
+            ),
+            ("control", f"{self.control}, weight {self.weight:.3g}"),
+            ("contact steps", f"{self.cost:.3g}, alone {self.cost_high_fidelity_only:.3g}"),
+        ]
+
+
+# Number of standard errors in the reported error of a mean.
+N_STANDARD_ERRORS = 2.0
+# Allowed error of each gait's measure, as a fraction of the mean's allowed error.
+GAIT_ERROR_FRACTION = 0.1
+# Smallest number of wheels with a gait in the pilot sample, from which the variance is estimated.
+MIN_PILOT_GAITS = 8
+
+
+@announce_wait("gaits of each model", "30 s")
+def multifidelity_mean(
+    measure: str,
+    params: WheelParams,
+    tol: float,
+    *,
+    friction: Any = 0.7,
+    pilot: int = 32,
+    seed: int = 0,
+    stoppers: str = "bilateral",
+) -> MultifidelityMean:
+    """Return the mean of a measure over wheels with unilateral contact, to within `tol`.
+
+    Fields of `params` and `friction` have one axis over the wheels. The wheels are, for example,
+    samples of manufacturing tolerances. The mean is over the wheels that have a gait with
+    unilateral contact. Most wheels are computed with a cheaper model of lower fidelity.
+
+    Args:
+        measure: name of one of the measures of `measure_to_tolerance`.
+        params: the wheels.
+        tol: allowed error (two standard errors), in the measure's unit.
+        friction: friction coefficient of the ground.
+        pilot: number of wheels in the pilot sample.
+        seed: seed of the random sample.
+        stoppers: stoppers of the wheels, "bilateral" or "one-sided".
+
+    Returns:
+        A `MultifidelityMean`: the mean, its error, and its cost.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid, or if too few wheels have a gait.
+
+    Examples:
+        >>> wheels = vrw.WheelParams(damping=jnp.linspace(120.0, 200.0, 60))
+        >>> mean = vrw.multifidelity_mean("speed", wheels, 1e-2, friction=15.0, pilot=12)
+        >>> bool(mean.error < 1.1e-2)
+        True
+    """
+    require_untraced_arguments(
+        "vrw.multifidelity_mean", "it on numbers, and give wheels as arrays", params, friction
+    )
+    check_type("measure", measure, str, "give the name of one, 'speed', say")
+    require_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
+    check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
+    tol = check_positive("tol", tol)
+    pilot = check_int("pilot", pilot, MIN_PILOT_GAITS, ", to estimate a variance")
+    seed = check_int("seed", seed, 0)
+    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(params, friction)
+    n_wheels = len(friction_by_wheel)
+    if not batch_shape or n_wheels <= pilot:
+        raise ValueError(
+            f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels "
+            "than its pilot: give a batch, params.damping of shape (1000,), say."
+        )
+
+    def measure_wheels(indices: np.ndarray) -> MeasureResult:
+        return measure_to_tolerance(
+            measure,
+            select_rows_on_device(params, indices),
+            GAIT_ERROR_FRACTION * tol,
+            friction=friction_by_wheel[indices],
+            stoppers=stoppers,
+        )
+
+    evaluate_control = functools.partial(
+        _evaluate_control, measure, params, friction_by_wheel, stoppers
+    )
+    pilot_wheels, other_wheels = np.split(
+        np.random.default_rng(seed).permutation(n_wheels), [pilot]
+    )
+    pilot_results = measure_wheels(pilot_wheels)
+    has_pilot_gait = pilot_results.found
+    if np.sum(has_pilot_gait) < MIN_PILOT_GAITS:
+        raise ValueError(
+            f"{np.sum(has_pilot_gait)} of the pilot's {pilot} wheels have a gait with contact, but "
+            f"a mean needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
+        )
+    pilot_values, mean_steps = _zero_missing(pilot_results), float(np.mean(pilot_results.n_steps))
+    plans = []
+    for name, cost in CONTROL_VARIATES.items():
+        n_drawn, weights = _plan_sampling(
+            *pilot_values, evaluate_control(pilot_wheels, name), tol, len(other_wheels)
+        )
+        plans.append((n_drawn * mean_steps + cost * len(other_wheels), n_drawn, weights, name))
+    _, n_drawn, weights, control = min(plans, key=operator.itemgetter(0))
+    drawn_results = measure_wheels(other_wheels[:n_drawn])
+    mean, standard_error = _estimate_mean(
+        *pilot_values,
+        *_zero_missing(drawn_results),
+        evaluate_control(other_wheels, control) @ weights,
+    )
+    gait_error_bounds = np.concatenate([x.error[x.found] for x in (pilot_results, drawn_results)])
+    n_steps = float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
+    return MultifidelityMean(
+        value=mean,
+        error=N_STANDARD_ERRORS * standard_error + float(np.mean(gait_error_bounds)),
+        n_gaits=float(len(gait_error_bounds)),
+        n_high_fidelity=float(pilot + n_drawn),
+        weight=float(weights[0]),
+        cost=n_steps + CONTROL_VARIATES[control] * n_wheels,
+        cost_high_fidelity_only=mean_steps * pilot + plans[0][0],
+        measure=measure,
+        control=control,
     )
 
 
-# Ratio of the error bound to the error estimated from one walking step. It is chosen because the
-# bound holds if each Newton correction is at most 3/4 as long as the previous correction.
-REQUEST_SAFETY_FACTOR = 4.0
-# Number of starts of walks, slow starts first, for wheels for which the lower model has no gait. It
-# is chosen because walks from the first two starts reach a gait for 100 of 232 wheels. Walks from
-# further starts reach a gait for no other wheel.
-N_COLD_STARTS = 2
-# Largest accepted distance between the lower model's gait and the gait with unilateral contact, in
-# lengths of the first correction. It is chosen because the sum of corrections that are halved each
-# time is twice the first correction.
-MAX_GAIT_DISTANCE_RATIO = 2.0
+def _zero_missing(results: MeasureResult) -> tuple[np.ndarray, np.ndarray]:
+    """Return the measure of each wheel, zero if it has no gait, and whether it has one, 1 or 0."""
+    return np.where(results.found, results.value, 0.0), results.found.astype(float)
 
 
-@dataclass
-class _MeasureRequest:
-    """State of the computation of measures for a batch of wheels, with the results so far."""
+def _evaluate_control(
+    measure: str,
+    params: WheelParams,
+    friction: np.ndarray,
+    stoppers: str,
+    indices: np.ndarray,
+    control: str,
+) -> np.ndarray:
+    """Return the two regressors for the regression on a control variate, shape (wheels, 2).
 
-    measure_names: tuple[str, ...]
-    tol: float
-    relative: bool
-    wheel_batch: ContactWheelBatch
-    params: WheelParams
+    - `indices`: indices of the evaluated wheels.
 
-    def __post_init__(self) -> None:
-        n_wheels = self.wheel_batch.parameter_matrix.shape[1]
-        self.lower_gaits = LowerFidelityGaits.without_gait(n_wheels)
-        fill = lambda value: np.full((n_wheels, len(self.measure_names)), value)
-        all_wheels = np.arange(n_wheels)
-        self.result_arrays = {
-            "values": fill(np.nan),
-            "errors": fill(np.inf),
-            "model_errors": fill(np.nan),
-            "numerical_errors": fill(np.inf),
-            "models": np.full(n_wheels, ModelIndex.NONE),
-            "statuses": np.full(n_wheels, int(MeasureStatus.NO_GAIT)),
-            "n_steps": np.zeros(n_wheels, int),
-            "outcomes": np.full(n_wheels, int(Outcome.NO_CYCLE_FOUND)),
-            "n_gaits": np.zeros(n_wheels, int),
-            "states": self.wheel_batch.embed_paper_states(all_wheels, np.zeros((n_wheels, 3))),
-        }
-
-    def compute_error_goal(self, values: np.ndarray) -> np.ndarray:
-        """Return the allowed absolute errors for measures with the given values."""
-        return self.tol * (np.abs(values) if self.relative else np.ones_like(values))
-
-    def find_unfinished_indices(self) -> np.ndarray:
-        return np.flatnonzero(self.result_arrays["models"] == ModelIndex.NONE)
-
-    def walk_to_gaits(self) -> None:
-        """Compute walks of wheels without a result, and store the measures of the gaits reached."""
-        unfinished = self.find_unfinished_indices()
-        has_lower_gait = self.lower_gaits.model_index[unfinished] != ModelIndex.NONE
-        wheels, unfinished = unfinished[has_lower_gait], unfinished[~has_lower_gait]
-        self._walk_and_record_gaits(
-            wheels, self.lower_gaits.section_states[wheels], MeasureStatus.REACHED_FROM_LOWER_GAIT
-        )
-        walk_starts = compute_walk_starts(select_rows_on_device(self.params, unfinished))
-        for start in walk_starts[:N_COLD_STARTS]:
-            is_missing = self.result_arrays["models"][unfinished] == ModelIndex.NONE
-            self._walk_and_record_gaits(
-                unfinished[is_missing], start[is_missing], MeasureStatus.REACHED_FROM_START
+    The first column is the control variate, or zero for a wheel for which the paper's model has no
+    gait. The second column is 1 for a wheel with a finite control variate and 0 otherwise.
+    """
+    params, friction = select_rows_on_device(params, indices), friction[indices]
+    control_values = np.full(len(friction), np.nan)
+    no_control, _, one_step = CONTROL_VARIATES
+    if control != no_control:
+        options = StepOptions()
+        gaits = find_paper_gaits(params, options)
+        (found,) = np.nonzero(gaits.model_index != ModelIndex.NONE)
+        gaits = select_tree_rows(gaits, found)
+        values = evaluate_measures([measure], gaits.step_quantities)
+        if control == one_step:
+            wheel_batch = ContactWheelBatch.from_params(
+                select_rows_on_device(params, found), friction[found], stoppers, options
             )
-
-    def select_gait_by_rank(self, gait_rank: int) -> None:
-        """Store the measures of the gait with the index `gait_rank`, slowest first.
-
-        The gaits are those that walks from all starts reach.
-        """
-        wheels = self.find_unfinished_indices()
-        starts = compute_walk_starts(self.params)
-        gait_wheels, gaits = self._walk_and_refine_gaits(
-            np.tile(wheels, len(starts)), np.concatenate(starts)
-        )
-        selected = []
-        for wheel in wheels:
-            distinct = gaits.find_distinct_gaits(np.flatnonzero(gait_wheels == wheel))
-            self.result_arrays["n_gaits"][wheel] = len(distinct)
-            selected += distinct[gait_rank:][:1] if -len(distinct) <= gait_rank else []
-        self._record_gaits(
-            gait_wheels, gaits, np.array(selected, int), MeasureStatus.SELECTED_BY_RANK
-        )
-
-    def correct_lower_gaits(
-        self,
-        wheel_indices: np.ndarray,
-        find_gaits: Callable[[WheelParams], LowerFidelityGaits],
-        are_rejected_gaits_refined: bool,
-    ) -> None:
-        """Compute one step with unilateral contact from each lower gait, and store measures.
-
-        The measures of a lower gait are stored if the estimated errors are within `tol`. If
-        `are_rejected_gaits_refined` is True, the other lower gaits are the initial guesses for
-        gaits with unilateral contact, whose measures are stored as well.
-        """
-        if not len(wheel_indices):
-            return
-        gaits = find_gaits(select_rows_on_device(self.params, wheel_indices))
-        self.lower_gaits = replace_rows(self.lower_gaits, wheel_indices, gaits)
-        has_gait = np.isfinite(gaits.step_quantities).all(1)
-        wheel_indices, gaits = select_tree_rows((wheel_indices, gaits), has_gait)
-        states, step, estimates = estimate_measures_from_lower_gaits(
-            self.wheel_batch, wheel_indices, gaits, self.measure_names
-        )
-        values = evaluate_measures(self.measure_names, gaits.step_quantities)
-        with np.errstate(all="ignore"):
-            step_change = evaluate_measures(self.measure_names, step.step_quantities) - values
-            total_change = np.abs(step_change) + estimates.correction_effect_on_measures
-            model_error = values - estimates.measure_values
-            sensitivity = np.abs(estimates.measure_jacobian @ gaits.step_quantity_jacobian)
-            numerical_error = (
-                multiply_rows(sensitivity, np.abs(gaits.section_state_error))
-                + estimates.numerical_error_bound
-                + estimates.missed_contact_error_bound
+            *_, estimates = estimate_measures_from_lower_gaits(
+                wheel_batch, np.arange(len(found)), gaits, [measure]
             )
-            error = (
-                np.abs(model_error) + (REQUEST_SAFETY_FACTOR - 1.0) * total_change + numerical_error
-            )
-            is_accepted = estimates.has_same_leg_codes & np.all(
-                error <= self.compute_error_goal(values), axis=1
-            )
-        self.result_arrays["n_steps"][wheel_indices] += 1
-        lower_results = {
-            "models": gaits.model_index,
-            "values": values,
-            "errors": error,
-            "model_errors": model_error,
-            "numerical_errors": numerical_error,
-            "states": states,
-        }
-        self._record_results(
-            wheel_indices[is_accepted],
-            select_tree_rows(lower_results, is_accepted),
-            MeasureStatus.CHECKED_BY_ONE_STEP,
-        )
-        is_refined = are_rejected_gaits_refined & ~is_accepted & estimates.has_same_leg_codes
-        wheel_indices = wheel_indices[is_refined]
-        refined = self._refine_gaits(wheel_indices, step.section_states[is_refined], False)
-        distances, correction_lengths = (
-            np.linalg.norm(x, axis=1)
-            for x in (
-                (refined.section_states - states[is_refined])[
-                    :, self.wheel_batch.list_paper_state_indices()
-                ],
-                estimates.newton_correction[is_refined],
-            )
-        )
-        is_near = distances <= MAX_GAIT_DISTANCE_RATIO * correction_lengths
-        self._record_gaits(
-            wheel_indices, refined, refined.is_found & is_near, MeasureStatus.CONTINUES_LOWER_GAIT
-        )
+            has_same_codes = estimates.has_same_leg_codes[:, None]
+            values = np.where(has_same_codes, estimates.measure_values, values)
+        control_values[found] = values[:, 0]
+    is_finite = np.isfinite(control_values)
+    return np.column_stack([np.where(is_finite, control_values, 0.0), is_finite])
 
-    def _refine_gaits(
-        self, wheel_indices: np.ndarray, states: np.ndarray, is_every_gait_compared: bool
-    ) -> RefinedGaits:
-        """Return the gaits near full section states, and add their steps to the results."""
-        gaits = refine_gaits(
-            self.wheel_batch,
-            wheel_indices,
-            states,
-            self.measure_names,
-            self.compute_error_goal,
-            is_every_gait_compared,
-        )
-        np.add.at(self.result_arrays["n_steps"], wheel_indices, gaits.n_steps)
-        return gaits
 
-    def _walk_and_record_gaits(
-        self, wheel_indices: np.ndarray, section_states: np.ndarray, status: MeasureStatus
-    ) -> None:
-        """Compute walks from the paper's section states, and store measures of the gaits reached.
+# Fraction of the largest singular value below which a singular value of the control columns is
+# treated as zero.
+SINGULAR_VALUE_TOLERANCE = 1e-12
 
-        The section states have the shape (wheels, 3).
-        """
-        gait_wheels, gaits = self._walk_and_refine_gaits(wheel_indices, section_states)
-        self._record_gaits(gait_wheels, gaits, gaits.is_found & gaits.is_attracting, status)
 
-    def _walk_and_refine_gaits(
-        self, wheel_indices: np.ndarray, section_states: np.ndarray
-    ) -> tuple[np.ndarray, RefinedGaits]:
-        """Return the gaits at the ends of walks from the paper's section states, after refinement.
+def _plan_sampling(
+    pilot_values: np.ndarray,
+    has_gait: np.ndarray,
+    regressors: np.ndarray,
+    tolerance: float,
+    n_remaining: int,
+) -> tuple[int, np.ndarray]:
+    """Return the number of further wheels for a mean to within `tolerance`, and the weights of the
+    two control columns.
 
-        The result is (wheel index of each gait, gaits).
-        """
-        walk_ends = walk_until_settled(
-            self.wheel_batch,
-            wheel_indices,
-            self.wheel_batch.embed_paper_states(wheel_indices, section_states),
-        )
-        np.add.at(self.result_arrays["n_steps"], wheel_indices, walk_ends.n_steps)
-        # A step cannot begin if a wheel has turned more than once in flight.
-        is_reason_unknown = np.isin(walk_ends.walk_outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT))
-        self.result_arrays["outcomes"][wheel_indices] = np.where(
-            is_reason_unknown, Outcome.NO_CYCLE_FOUND, walk_ends.walk_outcomes
-        )
-        wheel_indices = wheel_indices[walk_ends.has_settled]
-        states = walk_ends.section_states[walk_ends.has_settled]
-        return wheel_indices, self._refine_gaits(wheel_indices, states, True)
+    The pilot sample determines both. The mean M over the wheels with a gait is a ratio of two sums.
+    The controlled quantity is the wheel's measure minus M, or zero for a wheel without a gait. The
+    sum of this quantity over all wheels is zero.
+    """
+    gait_fraction = float(np.mean(has_gait))
+    centered_values = pilot_values - np.mean(pilot_values) / gait_fraction * has_gait
+    centered_regressors = regressors - np.mean(regressors, axis=0)
+    weights, _, rank, _ = np.linalg.lstsq(
+        centered_regressors, centered_values, rcond=SINGULAR_VALUE_TOLERANCE
+    )
+    squared_residuals = float(np.sum((centered_values - centered_regressors @ weights) ** 2))
+    squared_residuals += _compute_unseen_wheel_variance(has_gait, centered_values)
+    variance = squared_residuals / (len(centered_values) - 1 - int(rank))
+    sampling_tolerance = (1.0 - GAIT_ERROR_FRACTION) * tolerance
+    n_required = variance * (N_STANDARD_ERRORS / (sampling_tolerance * gait_fraction)) ** 2
+    n_drawn = math.ceil(n_required / (1.0 + n_required / n_remaining))
+    return min(n_remaining, max(MIN_PILOT_GAITS, n_drawn)), weights
 
-    def _record_gaits(
-        self,
-        gait_wheels: np.ndarray,
-        gaits: RefinedGaits,
-        selected_gaits: np.ndarray,
-        status: MeasureStatus,
-    ) -> None:
-        """Store the measures of the selected gaits with unilateral contact.
 
-        - `gait_wheels`: index of the wheel of each gait;
-        - `selected_gaits`: indices or mask of the selected gaits.
-        """
-        wheels, values, errors, states = select_tree_rows(
-            (gait_wheels, gaits.values, gaits.error_bounds, gaits.section_states), selected_gaits
-        )
-        lower_values = evaluate_measures(
-            self.measure_names, self.lower_gaits.step_quantities[wheels]
-        )
-        gait_results = {
-            "models": ModelIndex.UNILATERAL,
-            "values": values,
-            "errors": errors,
-            "model_errors": lower_values - values,
-            "numerical_errors": errors,
-            "states": states,
-        }
-        self._record_results(wheels, gait_results, status)
+def _estimate_mean(
+    pilot_values: np.ndarray,
+    pilot_has_gait: np.ndarray,
+    drawn_values: np.ndarray,
+    drawn_has_gait: np.ndarray,
+    control_values: np.ndarray,
+) -> tuple[float, float]:
+    """Return the mean of a measure and its standard error.
 
-    def _record_results(
-        self, wheel_indices: np.ndarray, results: dict[str, Any], status: MeasureStatus
-    ) -> None:
-        """Store the results of the wheels with the indices `wheel_indices`.
+    - `control_values`: weighted control variates of all wheels outside the pilot sample. The drawn
+      wheels come first.
+    """
+    n_remaining, n_drawn = len(control_values), len(drawn_values)
+    n_gaits = np.sum(pilot_has_gait) + n_remaining * np.mean(drawn_has_gait)
+    differences = drawn_values - control_values[:n_drawn]
+    mean = (
+        np.sum(pilot_values) + n_remaining * (np.mean(control_values) + np.mean(differences))
+    ) / n_gaits
+    if n_drawn == n_remaining:  # The gaits of all wheels are computed, perhaps of one only.
+        return float(mean), 0.0
+    squared_residuals = n_drawn * np.var(differences - mean * drawn_has_gait)
+    squared_residuals += _compute_unseen_wheel_variance(
+        pilot_has_gait, pilot_values - mean * pilot_has_gait
+    )
+    variance = squared_residuals / (n_drawn - 1) / n_drawn * (1.0 - n_drawn / n_remaining)
+    return float(mean), float(n_remaining / n_gaits * math.sqrt(variance))
 
-        The keys of `results` are those of `result_arrays`. `status` is the method of the results.
-        """
-        results = results | {"statuses": status, "outcomes": Outcome.STEPPED}
-        for result_name, new_result_values in results.items():
-            self.result_arrays[result_name][wheel_indices] = new_result_values
+
+def _compute_unseen_wheel_variance(has_gait: np.ndarray, centered_values: np.ndarray) -> float:
+    """Return the variance due to one more wheel whose control variate is wrong.
+
+    A wheel may have a gait in the paper's model and no gait with unilateral contact. A small sample
+    may contain no such wheel. The result is zero if all wheels in the pilot sample have a gait.
+    """
+    return 0.0 if np.all(has_gait) else float(np.var(centered_values))
