@@ -802,6 +802,11 @@ def test_heights_of_footholds_are_rises_in_walks_trajectories_and_batches():
     rises = {"rise": np.diff(heights)}
     stepwise = vrw.step_batch(rises, np.full((2, 1), 3.0), 3, model=RISING_BALL)
     np.testing.assert_array_equal(stepwise.section_state, batch.section_state)
+    on_stairs = vrw.step_batch(
+        {"rise": np.array([0.02, -0.1])}, np.full((2, 1), 3.0), 3, model=RISING_BALL,
+        heights=heights - np.outer([0.02, -0.1], range(4)),
+    )  # fmt: skip
+    np.testing.assert_allclose(on_stairs.section_state, expected, rtol=1e-9)
     walk = vrw.walk({"rise": 0.0}, [3.0], 3, model=RISING_BALL, heights=heights[0])
     np.testing.assert_allclose(walk.steps.section_state[-1], expected[0], rtol=1e-9)
     trajectory = vrw.simulate({"rise": 0.0}, [3.0], 3, model=RISING_BALL, heights=heights[0])

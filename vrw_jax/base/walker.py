@@ -19,6 +19,7 @@ from vrw_jax.base.checks import check_reals, check_type, has_traced_leaf
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import (
     StepOptions,
+    find_tree_parameter,
     is_tree_in_domain,
     list_tree_parameters,
     replace_tree_parameter,
@@ -72,8 +73,8 @@ class AbstractWalker(abc.ABC):
     - `invariants`: functions of section coordinates and parameters that a step conserves;
     - `measures`: measures of a gait, see `vrw.measure`;
     - `ground`: `{"height": name}` names the parameter that is the rise from the foothold of a step
-      to the next one, so that walks and batches take `heights`. `{"slope": name}` names the slope
-      of a step. `first_passage` draws either at random;
+      to the next one, so that walks and batches take `heights` above the line of this rise.
+      `{"slope": name}` names the slope of a step. `first_passage` draws either at random;
     - `sample_motion`: method that returns the motion during a step, for fits to time series.
 
     Parameters are a tree of numbers, such as a dictionary or an `equinox.Module`.
@@ -138,7 +139,8 @@ class AbstractWalker(abc.ABC):
     def put_on_heights(self, params: Any, heights: Any, n_steps: int) -> Any:
         """Return the parameters with the rises between footholds, one for each step of a walk.
 
-        - `heights`: heights of the footholds on the last axis, from that at the start of the walk.
+        - `heights`: heights of the footholds above the line of the rise in `params` on the last
+          axis, from that at the start of the walk.
         """
         if "height" not in self.ground:
             raise ValueError(
@@ -151,7 +153,11 @@ class AbstractWalker(abc.ABC):
                 f"heights have shape {heights.shape}, but a walk of {n_steps} steps begins and "
                 f"ends on a foothold: give {n_steps + 1} heights."
             )
-        return replace_tree_parameter(params, self.ground["height"], jnp.diff(heights))
+        name = self.ground["height"]
+        rise = jnp.asarray(jax.tree.leaves(params)[find_tree_parameter(params, name)])
+        if 0 < rise.ndim < heights.ndim:
+            rise = rise[:, None]
+        return replace_tree_parameter(params, name, rise + jnp.diff(heights))
 
     def evaluate_invariants(self, params: Any, x: Array) -> Array:
         """Return the quantities that a step conserves."""

@@ -247,12 +247,14 @@ class PassageStatus(StatusCode):
 class FirstPassage(AbstractPrintable):
     """Mean numbers of gait steps until failure, with the eigenvalues of the survival operator.
 
-    A line joins two footholds. Means include the step onto the line on which the wheel fails.
+    A line joins two footholds.
 
-    - `mean_steps`: mean for starts from the quasi-stationary distribution, 1/(1 - kappa_1);
-    - `mean_steps_from_gait`: mean for a start on the gait, before a landing on a line of the mean
-      slope, or on a foothold of random height after a foothold on the mean line. If walks are
-      sampled, its relative error is at most 1.5 times that of `mean_steps`;
+    - `mean_steps`: mean for starts from the quasi-stationary distribution, 1/(1 - kappa_1). It
+      counts the step that fails;
+    - `mean_steps_from_gait`: mean of completed steps, as `n_stepped` of `step_batch`. Walks start
+      on the gait, before a landing on a line of the mean slope, or on a foothold of random height
+      after a foothold on the mean line. If walks are sampled, the relative error is at most 1.5
+      times that of `mean_steps`;
     - `mean_distance`: distance of `mean_steps` steps along the mean slope, m. It is `mean_steps`
       times the mean distance of completed steps from the quasi-stationary distribution. It is NaN
       for a walker of yours, whose steps have no distance;
