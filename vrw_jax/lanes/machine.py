@@ -20,9 +20,15 @@ except ImportError:
 
 
 class _MissingLlvmType:
-    """Stand-in for a type of llvmlite that other modules use or subclass."""
+    """Stand-in for a type of llvmlite that other modules create or subclass.
+
+    Any other use of it raises an ImportError.
+    """
 
     def __init__(self, *_: Any) -> None: ...
+
+    def __getattr__(self, attribute_name: str) -> Any:
+        raise ImportError("machine code needs llvmlite, which is not installed: pip install it.")
 
 
 class _MissingLlvmTypes:
@@ -32,15 +38,8 @@ class _MissingLlvmTypes:
         return type(type_name, (_MissingLlvmType,), {})
 
 
-class _MissingLlvmCompiler:
-    """Stand-in for the module `llvmlite.binding`. Any use of it raises an ImportError."""
-
-    def __getattr__(self, attribute_name: str) -> Any:
-        raise ImportError("machine code needs llvmlite, which is not installed: pip install it.")
-
-
 if not is_llvmlite_installed:
-    llvm, ir = _MissingLlvmCompiler(), _MissingLlvmTypes()
+    llvm, ir = _MissingLlvmType(), _MissingLlvmTypes()
 
 
 LLVM_OPTIMIZATION_LEVEL = 1
