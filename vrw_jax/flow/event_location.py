@@ -18,7 +18,6 @@ from vrw_jax.flow.solver_steps import (
     ButcherTableau,
     SolverStepFunction,
     StageState,
-    fit_guard_parabola,
     load_explicit_tableau,
     take_rk_step,
 )
@@ -196,20 +195,57 @@ class _EventLocator(NamedTuple):
 
     def begin(self) -> EventSearch:
         """Return the search before its first iteration."""
-        step_start, step_length = self.step_start, self.step_start.next_step_length
-        fractions_to_zero = _find_parabola_zeros(
-            self.tableau,
-            self.phase.guards_rising_at_start is not None,
-            self.is_crossing,
+        step_start, middle_node = self.step_start, self.tableau.middle_node
+        start_guard_value, middle_guard_value, end_guard_value = (
             step_start.guard_values,
             step_start.middle_guard_values,
             step_start.end_guard_values,
         )
+        # The parabola of each guard passes through its values at the start, at the middle stage and
+        # at the end. The secant method, followed by Newton's method, locates its root.
+        secant_rate = (middle_guard_value - start_guard_value) / middle_node
+        quadratic_coefficient = (end_guard_value - start_guard_value - secant_rate) / (
+            1.0 - middle_node
+        )
+        linear_coefficient = end_guard_value - start_guard_value - quadratic_coefficient
+        guard_decrease = jnp.where(
+            self.is_crossing & (start_guard_value > end_guard_value),
+            start_guard_value - end_guard_value,
+            1.0,
+        )
+        fraction_to_zero = jnp.clip(start_guard_value / guard_decrease, 0.0, 1.0)
+        # A guard that rises from zero vanishes at the start of the step: the other root counts.
+        is_guard_rising = self.is_crossing & (linear_coefficient > 0.0)
+        if self.phase.guards_rising_at_start is None:
+            is_guard_rising = is_guard_rising & (start_guard_value == 0.0)
+        fraction_to_zero = jnp.where(
+            is_guard_rising,
+            jnp.clip(
+                -linear_coefficient / jnp.where(is_guard_rising, quadratic_coefficient, -1.0),
+                0.0,
+                1.0,
+            ),
+            fraction_to_zero,
+        )
+        for _ in range(3):
+            parabola_rate = linear_coefficient + 2.0 * quadratic_coefficient * fraction_to_zero
+            is_guard_falling = parabola_rate < 0.0
+            fraction_change = (
+                start_guard_value
+                + fraction_to_zero * (linear_coefficient + quadratic_coefficient * fraction_to_zero)
+            ) / jnp.where(is_guard_falling, parabola_rate, 1.0)
+            fraction_to_zero = jnp.where(
+                is_guard_falling,
+                jnp.clip(fraction_to_zero - fraction_change, 0.0, 1.0),
+                fraction_to_zero,
+            )
         first_crossing_fraction = jnp.min(
-            jnp.where(self.is_crossing, fractions_to_zero, 1.0), axis=0
+            jnp.where(self.is_crossing, fraction_to_zero, 1.0), axis=0
         )
         return EventSearch.begin(
-            step_start, step_length * first_crossing_fraction, self.phase.has_exact_events
+            step_start,
+            step_start.next_step_length * first_crossing_fraction,
+            self.phase.has_exact_events,
         )
 
     def iterate(self, search: EventSearch) -> EventSearch:
@@ -415,54 +451,6 @@ def _propose_earliest_event(
     )
     time_to_event = jnp.min(times_to_zero, axis=0)
     return time_to_event, find_first_guard(times_to_zero == time_to_event, 0)
-
-
-def _find_parabola_zeros(
-    tableau: ButcherTableau,
-    may_rise_from_roundoff: bool,
-    is_crossing: Array,
-    start_guard_value: Array,
-    middle_guard_value: Array,
-    end_guard_value: Array,
-) -> Array:
-    """Return the root of each guard's parabola, as a fraction of the solver step.
-
-    The parabola passes through the guard's values at the start, at the middle stage and at the end.
-    The secant method, followed by Newton's method, locates the root.
-    """
-    quadratic_coefficient, linear_coefficient = fit_guard_parabola(
-        tableau, start_guard_value, middle_guard_value, end_guard_value
-    )
-    guard_decrease = jnp.where(
-        is_crossing & (start_guard_value > end_guard_value),
-        start_guard_value - end_guard_value,
-        1.0,
-    )
-    fraction_to_zero = jnp.clip(start_guard_value / guard_decrease, 0.0, 1.0)
-    # A guard that rises from zero vanishes at the start of the step, so the other root is returned.
-    is_guard_rising = is_crossing & (linear_coefficient > 0.0)
-    if not may_rise_from_roundoff:
-        is_guard_rising = is_guard_rising & (start_guard_value == 0.0)
-    fraction_to_zero = jnp.where(
-        is_guard_rising,
-        jnp.clip(
-            -linear_coefficient / jnp.where(is_guard_rising, quadratic_coefficient, -1.0), 0.0, 1.0
-        ),
-        fraction_to_zero,
-    )
-    for _ in range(3):
-        parabola_rate = linear_coefficient + 2.0 * quadratic_coefficient * fraction_to_zero
-        is_guard_falling = parabola_rate < 0.0
-        fraction_change = (
-            start_guard_value
-            + fraction_to_zero * (linear_coefficient + quadratic_coefficient * fraction_to_zero)
-        ) / jnp.where(is_guard_falling, parabola_rate, 1.0)
-        fraction_to_zero = jnp.where(
-            is_guard_falling,
-            jnp.clip(fraction_to_zero - fraction_change, 0.0, 1.0),
-            fraction_to_zero,
-        )
-    return fraction_to_zero
 
 
 def find_events(

@@ -1,10 +1,10 @@
-"""Simulation and return maps of hybrid systems, which consist of modes, guards and resets.
+"""Simulation of hybrid systems, which consist of modes, guards and resets.
 
     ball = Mode(lambda y: jnp.stack([y[1], -9.81 + 0.0 * y[1]]), (Guard(height, bounce),))
     simulate_hybrid((ball,), start, events=10)
 
-A mode whose functions have wrong shapes raises a ValueError. If the simulation fails, the result
-has a code of `Termination` and contains all earlier events.
+Functions of wrong shapes raise a ValueError. If the simulation fails, the result has a code of
+`Termination` and contains all earlier events.
 """
 
 import functools
@@ -16,10 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
@@ -45,7 +43,7 @@ from vrw_jax.flow.phase_integration import (
     integrate_phase,
     is_machine_code_better,
 )
-from vrw_jax.lanes.code_cache import targets_machine_code
+from vrw_jax.lanes.autodiff import forbid_reverse_mode
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 MAX_STORED_NUMBERS = 100_000_000
@@ -72,6 +70,11 @@ class Guard(NamedTuple):
     target_mode: Any = None  # index or name of the next mode; None stands for the same mode
     armed: Callable[..., Scalar] | None = None
     ends_walk: bool = False
+
+    def wrap_functions(self, wrap: Callable, wrap_reset: Callable) -> "Guard":
+        """Return the guard in which its functions, and its reset, have been replaced."""
+        armed = None if self.armed is None else wrap(self.armed)
+        return self._replace(value=wrap(self.value), reset=wrap_reset(self.reset), armed=armed)
 
     def evaluate(self, *state_and_parameters: Any) -> Any:
         """Return the value that ends the mode when it falls to zero."""
@@ -213,12 +216,11 @@ def simulate_hybrid(
                 f"mode {mode_number} has no guard, but only a guard can end it: give one."
             )
         for guard_number, guard in enumerate(guards):
-            guard_name = f"guard {guard_number} of mode {mode_number}"
             target_mode = mode_number if guard.target_mode is None else guard.target_mode
             if check_int("target_mode", target_mode, 0) >= len(modes):
                 raise ValueError(
-                    f"{guard_name} leads to mode {target_mode}, but there are {len(modes)}: "
-                    "count from 0."
+                    f"guard {guard_number} of mode {mode_number} leads to mode {target_mode}, but "
+                    f"there are {len(modes)}: count from 0."
                 )
     check_mode_functions(
         {i: mode._replace(guards=dict(enumerate(mode.guards))) for i, mode in enumerate(modes)},
@@ -232,7 +234,7 @@ def simulate_hybrid(
         solution = call_compiled_program(
             simulate_modes, (modes, events), options, start, jnp.asarray(mode, jnp.int32)
         )
-    return forbid_reverse_mode("simulate_hybrid", solution)
+    return forbid_reverse_mode("hybrid.simulate_hybrid", solution)
 
 
 @lanes.jit
@@ -447,7 +449,6 @@ no_margins = lambda y: y[:0]
 
 
 def continue_after_event(_event: Event) -> Array:
-    """Return False: the simulation continues after any event."""
     return jnp.asarray(False)
 
 
@@ -569,9 +570,7 @@ def simulate_modes(
             )
         ]
 
-    def record_event(
-        log: list[Array], n_events: Array, has_event: Array, event: Event
-    ) -> list[Array]:
+    def record_event(log: list, n_events: Array, has_event: Array, event: Event) -> list[Array]:
         time_errors = lax.switch(
             event.mode,
             [functools.partial(estimate_time_errors, mode_index=i) for i in range(len(modes))],
@@ -600,52 +599,6 @@ def simulate_modes(
     )
     last_values = run.n_events, run.time, run.state, run.mode, run.solver_steps, run.termination
     return HybridSolution._make((*run.log, *last_values))
-
-
-_FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
-"""Identity operation whose transpose raises an error."""
-
-
-def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, function_name: str) -> None:
-    """Raise a ValueError that explains why reverse mode is not available."""
-    raise ValueError(
-        f"hybrid.{function_name} has no derivative in reverse mode, since the number of its solver "
-        "steps is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of "
-        "jax.grad, jax.jacrev or jax.vjp."
-    )
-
-
-_FORWARD_ONLY_PRIMITIVE.def_impl(lambda x, *, function_name: x)
-
-
-_FORWARD_ONLY_PRIMITIVE.def_abstract_eval(lambda x, *, function_name: x)
-
-
-ad.deflinear2(_FORWARD_ONLY_PRIMITIVE, _raise_reverse_mode_error)
-
-
-batching.defvectorized(_FORWARD_ONLY_PRIMITIVE)
-
-
-mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, function_name: [x])
-
-
-def forbid_reverse_mode(function_name: str, function_result: PyTree) -> PyTree:
-    """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
-    error.
-
-    `function_name` is the function in `flow` that computed the result. Inside `lanes.jit` there is
-    no mark, because reverse mode transposes the derivatives that machine code computes.
-    """
-    if targets_machine_code():
-        return function_result
-
-    def mark_leaf_as_forward_only(leaf: Any) -> Any:
-        if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
-            return _FORWARD_ONLY_PRIMITIVE.bind(leaf, function_name=function_name)
-        return leaf
-
-    return jax.tree.map(mark_leaf_as_forward_only, function_result)
 
 
 OUTCOME_BY_TERMINATION = np.array(

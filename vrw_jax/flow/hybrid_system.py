@@ -234,12 +234,10 @@ class HybridSystem(AbstractWalker):
             Mode(
                 bind(mode.field),
                 tuple(
-                    Guard(
-                        bind(guard.value),
-                        bind(guard.reset),
-                        None if guard.target_mode is None else self._find_mode(guard.target_mode),
-                        None if guard.armed is None else bind(guard.armed),
-                        guard.ends_walk,
+                    guard.wrap_functions(bind, bind)._replace(
+                        target_mode=None
+                        if guard.target_mode is None
+                        else self._find_mode(guard.target_mode)
                     )
                     for guard in mode.guards.values()
                 ),
@@ -508,19 +506,16 @@ def _append_integrals(system: HybridSystem, measures: tuple[Measure, ...]) -> Hy
 
         return evaluate
 
-    def extend_guard(guard: Guard) -> Guard:
-        armed = guard.armed
-        return guard._replace(
-            value=lambda y, params: guard.value(y[:n], params),
-            reset=lambda y, params: jnp.concatenate([guard.reset(y[:n], params), y[n:]]),
-            armed=None if armed is None else lambda y, params: armed(y[:n], params),
-        )
-
+    drop_integrals = lambda function: lambda y, params: function(y[:n], params)
+    keep_integrals = lambda reset: lambda y, params: jnp.concatenate([reset(y[:n], params), y[n:]])
     return HybridSystem(
         modes={
             name: Mode(
                 append_rates(name, mode.field),
-                {guard_name: extend_guard(guard) for guard_name, guard in mode.guards.items()},
+                {
+                    guard_name: guard.wrap_functions(drop_integrals, keep_integrals)
+                    for guard_name, guard in mode.guards.items()
+                },
             )
             for name, mode in system.modes.items()
         },

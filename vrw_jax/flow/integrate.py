@@ -115,15 +115,10 @@ def integrate_batch_phase(
     """
 
     def integrate(
-        phase_tangents: Any,
-        phase_constants: Any,
-        held_constants: Vector,
-        q: Vector,
-        v: Vector,
-        *arguments: Any,
+        phase_tangents: Any, phase_constants: Any, held_constants: Vector, *arguments: Any
     ) -> tuple[PhaseEnd, Any]:
         phase = make_phase(phase_constants, held_constants)
-        return integrate_to_event(phase, phase_tangents, tableau, q, v, *arguments)
+        return integrate_to_event(phase, phase_tangents, tableau, *arguments)
 
     integrate_with_rule = jax.custom_jvp(lambda *arguments: integrate(None, *arguments)[0])
 
@@ -148,16 +143,14 @@ def integrate_batch_phase(
         state_tangent = zero_phase_end.state._replace(
             q=tuple(motion_tangent[:n]), v=tuple(motion_tangent[n:])
         )
-        log_tangent = zero_phase_end.kink_log
-        if log_tangent is not None:
-            log_tangent = log_tangent._replace(
-                times=kink_tangents[:, 0], states=kink_tangents[:, 1:]
-            )
+        log = zero_phase_end.kink_log
+        if log is not None:
+            log = log._replace(times=kink_tangents[:, 0], states=kink_tangents[:, 1:])
         return phase_end, zero_phase_end._replace(
             state=state_tangent,
             duration=event_time_tangent,
             margin_minima=minima_tangents,
-            kink_log=log_tangent,
+            kink_log=log,
         )
 
     return integrate_with_rule(
@@ -202,21 +195,21 @@ def compute_phase_end_jvp(
         last_step_length,
         located_guard_index,
     )
-    held_tangents = end_tangents[:, motion_tangents.shape[1] :]
-    minima_tangents = None
     margin_minima_state = integrator_state.margin_minima_state
-    if margin_minima_state is not None and margin_minima_result is not None:
-        minima_tangents = compute_margin_minima_jvp(
-            solver_step_function,
-            tableau,
-            phase_tangents,
-            margin_minima_state,
-            margin_minima_result,
-            start_state,
-            phase_end.state,
-            jnp.concatenate([motion_tangents, held_tangents], 1),
-            enter_sides,
-        )
+    if margin_minima_state is None or margin_minima_result is None:
+        return motion_tangents, event_time_tangent, None
+    held_tangents = end_tangents[:, motion_tangents.shape[1] :]
+    minima_tangents = compute_margin_minima_jvp(
+        solver_step_function,
+        tableau,
+        phase_tangents,
+        margin_minima_state,
+        margin_minima_result,
+        start_state,
+        phase_end.state,
+        jnp.concatenate([motion_tangents, held_tangents], 1),
+        enter_sides,
+    )
     return motion_tangents, event_time_tangent, minima_tangents
 
 
@@ -247,9 +240,7 @@ def integrate_to_event(
     - `phase_tangents`: a `PhaseTangents` or an object with the same methods, or None;
     - `interruption`: when the integration is interrupted, and elements that continue after one.
     """
-    phase = _wrap_each_phase_function(
-        phase, lanes.mark_noinline if phase.is_compiled_separately else jax.jit
-    )
+    phase = phase.wrap_functions(lanes.mark_noinline if phase.is_compiled_separately else jax.jit)
     n_guards: Any = None
     phase_with_kinks, enter_sides = phase, None
     if phase.evaluate_kinks is not None:
@@ -265,13 +256,13 @@ def integrate_to_event(
     integrator_state = _init_integrator_state(
         phase, start_state, guard_values, is_phase_started, initial_dt, phase_tangents, interruption
     )
-    needs_more_steps = functools.partial(
-        _needs_more_steps, is_phase_started, straggler_count, interruption
-    )
 
     def make_loop(phase: BatchPhase, solver: SolverStepFunction, tangents: Any) -> Callable:
-        try_step = _make_step_attempt(phase, solver, tableau, options, straggler_count, tangents)
-        return functools.partial(lax.while_loop, needs_more_steps, try_step)
+        return functools.partial(
+            lax.while_loop,
+            functools.partial(_needs_more_steps, is_phase_started, straggler_count, interruption),
+            _make_step_attempt(phase, solver, tableau, options, straggler_count, tangents),
+        )
 
     locate = lambda phase, solver, state: locate_event(
         phase, solver, tableau, lax.stop_gradient(state), options
@@ -283,7 +274,7 @@ def integrate_to_event(
             has_last_step = phase_tangents is not None and phase.take_solver_step is not None
             # The functions are called, not inlined, because the program is already long.
             if not has_last_step:
-                phase = phase_with_kinks = _wrap_each_phase_function(phase, lanes.mark_noinline)
+                phase = phase_with_kinks = phase.wrap_functions(lanes.mark_noinline)
                 solver = make_solver_step_function(phase, tableau, options)
         if phase.take_last_step is not None:
             take_last_step = phase.take_last_step
@@ -330,7 +321,7 @@ def _enter_first_sides(
     """Return the phase on its first sides, the function for the others, and the guards' number."""
 
     def enter_sides(sides: Vector) -> tuple[BatchPhase, SolverStepFunction, Any]:
-        phase = _wrap_each_phase_function(phase_with_kinks.on_sides(sides), lanes.mark_noinline)
+        phase = phase_with_kinks.on_sides(sides).wrap_functions(lanes.mark_noinline)
         tangents = None if phase_tangents is None else phase_tangents.on_sides(sides)
         return phase, make_solver_step_function(phase, tableau, options), tangents
 
@@ -444,16 +435,6 @@ def _add_margin_minima(
             integrator_state=integrator_state._replace(margin_minima_state=margin_minima_state),
             margin_minima_result=margin_minima_result,
         ),
-    )
-
-
-def _wrap_each_phase_function(phase: BatchPhase, wrap_function: Callable) -> BatchPhase:
-    """Return a copy of the phase in which `wrap_function` has been applied to each function."""
-    return phase._replace(
-        evaluate_acceleration=wrap_function(phase.evaluate_acceleration),
-        evaluate_guards=wrap_function(phase.evaluate_guards),
-        evaluate_margins=wrap_function(phase.evaluate_margins),
-        on_sides=lambda sides: _wrap_each_phase_function(phase.on_sides(sides), wrap_function),
     )
 
 

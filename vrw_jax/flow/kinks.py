@@ -120,10 +120,8 @@ def integrate_over_kinks(
     """
 
     def integrate_to_next_kink(passage: KinkPassage) -> KinkPassage:
-        phase, solver_step_function, phase_tangents = enter_sides(passage.sides)
-        state, search = integrate_segment(
-            phase, solver_step_function, phase_tangents, passage.integrator_state
-        )
+        phase, solver, tangents = enter_sides(passage.sides)
+        state, search = integrate_segment(phase, solver, tangents, passage.integrator_state)
         is_at_kink = (
             state.has_guard_crossed & ~search.is_event_unresolved & (search.guard_index >= n_guards)
         )
@@ -132,7 +130,7 @@ def integrate_over_kinks(
         if attach_derivatives is not None:
             elapsed_time, v = attach_derivatives(
                 phase,
-                solver_step_function,
+                solver,
                 state,
                 elapsed_time,
                 search.end_state,
@@ -155,8 +153,8 @@ def integrate_over_kinks(
         )
         next_state, kink_tangents = _select_passed_state(
             tableau,
-            solver_step_function,
-            phase_tangents,
+            solver,
+            tangents,
             (phase, next_phase),
             (state, next_state),
             search,
@@ -249,16 +247,29 @@ def _select_passed_state(
     }
     kink_tangents = logged_tangents = None
     if phase_tangents is not None:
-        pass_kink = functools.partial(
-            _pass_tangents,
-            phase_tangents,
-            tableau,
-            solver_step_function,
-            state,
-            search,
-            next_state.state,
-            is_passed,
-        )
+
+        def pass_kink(tangents: tuple[Array, Array, Array]) -> Any:
+            """Return tangents after a kink at a fixed time, and of the state and the time at it."""
+            end_tangents, time_tangent, kink_tangents = propagate_to_event(
+                tableau,
+                solver_step_function,
+                phase_tangents,
+                state,
+                jnp.where(is_passed, search.event_step_length, 0.0),
+                search.guard_index,
+            )
+            tangents_after = kink_tangents - time_tangent[:, None] * evaluate_motion_rates(
+                next_state.state
+            )
+            held_tangents = end_tangents[:, kink_tangents.shape[1] :]
+            return (
+                *(
+                    jnp.where(is_passed, jnp.concatenate([x, held_tangents], 1), y)
+                    for x, y in zip((tangents_after, kink_tangents), tangents[:2], strict=True)
+                ),
+                jnp.where(is_passed, time_tangent, tangents[2]),
+            )
+
         tangents: Any = state.state_tangents
         unchanged_tangents = tangents, tangents, tangents[:, 0]
         tangents, kink_tangents, time_tangent = run_if_any_element_active(
@@ -280,40 +291,6 @@ def _select_passed_state(
         is_passed, next_state._replace(**drop), state._replace(**drop)
     )
     return selected_state._replace(**unbatched), logged_tangents
-
-
-def _pass_tangents(
-    phase_tangents: Any,
-    tableau: ButcherTableau,
-    solver_step_function: SolverStepFunction,
-    integrator_state: IntegratorState,
-    search: EventSearch,
-    kink_state: StageState,
-    is_passed: Array,
-    tangents: tuple[Array, Array, Array],
-) -> tuple[Array, Array, Array]:
-    """Return tangents after a kink at a fixed time, and of the state and the time at the kink.
-
-    - `kink_state`: state after the kink;
-    - `tangents`: results for batch elements that are not at a kink.
-    """
-    end_tangents, time_tangent, kink_tangents = propagate_to_event(
-        tableau,
-        solver_step_function,
-        phase_tangents,
-        integrator_state,
-        jnp.where(is_passed, search.event_step_length, 0.0),
-        search.guard_index,
-    )
-    tangents_after = kink_tangents - time_tangent[:, None] * evaluate_motion_rates(kink_state)
-    held_tangents = end_tangents[:, kink_tangents.shape[1] :]
-    return (
-        *(
-            jnp.where(is_passed, jnp.concatenate([x, held_tangents], 1), y)
-            for x, y in zip((tangents_after, kink_tangents), tangents[:2], strict=True)
-        ),
-        jnp.where(is_passed, time_tangent, tangents[2]),
-    )  # type: ignore[return-value]
 
 
 N_INTERVALS = 8

@@ -27,25 +27,6 @@ EnterSides = Callable[[Vector], tuple[BatchPhase, SolverStepFunction, Any]]
 """Function that returns the phase on the given sides of its kinks, its solver, and its tangents."""
 
 
-def _evaluate_cubic(
-    x: Array,
-    cubic_value_at_0: Array,
-    cubic_rate_at_0: Array,
-    cubic_value_at_1: Array,
-    cubic_rate_at_1: Array,
-) -> Array:
-    """Return the value at `x`, between 0 and 1, of the cubic Hermite interpolant.
-
-    The rates at 0 and 1 must be multiplied by the length of the solver step.
-    """
-    return (
-        (1 + 2 * x) * (1 - x) ** 2 * cubic_value_at_0
-        + x * (1 - x) ** 2 * cubic_rate_at_0
-        + x * x * (3 - 2 * x) * cubic_value_at_1
-        + x * x * (x - 1) * cubic_rate_at_1
-    )
-
-
 @jax.jit  # The function is traced once for all margins.
 def _find_cubic_minimum(
     cubic_value_at_0: Array, cubic_rate_at_0: Array, cubic_value_at_1: Array, cubic_rate_at_1: Array
@@ -53,7 +34,7 @@ def _find_cubic_minimum(
     """Return the location and the value of the interior minimum of the cubic Hermite interpolant.
 
     The location is between 0 and 1. If there is no interior minimum, the value is the
-    lower of the values at the two ends.
+    lower of the values at the two ends. Rates are multiplied by the length of the solver step.
     """
     quadratic_coefficient = 3.0 * (
         2.0 * cubic_value_at_0 + cubic_rate_at_0 - 2.0 * cubic_value_at_1 + cubic_rate_at_1
@@ -78,47 +59,14 @@ def _find_cubic_minimum(
     x = jnp.where(location_denominator == 0.0, -1.0, location_numerator / nonzero_denominator)
     has_interior_minimum = (discriminant > 0.0) & (x > 0.0) & (x < 1.0)
     x = jnp.where(has_interior_minimum, x, 0.5)
-    return x, jnp.where(
-        has_interior_minimum,
-        _evaluate_cubic(x, cubic_value_at_0, cubic_rate_at_0, cubic_value_at_1, cubic_rate_at_1),
-        jnp.minimum(cubic_value_at_0, cubic_value_at_1),
+    value = (
+        (1 + 2 * x) * (1 - x) ** 2 * cubic_value_at_0
+        + x * (1 - x) ** 2 * cubic_rate_at_0
+        + x * x * (3 - 2 * x) * cubic_value_at_1
+        + x * x * (x - 1) * cubic_rate_at_1
     )
-
-
-def _refine_minimum_location(
-    step_length: Array,
-    margin_rate: Array,
-    max_step_length: Array,
-    best_step_length: Array,
-    best_margin_rate: Array,
-) -> tuple[Array, Array, Array, Array]:
-    """Return the next step of a secant iteration for the time at which a margin's rate is zero.
-
-    The result consists of the next step length, the step length with the smallest rate so far, that
-    rate, and whether the iteration has converged. The slope of the secant has no derivative.
-
-    - `margin_rate`: time derivative of the margin after a solver step of `step_length`, s;
-    - `max_step_length`: length of the solver step that contains the minimum, s.
-    """
-    length_value, rate_value = lax.stop_gradient((step_length, margin_rate))
-    length_change = length_value - best_step_length
-    rate_slope = (rate_value - best_margin_rate) / jnp.where(
-        length_change == 0.0, 1.0, length_change
-    )
-    is_secant_usable = (length_change != 0.0) & (rate_slope > 0.0)
-    length_correction = jnp.where(
-        is_secant_usable, -margin_rate / jnp.where(is_secant_usable, rate_slope, 1.0), 0.0
-    )
-    next_step_length = jnp.clip(step_length + length_correction, 0.0, max_step_length)
-    has_converged = (
-        jnp.abs(next_step_length - step_length) <= MINIMUM_LOCATION_TOLERANCE * max_step_length
-    )
-    best_step_length, best_margin_rate = select_trees_by_condition(
-        jnp.abs(rate_value) < jnp.abs(best_margin_rate),
-        (length_value, rate_value),
-        (best_step_length, best_margin_rate),
-    )
-    return next_step_length, best_step_length, best_margin_rate, has_converged
+    end_value = jnp.minimum(cubic_value_at_0, cubic_value_at_1)
+    return x, jnp.where(has_interior_minimum, value, end_value)
 
 
 class MarginMinimaState(NamedTuple):
@@ -375,24 +323,32 @@ def _refine_one_margin_minimum(
         (margin_value,), (margin_rate,) = phase.evaluate_with_rates(
             evaluate_selected_margin, step_end
         )
-        step_length, best_step_length, best_margin_rate, has_secant_converged = (
-            _refine_minimum_location(
-                step_length,
-                margin_rate,
-                margin_minimum_state.step_length,
-                margin_minimum_search.best_step_length,
-                margin_minimum_search.best_margin_rate,
-            )
+        # A secant step for the root of the margin's rate, whose slope has no derivative.
+        length_value, rate_value = lax.stop_gradient((step_length, margin_rate))
+        best = margin_minimum_search.best_step_length, margin_minimum_search.best_margin_rate
+        length_change = length_value - best[0]
+        rate_slope = (rate_value - best[1]) / jnp.where(length_change == 0.0, 1.0, length_change)
+        is_secant_usable = (length_change != 0.0) & (rate_slope > 0.0)
+        length_correction = jnp.where(
+            is_secant_usable, -margin_rate / jnp.where(is_secant_usable, rate_slope, 1.0), 0.0
+        )
+        max_step_length = margin_minimum_state.step_length
+        next_step_length = jnp.clip(step_length + length_correction, 0.0, max_step_length)
+        has_converged = (
+            jnp.abs(next_step_length - step_length) <= MINIMUM_LOCATION_TOLERANCE * max_step_length
+        )
+        best_step_length, best_margin_rate = select_trees_by_condition(
+            jnp.abs(rate_value) < jnp.abs(best[1]), (length_value, rate_value), best
         )
         return select_trees_by_condition(
             margin_minimum_search.is_minimum_unresolved,
             _MarginMinimumSearch(
-                step_length,
+                next_step_length,
                 best_step_length,
                 best_margin_rate,
                 margin_value,
                 margin_minimum_search.is_minimum_unresolved
-                & (~has_secant_converged | (n_iterations + 1 < min_iterations)),
+                & (~has_converged | (n_iterations + 1 < min_iterations)),
                 n_iterations,
             ),
             margin_minimum_search,

@@ -32,7 +32,6 @@ from vrw_jax.flow.hybrid_simulation import (
     Mode,
     Termination,
     convert_modes_to_tuple,
-    forbid_reverse_mode,
     simulate_hybrid,
     simulate_modes,
 )
@@ -42,6 +41,7 @@ from vrw_jax.flow.phase_integration import (
     is_machine_code_better,
     sample_phase,
 )
+from vrw_jax.lanes.autodiff import forbid_reverse_mode
 from vrw_jax.lanes.saved_traces import call_compiled_program
 
 
@@ -102,7 +102,7 @@ def segment_maps(
         flow_segments = call_compiled_program(
             _integrate_flow_segments, static_arguments, start, duration, options
         )
-    return forbid_reverse_mode("segment_maps", flow_segments)
+    return forbid_reverse_mode("hybrid.segment_maps", flow_segments)
 
 
 @lanes.jit
@@ -323,7 +323,7 @@ def flow_jacobian_determinant(
     flow_determinant = call_compiled_program(
         _multiply_event_determinants, modes, start, solution, options
     )
-    return forbid_reverse_mode("flow_jacobian_determinant", flow_determinant)
+    return forbid_reverse_mode("hybrid.flow_jacobian_determinant", flow_determinant)
 
 
 def _multiply_event_determinants(

@@ -133,24 +133,6 @@ or before the end is the hardest to detect.
 """
 
 
-def fit_guard_parabola(
-    tableau: ButcherTableau,
-    start_guard_value: Array,
-    middle_guard_value: Array,
-    end_guard_value: Array,
-) -> tuple[Array, Array]:
-    """Return the quadratic and linear coefficients of the parabola through three values of a guard.
-
-    The variable of the parabola is the fraction of the solver step. `middle_guard_value` is the
-    guard at `middle_guard_index`.
-    """
-    secant_rate = (middle_guard_value - start_guard_value) / tableau.middle_node
-    quadratic_coefficient = (end_guard_value - start_guard_value - secant_rate) / (
-        1.0 - tableau.middle_node
-    )
-    return quadratic_coefficient, end_guard_value - start_guard_value - quadratic_coefficient
-
-
 def _compute_bernstein_coefficients(
     tableau: ButcherTableau, guard_values: list[Array]
 ) -> list[Array]:
@@ -162,40 +144,6 @@ def _compute_bernstein_coefficients(
         guard_values[0],
         *(_sum_weighted_terms(matrix_row, guard_values) for matrix_row in tableau.bernstein_matrix),
     ]
-
-
-def _find_guard_minima(tableau: ButcherTableau, guard_values: list[Array]) -> tuple[Array, Array]:
-    """Return whether each guard may have a negative minimum inside a solver step, and where.
-
-    The location is the node of the lowest Bernstein coefficient, as a fraction of the step. A guard
-    that only decreases has no minimum.
-    """
-    min_bernstein_coefficient, *inner_bernstein_coefficients = _compute_bernstein_coefficients(
-        tableau, guard_values
-    )
-    minimum_fraction = jnp.zeros_like(min_bernstein_coefficient)
-    for i, inner_bernstein_coefficient in enumerate(inner_bernstein_coefficients):
-        minimum_fraction = jnp.where(
-            inner_bernstein_coefficient < min_bernstein_coefficient,
-            (i + 1) / len(guard_values[1:]),
-            minimum_fraction,
-        )
-        min_bernstein_coefficient = jnp.minimum(
-            inner_bernstein_coefficient, min_bernstein_coefficient
-        )
-    has_guard_risen = jnp.zeros(minimum_fraction.shape, bool)
-    for preceding_guard_value, following_guard_value in (
-        *zip(inner_bernstein_coefficients[-1:], guard_values[-1:], strict=False),
-        *itertools.pairwise(guard_values),
-    ):
-        has_guard_risen = has_guard_risen | (preceding_guard_value < following_guard_value)
-    has_guard_minimum = (
-        (min_bernstein_coefficient <= 0.0)
-        & (minimum_fraction > 0.0)
-        & has_guard_risen
-        & (guard_values[-1] > 0.0)
-    )
-    return has_guard_minimum, minimum_fraction
 
 
 def find_earliest_guard_minimum_fraction(
@@ -216,7 +164,32 @@ def find_earliest_guard_minimum_fraction(
     )
 
     def find_first_minimum(_: Array) -> Array:
-        has_guard_minimum, minimum_fraction = _find_guard_minima(tableau, guard_values)
+        # A guard may have a minimum at the node of its lowest coefficient if it rises somewhere.
+        min_bernstein_coefficient, *inner_bernstein_coefficients = _compute_bernstein_coefficients(
+            tableau, guard_values
+        )
+        minimum_fraction = jnp.zeros_like(min_bernstein_coefficient)
+        for i, inner_bernstein_coefficient in enumerate(inner_bernstein_coefficients):
+            minimum_fraction = jnp.where(
+                inner_bernstein_coefficient < min_bernstein_coefficient,
+                (i + 1) / len(guard_values[1:]),
+                minimum_fraction,
+            )
+            min_bernstein_coefficient = jnp.minimum(
+                inner_bernstein_coefficient, min_bernstein_coefficient
+            )
+        has_guard_risen = jnp.zeros(minimum_fraction.shape, bool)
+        for preceding_guard_value, following_guard_value in (
+            *zip(inner_bernstein_coefficients[-1:], guard_values[-1:], strict=False),
+            *itertools.pairwise(guard_values),
+        ):
+            has_guard_risen = has_guard_risen | (preceding_guard_value < following_guard_value)
+        has_guard_minimum = (
+            (min_bernstein_coefficient <= 0.0)
+            & (minimum_fraction > 0.0)
+            & has_guard_risen
+            & (guard_values[-1] > 0.0)
+        )
         return jnp.min(jnp.where(is_counted & has_guard_minimum, minimum_fraction, 1.0), axis=0)
 
     whole_step_fraction = jnp.ones_like(guard_values[0][0])
@@ -473,6 +446,15 @@ class BatchPhase(NamedTuple):
     def make_state(self, q: Any, v: Any) -> StageState:
         """Return the state with positions `q`, rates `v` and the accelerations there."""
         return StageState(q, v, self.evaluate_acceleration(q, v))
+
+    def wrap_functions(self, wrap: Callable) -> "BatchPhase":
+        """Return the phase in which `wrap` has been applied to each function."""
+        return self._replace(
+            evaluate_acceleration=wrap(self.evaluate_acceleration),
+            evaluate_guards=wrap(self.evaluate_guards),
+            evaluate_margins=wrap(self.evaluate_margins),
+            on_sides=lambda sides: self.on_sides(sides).wrap_functions(wrap),
+        )
 
     def evaluate_with_rates(
         self, evaluate_functions: Callable[[StageState], Any], state: StageState

@@ -147,15 +147,6 @@ def _split_along_axis(
     ]
 
 
-def emit_concatenated_array(
-    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *joined_arrays: LlvmArray
-) -> LlvmArray:
-    """Return the arrays joined along an existing axis."""
-    return _concatenate_along_axis(
-        array_emitter, primitive_call, primitive_call.primitive_params["dimension"], joined_arrays
-    )
-
-
 def emit_stacked_array(
     array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *stacked_arrays: LlvmArray
 ) -> LlvmArray:
@@ -165,7 +156,8 @@ def emit_stacked_array(
         array_emitter.reshape_array(x, (*x.shape[:new_axis], 1, *x.shape[new_axis:]))
         for x in stacked_arrays
     ]
-    return _concatenate_along_axis(array_emitter, primitive_call, new_axis, expanded_arrays)
+    concatenation = primitive_call._replace(primitive_params={"dimension": new_axis})
+    return emit_concatenated_array(array_emitter, concatenation, *expanded_arrays)
 
 
 def emit_unstacked_arrays(
@@ -196,13 +188,11 @@ def emit_optimization_barrier(
     ]
 
 
-def _concatenate_along_axis(
-    array_emitter: ArrayEmitter,
-    primitive_call: PrimitiveCall,
-    join_axis: int,
-    joined_arrays: Sequence[LlvmArray],
+def emit_concatenated_array(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *joined_arrays: LlvmArray
 ) -> LlvmArray:
-    """Return the arrays joined along the existing axis `join_axis`."""
+    """Return the arrays joined along an existing axis."""
+    join_axis = primitive_call.primitive_params["dimension"]
     result_shape = primitive_call.result_shape
     if join_axis == len(result_shape):
         raise make_lane_mixing_error(primitive_call.primitive_name)
@@ -402,69 +392,6 @@ def emit_cumulative_sum(
     return np.flip(partial_sums, sum_axis) if is_reversed else partial_sums
 
 
-def emit_array_product(
-    array_emitter: ArrayEmitter,
-    primitive_call: PrimitiveCall,
-    left_array: LlvmArray,
-    right_array: LlvmArray,
-) -> LlvmArray:
-    """Return the product of two arrays, summed over one axis of each array."""
-    (contracted_left_axes, contracted_right_axes), (batch_axes, _) = (
-        primitive_call.primitive_params["dimension_numbers"]
-    )
-    if batch_axes or len(contracted_left_axes) != 1:
-        raise NotImplementedError(
-            "dot_general sums over one pair of axes only, without a batch: multiply and sum."
-        )
-    (left_axis,), (right_axis,) = contracted_left_axes, contracted_right_axes
-    result_dtype = primitive_call.result_aval.dtype
-    emit_product = _make_combination(array_emitter, "mul", result_dtype)
-    emit_sum = _make_combination(array_emitter, "add", result_dtype)
-    n_terms, n_left_axes = left_array.shape[left_axis], len(left_array.shape) - 1
-
-    def emit_product_term(product_index: EntryIndex, k: Any) -> LlvmValue:
-        left_index, right_index = product_index[:n_left_axes], product_index[n_left_axes:]
-        x = array_emitter.get_array_entry(
-            left_array, (*left_index[:left_axis], k, *left_index[left_axis:])
-        )
-        y = array_emitter.get_array_entry(
-            right_array, (*right_index[:right_axis], k, *right_index[right_axis:])
-        )
-        return emit_product(x, y)
-
-    product_shape = primitive_call.result_shape
-    entry_type = array_emitter.get_entry_type(primitive_call.result_aval)
-    if n_terms <= array_emitter.MAX_UNROLLED_REDUCTION_TERMS or array_emitter.is_in_innermost_loop:
-        emit_product_entry = lambda entry_index: functools.reduce(
-            emit_sum, [emit_product_term(entry_index, k) for k in range(n_terms)]
-        )
-        if isinstance(left_array, LazyArray) or isinstance(right_array, LazyArray):
-            return LazyArray(product_shape, entry_type, emit_product_entry)
-        return make_entry_array(
-            product_shape, list(map(emit_product_entry, np.ndindex(product_shape)))
-        )
-    left_array, right_array = map(array_emitter.store_array_in_memory, (left_array, right_array))
-    product_memory = array_emitter.allocate_memory_array(product_shape, entry_type)
-
-    def store_product_entry(product_index: EntryIndex, _: Any) -> list[LlvmValue]:
-        add_term = lambda k, partial_sums: [
-            emit_sum(partial_sums[0], emit_product_term(product_index, k))
-        ]
-        product_memory.emit_entry_store(
-            product_index,
-            array_emitter.emit_range_loop(
-                0,
-                n_terms,
-                add_term,
-                [array_emitter.value_emitter.make_llvm_constant(entry_type, 0)],
-            )[0],
-        )
-        return []
-
-    array_emitter.emit_index_loops(product_shape, store_product_entry)
-    return product_memory
-
-
 COMBINING_PRIMITIVE_BY_REDUCTION = {
     "reduce_and": "and",
     "reduce_max": "max",
@@ -543,7 +470,17 @@ def emit_reduced_array(
             [initial_reduction_value],
         )[0]
 
-    reduced_entries = list(map(emit_reduced_entry, np.ndindex(*result_axis_lengths)))
+    def store_reduced_entry(result_index: EntryIndex, _: Any) -> list[LlvmValue]:
+        result_memory.emit_entry_store(result_index, emit_reduced_entry(result_index))
+        return []
+
+    result_shape = tuple(result_axis_lengths)
+    is_large = math.prod(result_shape) > array_emitter.MAX_REGISTER_ENTRIES
+    if isinstance(array, LazyArray) and is_large and not reduces_over_lanes:
+        result_memory = array_emitter.allocate_memory_array(result_shape, array.entry_type)
+        array_emitter.emit_index_loops(result_shape, store_reduced_entry)
+        return result_memory
+    reduced_entries = list(map(emit_reduced_entry, np.ndindex(result_shape)))
     for i, lane_flags in enumerate(reduced_entries):
         # This truth value of the group is a scalar: whether any ("or") or all ("and") lanes are
         # true.
@@ -555,7 +492,7 @@ def emit_reduced_array(
             reduced_entries[i] = array_emitter.llvm_builder.icmp_unsigned(
                 comparison_operator, lane_bits, ir.Constant(lane_bits.type, number)
             )
-    return make_entry_array(tuple(result_axis_lengths), reduced_entries)
+    return make_entry_array(result_shape, reduced_entries)
 
 
 def _make_combination(

@@ -24,10 +24,11 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
-from jax.interpreters import batching
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
 from vrw_jax.lanes.batching import BatchFunction, unbatch
+from vrw_jax.lanes.code_cache import targets_machine_code
 from vrw_jax.lanes.settings import with_default_jax_settings
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
@@ -229,21 +230,6 @@ def compute_jacobian_columns(
     return jacobian_columns, float_outputs, nonfloat_outputs
 
 
-def _differentiate_float_outputs(
-    function: ForwardFunction, argnums: int | tuple[int, ...]
-) -> Callable[..., tuple]:
-    """Return a function that computes the Jacobians of the float outputs, and all outputs.
-
-    The Jacobians are with respect to the arguments `argnums`, as those of `jax.jacfwd`.
-    """
-
-    def evaluate_with_aux(*arrays: Any) -> tuple[PyTree, tuple]:
-        outputs = function(*arrays)
-        return outputs[0], outputs
-
-    return jax.jacfwd(evaluate_with_aux, argnums=argnums, has_aux=True)
-
-
 @jax.jit
 def _apply_columns(columns: PyTree, tangents: Sequence[Array]) -> PyTree:
     """Return the sum over columns of a Jacobian times entries of tangents, leaf by leaf.
@@ -338,12 +324,13 @@ def evaluate_with_jacobian(function: Callable, *arguments: Array) -> tuple[Any, 
     one entry per argument.
     """
 
-    partitioned_function = lambda *arrays: eqx.partition(function(*arrays), eqx.is_inexact_array)
-    all_argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
-    output_jacobian, outputs = _differentiate_float_outputs(partitioned_function, all_argnums)(
-        *arguments
-    )
-    return eqx.combine(*outputs), output_jacobian
+    def evaluate_parts(*arrays: Any) -> tuple[PyTree, tuple]:
+        outputs = eqx.partition(function(*arrays), eqx.is_inexact_array)
+        return outputs[0], outputs
+
+    argnums = tuple(range(len(arguments))) if len(arguments) > 1 else 0
+    jacobian, outputs = jax.jacfwd(evaluate_parts, argnums, has_aux=True)(*arguments)
+    return eqx.combine(*outputs), jacobian
 
 
 def apply_jacobian(jacobian: PyTree, tangent: Array) -> PyTree:
@@ -513,3 +500,49 @@ def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
         return differentiable_function(*float_arguments)
 
     return call_with_batched_jvp
+
+
+_FORWARD_ONLY_PRIMITIVE = Primitive("forward_only")
+"""Identity operation whose transpose raises an error."""
+
+
+def _raise_reverse_mode_error(_cotangent: Any, _value: Any, *, function_name: str) -> None:
+    """Raise a ValueError that explains why reverse mode is not available."""
+    raise ValueError(
+        f"{function_name} has no derivative in reverse mode, since the number of its solver "
+        "steps is not known beforehand: use forward mode, jax.jacfwd or jax.jvp, instead of "
+        "jax.grad, jax.jacrev or jax.vjp."
+    )
+
+
+_FORWARD_ONLY_PRIMITIVE.def_impl(lambda x, *, function_name: x)
+
+
+_FORWARD_ONLY_PRIMITIVE.def_abstract_eval(lambda x, *, function_name: x)
+
+
+ad.deflinear2(_FORWARD_ONLY_PRIMITIVE, _raise_reverse_mode_error)
+
+
+batching.defvectorized(_FORWARD_ONLY_PRIMITIVE)
+
+
+mlir.register_lowering(_FORWARD_ONLY_PRIMITIVE, lambda _context, x, *, function_name: [x])
+
+
+def forbid_reverse_mode(function_name: str, function_result: PyTree) -> PyTree:
+    """Return `function_result` unchanged, marked so that reverse-mode differentiation raises an
+    error.
+
+    `function_name` is the function that computed the result. Inside `lanes.jit` there is no mark,
+    because reverse mode transposes the derivatives that machine code computes.
+    """
+    if targets_machine_code():
+        return function_result
+
+    def mark_leaf_as_forward_only(leaf: Any) -> Any:
+        if isinstance(leaf, jax.core.Tracer) and eqx.is_inexact_array(leaf):
+            return _FORWARD_ONLY_PRIMITIVE.bind(leaf, function_name=function_name)
+        return leaf
+
+    return jax.tree.map(mark_leaf_as_forward_only, function_result)

@@ -53,6 +53,7 @@ class LaneProgram:
     """
 
     name: str  # Programs with equal names are equal.
+    lanes_per_group: int = field(compare=False)
     result_shapes_and_dtypes: ResultShapesAndDtypes = field(compare=False)
     result_structure: Any = field(compare=False)
     compile_code: Callable[[], MachineCode] = field(compare=False)
@@ -70,7 +71,7 @@ def get_lane_program(
     lane_function: Callable,
     argument_shapes: Any,
     function_key: str | None,
-    lanes_per_group: int,
+    numbers_of_lanes: Sequence[int],
     max_unrolled_entries: int,
 ) -> LaneProgram:
     """Return the program of a function of arrays with lanes on the last axis.
@@ -81,35 +82,16 @@ def get_lane_program(
     - `argument_shapes`: shapes and dtypes of the arguments;
     - `function_key`: key of the function, see `keys.make_key`; None if it has none, so that it is
       traced at each call and never saved;
-    - `lanes_per_group`: number of lanes that the code computes at a time.
+    - `numbers_of_lanes`: possible numbers of lanes that the code computes at a time. The first
+      number is taken for which this process, or else the disk cache, has a program. If there is
+      none, it is the first of all.
     """
-    if function_key is None:
-        return _trace_lane_program(
-            lane_function, argument_shapes, None, None, lanes_per_group, max_unrolled_entries
-        )
-    trace_name, index_name = _make_names(
-        function_key, argument_shapes, lanes_per_group, max_unrolled_entries
+    trace_program = lambda trace_name, index_name, n: _trace_lane_program(
+        lane_function, argument_shapes, trace_name, index_name, n, max_unrolled_entries
     )
-    if index_name not in _lane_program_by_index_name:
-        trace_program = functools.partial(
-            _trace_lane_program,
-            lane_function,
-            argument_shapes,
-            trace_name,
-            index_name,
-            lanes_per_group,
-            max_unrolled_entries,
-        )
-        _lane_program_by_index_name[index_name] = (
-            _load_lane_program(index_name, trace_program) or trace_program()
-        )
-    return _lane_program_by_index_name[index_name]
-
-
-def _make_names(
-    function_key: str, argument_shapes: Any, lanes_per_group: int, max_unrolled_entries: int
-) -> tuple[str, str]:
-    """Return the names of the trace of a function, and of the index record of a program."""
+    n = numbers_of_lanes[0]
+    if function_key is None:
+        return trace_program(None, None, n)
     trace_key = (
         function_key,
         [(x.shape, x.dtype.name, bool(getattr(x, "weak_type", False))) for x in argument_shapes],
@@ -117,38 +99,23 @@ def _make_names(
         disk_cache.describe_trace_environment(),
         describe_compiler_settings(),
     )
-    trace_name, index_digest = (
-        hashlib.sha256(repr(key).encode()).hexdigest()
-        for key in (trace_key, (trace_key, lanes_per_group))
-    )
-    return trace_name, f"lanes_index_{index_digest}"
-
-
-def choose_lanes_per_group(
-    function_key: str | None,
-    argument_shapes: Any,
-    numbers_of_lanes: Sequence[int],
-    max_unrolled_entries: int,
-) -> int:
-    """Return the first number of lanes per group for which this process or else the disk cache has
-    a program of `get_lane_program`, or the first of all if there is none.
-    """
-    if function_key is None:
-        return numbers_of_lanes[0]
-    index_names = [
-        _make_names(function_key, argument_shapes, n, max_unrolled_entries)[1]
-        for n in numbers_of_lanes
-    ]
-    is_saved = lambda name: disk_cache.load_cache_record(name) is not None
-    for is_known in (_lane_program_by_index_name.__contains__, is_saved):
-        for n, index_name in zip(numbers_of_lanes, index_names, strict=True):
-            if is_known(index_name):
-                return n
-    return numbers_of_lanes[0]
+    digest = lambda key: hashlib.sha256(repr(key).encode()).hexdigest()
+    index_names = {m: f"lanes_index_{digest((trace_key, m))}" for m in numbers_of_lanes}
+    if len(numbers_of_lanes) > 1:
+        is_saved = lambda name: disk_cache.load_cache_record(name) is not None
+        are_known = (_lane_program_by_index_name.__contains__, is_saved)
+        n = next((m for f in are_known for m in numbers_of_lanes if f(index_names[m])), n)
+    index_name = index_names[n]
+    if index_name not in _lane_program_by_index_name:
+        trace = functools.partial(trace_program, digest(trace_key), index_name, n)
+        _lane_program_by_index_name[index_name] = (
+            _load_lane_program(index_name, n, trace) or trace()
+        )
+    return _lane_program_by_index_name[index_name]
 
 
 def _load_lane_program(
-    index_name: str, trace_program: Callable[[], LaneProgram]
+    index_name: str, lanes_per_group: int, trace_program: Callable[[], LaneProgram]
 ) -> LaneProgram | None:
     """Return the program that an index record describes, or None.
 
@@ -166,9 +133,8 @@ def _load_lane_program(
         return None
     if code_name and machine_code is None:
         return None
-    return LaneProgram(
-        index_name, result_types, structure, lambda: machine_code or trace_program().machine_code
-    )
+    compile_code = lambda: machine_code or trace_program().machine_code
+    return LaneProgram(index_name, lanes_per_group, result_types, structure, compile_code)
 
 
 @with_default_jax_settings  # The trace has calls also where the caller has disabled `jax.jit`.
@@ -203,52 +169,37 @@ def _trace_lane_program(
             record = pickle.dumps((code_name, result_types, skeleton))
             disk_cache.save_cache_record(str(index_name), record)
 
-    compile_code = lambda: _compile_trace(
-        closed_jaxpr,
-        save_index if index_name else None,
-        lanes_per_group,
-        max_unrolled_entries,
-    )
+    def compile_code() -> MachineCode:
+        """Compile the trace in the background, unless its LLVM text is known."""
+        llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, max_unrolled_entries)
+        digested_text = f"{describe_compiler_settings()}{llvm_text}"
+        code_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
+
+        def compile_and_save_code() -> bytes:
+            object_code = compile_llvm_for_processor(llvm_text)
+            if trace_name:
+                disk_cache.save_cache_record(code_name, object_code)
+                save_index(code_name)
+            return object_code
+
+        # Another trace may have given the same LLVM text.
+        find_code = load_machine_code if trace_name else _machine_code_by_name.get
+        machine_code = find_code(code_name)
+        if machine_code is None:
+            machine_code = _machine_code_by_name[code_name] = MachineCode(
+                code_name, _llvm_compiler_pool.submit(compile_and_save_code)
+            )
+        elif trace_name:
+            save_index(code_name)
+        return machine_code
+
+    get_code = compile_code
     if index_name:
         save_index()
     else:
         machine_code = compile_code()
-        index_name, compile_code = machine_code.ffi_target_name, lambda: machine_code
-    return LaneProgram(index_name, result_types, result_structure, compile_code)
-
-
-def _compile_trace(
-    closed_jaxpr: ClosedJaxpr,
-    save_index: Callable[[str], None] | None,
-    lanes_per_group: int,
-    max_unrolled_entries: int,
-) -> MachineCode:
-    """Compile a trace in the background, unless its LLVM text is known.
-
-    - `save_index`: function that saves the name of the code; None if nothing is saved.
-    """
-    llvm_text = write_llvm_kernel(closed_jaxpr, lanes_per_group, max_unrolled_entries)
-    digested_text = f"{describe_compiler_settings()}{llvm_text}"
-    code_name = f"lanes_code_{hashlib.sha256(digested_text.encode()).hexdigest()}"
-
-    def compile_and_save_code() -> bytes:
-        object_code = compile_llvm_for_processor(llvm_text)
-        if save_index:
-            disk_cache.save_cache_record(code_name, object_code)
-            save_index(code_name)
-        return object_code
-
-    # Another trace may have given the same LLVM text.
-    machine_code = (
-        load_machine_code(code_name) if save_index else _machine_code_by_name.get(code_name)
-    )
-    if machine_code is None:
-        machine_code = _machine_code_by_name[code_name] = MachineCode(
-            code_name, _llvm_compiler_pool.submit(compile_and_save_code)
-        )
-    elif save_index:
-        save_index(code_name)
-    return machine_code
+        index_name, get_code = machine_code.ffi_target_name, lambda: machine_code
+    return LaneProgram(index_name, lanes_per_group, result_types, result_structure, get_code)
 
 
 def load_machine_code(code_name: str) -> MachineCode | None:

@@ -1,4 +1,4 @@
-"""Primitives without a rule of their own, written for one lane in terms of others."""
+"""Primitives without a rule of their own, written in terms of others, for one lane."""
 
 import functools
 import math
@@ -171,14 +171,6 @@ def _atan2(y: jax.Array, x: jax.Array, **_: Any) -> jax.Array:
     return angle + (sine + sine * sine * sine / 6.0)
 
 
-def _asin(x: jax.Array, **_: Any) -> jax.Array:
-    return _atan2(x, jnp.sqrt((1.0 - x) * (1.0 + x)))
-
-
-def _acos(x: jax.Array, **_: Any) -> jax.Array:
-    return _atan2(jnp.sqrt((1.0 - x) * (1.0 + x)), x)
-
-
 def _asinh(x: jax.Array, **_: Any) -> jax.Array:
     size = jnp.abs(x)
     is_large = size > 1e8  # 1 + size**2 is size**2 to round-off
@@ -226,12 +218,39 @@ def _cbrt(x: jax.Array, **_: Any) -> jax.Array:
     return jnp.where(is_simple, x, jnp.where(x < 0.0, -root, root))
 
 
+def _multiply(
+    left: jax.Array,
+    right: jax.Array,
+    *,
+    dimension_numbers: Any,
+    preferred_element_type: Any = None,
+    **_: Any,
+) -> jax.Array:
+    """Return a product of arrays as a sum of elementwise products."""
+    (summed_left, summed_right), (batch_left, batch_right) = dimension_numbers
+    first_left, first_right = (*summed_left, *batch_left), (*summed_right, *batch_right)
+    free_left, free_right = (
+        [axis for axis in range(x.ndim) if axis not in first_axes]
+        for x, first_axes in ((left, first_left), (right, first_right))
+    )
+    n, n_left, n_right = map(len, (first_left, free_left, free_right))
+    dtype = preferred_element_type or jnp.result_type(left, right)
+    left, right = (
+        jnp.expand_dims(lax.transpose(x, order), new_axes).astype(dtype)
+        for x, order, new_axes in (
+            (left, (*first_left, *free_left), tuple(range(n + n_left, n + n_left + n_right))),
+            (right, (*first_right, *free_right), tuple(range(n, n + n_left))),
+        )
+    )
+    return jnp.sum(left * right, tuple(range(len(summed_left))), dtype)
+
+
 DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
-    "acos": _acos,
+    "acos": lambda x, **_: _atan2(jnp.sqrt((1.0 - x) * (1.0 + x)), x),
     "acosh": _acosh,
     "argmax": functools.partial(_find_extremum, lax.gt),
     "argmin": functools.partial(_find_extremum, lax.lt),
-    "asin": _asin,
+    "asin": lambda x, **_: _atan2(x, jnp.sqrt((1.0 - x) * (1.0 + x))),
     "asinh": _asinh,
     "atan": lambda x, **_: _atan2(x, jnp.ones_like(x)),
     "atan2": _atan2,
@@ -240,6 +259,7 @@ DECOMPOSITIONS: dict[str, Callable[..., Any]] = {
     "ceil": lambda x: -jnp.floor(-x),
     "clamp": lambda lower, x, upper: jnp.minimum(jnp.maximum(x, lower), upper),
     "cosh": lambda x, **_: 0.5 * (jnp.exp(x) + jnp.exp(-x)),
+    "dot_general": _multiply,
     "expm1": _expm1,
     "gather": _gather,
     "log1p": _log1p,

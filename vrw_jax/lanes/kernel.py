@@ -6,6 +6,7 @@ XLA calls the latter through its foreign function interface (FFI).
 import functools
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -178,7 +179,6 @@ def write_llvm_kernel(
     array_emitter = ArrayEmitter(value_emitter, max_unrolled_entries)
     inputs, outputs, n_lanes, first_lane_group, end_lane_group = llvm_kernel.args
     argument_avals, result_avals = closed_jaxpr.in_avals, closed_jaxpr.out_avals
-    has_single_lane = lanes_per_group == 1
 
     def load_pointers(pointer_table: LlvmValue, n_pointers: int) -> list[LlvmValue]:
         table = MemoryArray(array_emitter, (n_pointers,), llvm_pointer_type, pointer_table)
@@ -189,77 +189,9 @@ def write_llvm_kernel(
 
     def emit_lane_group(lane_group_index: LlvmValue, _: Any) -> list[LlvmValue]:
         first_lane = llvm_builder.mul(lane_group_index, ir.Constant(I64, lanes_per_group))
-
-        def emit_address(base: LlvmValue, aval: Any, entry_index: EntryIndex) -> tuple:
-            """Return the address of an entry for the first lane of the group, and its type there.
-
-            The last axis of the caller's arrays is the lane axis.
-            """
-            number_type = I8 if aval.dtype.kind == "b" else LLVM_NUMBER_TYPES[aval.dtype.name]
-            if aval.shape == ():
-                return base, number_type
-            entry_offset = array_emitter.emit_memory_offset(entry_index, aval.shape[:-1])
-            lane_offset = llvm_builder.add(llvm_builder.mul(entry_offset, n_lanes), first_lane)
-            address = llvm_builder.gep(base, [lane_offset], source_etype=number_type)
-            if has_single_lane:
-                return address, number_type
-            return address, value_emitter.make_vector_type(number_type)
-
-        def read_argument(base: LlvmValue, aval: Any) -> LlvmArray:
-            """Return an argument; one without axes is one number for all lanes."""
-            if LANE_AXIS_SENTINEL in aval.shape[:-1]:
-                raise make_lane_axis_error("An argument", aval)
-
-            def load_entry(entry_index: EntryIndex) -> LlvmValue:
-                address, stored_type = emit_address(base, aval, entry_index)
-                value = llvm_builder.load(address, typ=stored_type, align=aval.dtype.itemsize)
-                if aval.dtype.kind == "b":
-                    zero = value_emitter.make_llvm_constant(stored_type, 0)
-                    value = llvm_builder.icmp_signed("!=", value, zero)
-                if not (has_single_lane and aval.shape):
-                    return value
-                vector = value_emitter.to_lane_vector(value)
-                if aval.dtype.kind != "f":
-                    return vector
-                # The vector is read from memory. LLVM would else compute only one of two equal
-                # entries, and then might not fuse the same products and sums.
-                memory = array_emitter.allocate_memory_array((2,), value.type)
-                for i in range(2):
-                    memory.emit_entry_store((i,), value)
-                return llvm_builder.load(memory.base_pointer, typ=vector.type, align=8)
-
-            array = LazyArray(aval.shape[:-1], array_emitter.get_entry_type(aval), load_entry)
-            fits_registers = math.prod(array.shape) <= array_emitter.MAX_REGISTER_ENTRIES
-            return array_emitter.get_array_entries(array) if fits_registers else array
-
-        def write_result(base: LlvmValue, aval: Any, result: LlvmArray) -> None:
-            if not has_lane_axis(aval):
-                raise LaneAxisError(
-                    f"A result has the shape {aval.str_short()}, the same for all lanes: compute "
-                    "it outside, or add zeros of the lanes."
-                )
-
-            if 0 in aval.shape:
-                return
-
-            def store_entry(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
-                address, stored_type = emit_address(base, aval, entry_index)
-                value = value_emitter.to_lane_vector(
-                    array_emitter.get_array_entry(result, entry_index)
-                )
-                if aval.dtype.kind == "b":
-                    value = llvm_builder.zext(value, value_emitter.make_vector_type(I8))
-                if has_single_lane:
-                    # The lane is read from memory, because LLVM would reduce an extracted entry,
-                    # and all operations before it, to scalars.
-                    memory = array_emitter.allocate_memory_array((), value.type)
-                    llvm_builder.store(value, memory.base_pointer)
-                    value = llvm_builder.load(memory.base_pointer, typ=stored_type)
-                llvm_builder.store(value, address, align=aval.dtype.itemsize)
-                return []
-
-            array_emitter.emit_index_loops(aval.shape[:-1], store_entry)
-
+        read_argument, write_result = _make_lane_access(
+            array_emitter, lanes_per_group, n_lanes, first_lane
+        )
         arguments = list(map(read_argument, input_pointers, argument_avals))
         lowering = JaxprLowering(array_emitter)
         results = lowering.lower_jaxpr(closed_jaxpr, arguments)
@@ -272,3 +204,81 @@ def write_llvm_kernel(
     n_arguments, n_results = len(argument_avals), len(result_avals)
     add_ffi_handler(llvm_module, llvm_kernel, n_arguments, n_results, lanes_per_group)
     return str(llvm_module)
+
+
+def _make_lane_access(
+    array_emitter: ArrayEmitter, lanes_per_group: int, n_lanes: LlvmValue, first_lane: LlvmValue
+) -> tuple[Callable[..., LlvmArray], Callable[..., None]]:
+    """Return functions that read an argument and write a result of the lanes from `first_lane`."""
+    value_emitter, llvm_builder = array_emitter.value_emitter, array_emitter.llvm_builder
+    has_single_lane = lanes_per_group == 1
+
+    def emit_address(base: LlvmValue, aval: Any, entry_index: EntryIndex) -> tuple:
+        """Return the address of an entry for the first lane of the group, and its type there.
+
+        The last axis of the caller's arrays is the lane axis.
+        """
+        number_type = I8 if aval.dtype.kind == "b" else LLVM_NUMBER_TYPES[aval.dtype.name]
+        if aval.shape == ():
+            return base, number_type
+        entry_offset = array_emitter.emit_memory_offset(entry_index, aval.shape[:-1])
+        lane_offset = llvm_builder.add(llvm_builder.mul(entry_offset, n_lanes), first_lane)
+        address = llvm_builder.gep(base, [lane_offset], source_etype=number_type)
+        if has_single_lane:
+            return address, number_type
+        return address, value_emitter.make_vector_type(number_type)
+
+    def read_argument(base: LlvmValue, aval: Any) -> LlvmArray:
+        """Return an argument; one without axes is one number for all lanes."""
+        if LANE_AXIS_SENTINEL in aval.shape[:-1]:
+            raise make_lane_axis_error("An argument", aval)
+
+        def load_entry(entry_index: EntryIndex) -> LlvmValue:
+            address, stored_type = emit_address(base, aval, entry_index)
+            value = llvm_builder.load(address, typ=stored_type, align=aval.dtype.itemsize)
+            if aval.dtype.kind == "b":
+                zero = value_emitter.make_llvm_constant(stored_type, 0)
+                value = llvm_builder.icmp_signed("!=", value, zero)
+            if not (has_single_lane and aval.shape):
+                return value
+            vector = value_emitter.to_lane_vector(value)
+            if aval.dtype.kind != "f":
+                return vector
+            # The vector is read from memory. LLVM would else compute only one of two equal
+            # entries, and then might not fuse the same products and sums.
+            memory = array_emitter.allocate_memory_array((2,), value.type)
+            for i in range(2):
+                memory.emit_entry_store((i,), value)
+            return llvm_builder.load(memory.base_pointer, typ=vector.type, align=8)
+
+        array = LazyArray(aval.shape[:-1], array_emitter.get_entry_type(aval), load_entry)
+        fits_registers = math.prod(array.shape) <= array_emitter.MAX_REGISTER_ENTRIES
+        return array_emitter.get_array_entries(array) if fits_registers else array
+
+    def write_result(base: LlvmValue, aval: Any, result: LlvmArray) -> None:
+        if not has_lane_axis(aval):
+            raise LaneAxisError(
+                f"A result has the shape {aval.str_short()}, the same for all lanes: compute "
+                "it outside, or add zeros of the lanes."
+            )
+
+        if 0 in aval.shape:
+            return
+
+        def store_entry(entry_index: EntryIndex, _: Any) -> list[LlvmValue]:
+            address, stored_type = emit_address(base, aval, entry_index)
+            value = value_emitter.to_lane_vector(array_emitter.get_array_entry(result, entry_index))
+            if aval.dtype.kind == "b":
+                value = llvm_builder.zext(value, value_emitter.make_vector_type(I8))
+            if has_single_lane:
+                # The lane is read from memory, because LLVM would reduce an extracted entry,
+                # and all operations before it, to scalars.
+                memory = array_emitter.allocate_memory_array((), value.type)
+                llvm_builder.store(value, memory.base_pointer)
+                value = llvm_builder.load(memory.base_pointer, typ=stored_type)
+            llvm_builder.store(value, address, align=aval.dtype.itemsize)
+            return []
+
+        array_emitter.emit_index_loops(aval.shape[:-1], store_entry)
+
+    return read_argument, write_result

@@ -169,7 +169,8 @@ def lift_numbers(function: Callable) -> tuple[list[Any], Callable[[Sequence[Any]
 
     def lift(value: Any, enclosing_ids: frozenset[int]) -> Callable[[Sequence[Any]], Any]:
         """Return a function of all numbers that makes `value` anew."""
-        if _is_number(value):
+        is_array = isinstance(value, np.ndarray | np.generic | jax.Array)
+        if isinstance(value, float) or (is_array and np.issubdtype(value.dtype, np.floating)):
             numbers.append(value)
             return operator.itemgetter(len(numbers) - 1)
         if id(value) in enclosing_ids or _is_trusted_function(value):
@@ -206,13 +207,6 @@ def make_placeholder(number: Any) -> tuple:
     """Return what stands in a key for a number that is an argument of the compiled function."""
     aval = jax.typeof(number)
     return "argument", aval.shape, aval.dtype.name, aval.weak_type
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, float) or (
-        isinstance(value, np.ndarray | np.generic | jax.Array)
-        and np.issubdtype(value.dtype, np.floating)
-    )
 
 
 def _with_closure(function: types.FunctionType, cell_values: Sequence[Any]) -> types.FunctionType:
@@ -411,7 +405,10 @@ class _Digester:
         if facts.obstacle:
             raise UnresolvableFunctionError(facts.obstacle)
         self.write("code", facts.digest)
-        global_values, builtin_values = function.__globals__, _get_builtins(function)
+        global_values = function.__globals__
+        builtin_values = global_values.get("__builtins__", {})
+        if isinstance(builtin_values, types.ModuleType):
+            builtin_values = vars(builtin_values)
         free_modules = dict(
             zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
         )
@@ -526,11 +523,6 @@ def _is_found_by_name(value: type) -> bool:
 
 def _without_descriptions(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return {name: x for name, x in attributes.items() if name not in DESCRIPTIVE_ATTRIBUTES}
-
-
-def _get_builtins(function: types.FunctionType) -> dict[str, Any]:
-    builtin_values = function.__globals__.get("__builtins__", {})
-    return vars(builtin_values) if isinstance(builtin_values, types.ModuleType) else builtin_values
 
 
 def _as_tuple(names: Any) -> tuple[str, ...]:

@@ -67,9 +67,10 @@ def append_lane_axis(function: Callable[..., Any], n_shared: int = 0) -> Callabl
         n_shared_leaves = len(jax.tree.leaves(arguments[:n_shared]))
         n_lanes = argument_leaves[-1].shape[-1]
         values = [LaneValue(x, i >= n_shared_leaves) for i, x in enumerate(argument_leaves)]
+        is_weak = lambda x: bool(getattr(jax.typeof(x), "weak_type", False))
         one_lane = [
             jax.ShapeDtypeStruct(
-                x.shape[:-1] if has_lanes else jnp.shape(x), x.dtype, weak_type=_is_weak(x)
+                x.shape[:-1] if has_lanes else jnp.shape(x), x.dtype, weak_type=is_weak(x)
             )
             for x, has_lanes in values
         ]
@@ -82,10 +83,6 @@ def append_lane_axis(function: Callable[..., Any], n_shared: int = 0) -> Callabl
         )
 
     return call_with_lanes
-
-
-def _is_weak(array: Any) -> bool:
-    return bool(getattr(jax.typeof(array), "weak_type", False))
 
 
 def _with_lanes(n_lanes: int, value: LaneValue, shape: tuple[int, ...] | None = None) -> Any:
@@ -138,7 +135,12 @@ def _evaluate_with_lanes(
         decomposed = jax.make_jaxpr(functools.partial(DECOMPOSITIONS[name], **equation.params))
         return _evaluate(n_lanes, decomposed(*(x.aval for x in equation.invars)), operands)
     if name in CALLED_JAXPR_PARAMETERS:
-        return _call(n_lanes, equation, operands)
+        closed_jaxpr = equation.params[CALLED_JAXPR_PARAMETERS[name]]
+        flags = tuple(x.has_lanes for x in operands)
+        if equation.params.get("name") != NOINLINE_FUNCTION_NAME or not any(flags):
+            return _evaluate(n_lanes, closed_jaxpr, operands)
+        evaluate_arrays, result_flags = _make_separate_function(n_lanes, closed_jaxpr, flags)
+        return list(map(LaneValue, evaluate_arrays(*(x.array for x in operands)), result_flags))
     if name in ELEMENTWISE_RULES:
         shape = equation.outvars[0].aval.shape
         # Numbers that lanes share need no axes, except where operands have one shape.
@@ -149,16 +151,6 @@ def _evaluate_with_lanes(
     if name in PRIMITIVES_WITH_LEADING_AXES:
         return _bind(equation, [_with_lanes(n_lanes, x) for x in operands], True)
     raise NotImplementedError(f"{name} has no rule for lanes")
-
-
-def _call(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    closed_jaxpr = equation.params[CALLED_JAXPR_PARAMETERS[equation.primitive.name]]
-    flags = tuple(x.has_lanes for x in operands)
-    if equation.params.get("name") != NOINLINE_FUNCTION_NAME or not any(flags):
-        return _evaluate(n_lanes, closed_jaxpr, operands)
-    evaluate_arrays, result_flags = _make_separate_function(n_lanes, closed_jaxpr, flags)
-    results = evaluate_arrays(*(x.array for x in operands))
-    return list(map(LaneValue, results, result_flags))
 
 
 @functools.lru_cache(64)
@@ -178,18 +170,8 @@ def _make_separate_function(
 
 def _broadcast(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
     shape, axes = (equation.params[x] for x in ("shape", "broadcast_dimensions"))
-    return _bind(
-        equation,
-        [operands[0].array],
-        True,
-        shape=(*shape, n_lanes),
-        broadcast_dimensions=(*axes, len(shape)),
-    )
-
-
-def _reshape(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    new_sizes = (*equation.params["new_sizes"], n_lanes)
-    return [LaneValue(lax.reshape(operands[0].array, new_sizes), True)]
+    changed = {"shape": (*shape, n_lanes), "broadcast_dimensions": (*axes, len(shape))}
+    return _bind(equation, [operands[0].array], True, **changed)
 
 
 def _transpose(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
@@ -270,29 +252,6 @@ def _require_short(length: int) -> int:
             f"{MAX_SELECTED_ENTRIES} have a rule"
         )
     return length
-
-
-def _multiply(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -> list[LaneValue]:
-    """Return a product of arrays as a sum of elementwise products."""
-    (summed_left, summed_right), (batch_left, batch_right) = equation.params["dimension_numbers"]
-    left, right = (_with_lanes(n_lanes, x) for x in operands)
-    free_left, free_right = (
-        [i for i in range(x.ndim - 1) if i not in summed and i not in batch]
-        for x, summed, batch in (
-            (left, summed_left, batch_left),
-            (right, summed_right, batch_right),
-        )
-    )
-    left = lax.transpose(left, (*batch_left, *free_left, *summed_left, left.ndim - 1))
-    right = lax.transpose(right, (*batch_right, *free_right, *summed_right, right.ndim - 1))
-    n_batch, n_left, n_right, n_summed = map(len, (batch_left, free_left, free_right, summed_left))
-    result_dtype = equation.outvars[0].aval.dtype
-    left = jnp.expand_dims(left, tuple(range(n_batch + n_left, n_batch + n_left + n_right)))
-    right = jnp.expand_dims(right, tuple(range(n_batch, n_batch + n_left)))
-    first_summed = n_batch + n_left + n_right
-    products = left.astype(result_dtype) * right.astype(result_dtype)
-    summed = tuple(range(first_summed, first_summed + n_summed))
-    return [LaneValue(jnp.sum(products, axis=summed), True)]
 
 
 @functools.lru_cache(maxsize=1024)
@@ -441,11 +400,12 @@ def _choose_branch(n_lanes: int, equation: Any, operands: Sequence[LaneValue]) -
 RULES: dict[str, Callable[[int, Any, Sequence[LaneValue]], list[LaneValue]]] = {
     "broadcast_in_dim": _broadcast,
     "cond": _choose_branch,
-    "dot_general": _multiply,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _update_slice,
     "pad": _pad,
-    "reshape": _reshape,
+    "reshape": lambda n_lanes, equation, operands: [
+        LaneValue(lax.reshape(operands[0].array, (*equation.params["new_sizes"], n_lanes)), True)
+    ],
     "scan": _scan,
     "slice": _slice,
     "transpose": _transpose,

@@ -24,7 +24,6 @@ from vrw_jax.lanes.autodiff import enable_all_ad_modes
 from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
 from vrw_jax.lanes.code_cache import (
     LaneProgram,
-    choose_lanes_per_group,
     get_lane_program,
     targets_machine_code,
 )
@@ -91,7 +90,7 @@ class CompiledBatchFunction:
 
     def __call__(self, *argument_trees: Any) -> Any:
         """Return the results as part of the JAX program that calls this object."""
-        if is_machine_code_available() and self._has_machine_code():
+        if self._has_machine_code():
             leaves, structure = jax.tree.flatten(argument_trees)
             leaves = [x if hasattr(x, "dtype") else jnp.asarray(x) for x in leaves]
 
@@ -118,13 +117,9 @@ class CompiledBatchFunction:
         leaves, structure = jax.tree.flatten(argument_trees)
         leaves = [np.asarray(x) for x in leaves]
         flat_function = functools.partial(_call_with_leaves, self._function, structure)
-        if is_machine_code_available() and self._has_machine_code():
+        if self._has_machine_code():
             with contextlib.suppress(_NoMachineCodeError):
-                return run_machine_code(
-                    functools.partial(self._get_program, structure),
-                    functools.partial(self._choose_lanes_per_group, structure),
-                    leaves,
-                )
+                return run_machine_code(functools.partial(self._get_program, structure), leaves)
         # Each program is traced once, while the function has the values of the key.
         argument_types = [(x.shape[:-1] if x.ndim else None, x.dtype) for x in leaves]
         program_key = self._find_key(structure, argument_types)
@@ -132,7 +127,11 @@ class CompiledBatchFunction:
         if program_key:
             _xla_programs[program_key] = xla_program
         if next(x.shape[-1] for x in leaves if x.ndim) == 0:
-            return _make_empty_results(xla_program, leaves)
+            one_lane = [
+                jax.ShapeDtypeStruct((*x.shape[:-1], 1) if x.ndim else (), x.dtype) for x in leaves
+            ]
+            make_empty = lambda x: np.empty((*x.shape[:-1], 0), x.dtype)
+            return jax.tree.map(make_empty, jax.eval_shape(xla_program, *one_lane))
         return _run_by_blocks(
             xla_program,
             self._xla_block_size,
@@ -141,48 +140,36 @@ class CompiledBatchFunction:
         )
 
     def _get_program(
-        self, structure: Any, argument_types: ArgumentTypes, lanes_per_group: int
+        self, structure: Any, argument_types: ArgumentTypes, numbers_of_lanes: Sequence[int]
     ) -> LaneProgram:
-        """Return the program for arguments of a structure, and for groups of lanes.
+        """Return the program for arguments of a structure, see `get_lane_program`.
 
         Raise a `_NoMachineCodeError` if XLA has to compute the function. The code of one lane is
         compiled later, so its errors appear in `LaneCall.lower`.
         """
         environment = disk_cache.describe_trace_environment()
-        signature = structure, argument_types, lanes_per_group, environment
-        if signature in self._programs:
-            return self._programs[signature]
+        make_signature = lambda n: (structure, argument_types, n, environment)
+        for signature in map(make_signature, numbers_of_lanes):
+            if signature in self._programs:
+                return self._programs[signature]
         try:
             lane_program = get_lane_program(
                 functools.partial(_call_with_leaves, self._function, structure),
                 make_argument_shapes(argument_types),
                 self._find_key(structure),
-                lanes_per_group,
+                numbers_of_lanes,
                 self._max_unrolled_entries,
             )
-            if lanes_per_group > 1:  # JAX may still map the call for one lane over a batch.
+            if (
+                lane_program.lanes_per_group > 1
+            ):  # JAX may still map the call for one lane over a batch.
                 lane_program.machine_code  # noqa: B018, starts the compilation
         except Exception as compilation_error:
             self._use_xla_after(compilation_error)
             raise _NoMachineCodeError from compilation_error
         if self._lasting_key not in (None, "by content"):
-            self._programs[signature] = lane_program
+            self._programs[make_signature(lane_program.lanes_per_group)] = lane_program
         return lane_program
-
-    def _choose_lanes_per_group(
-        self, structure: Any, argument_types: ArgumentTypes, numbers_of_lanes: Sequence[int]
-    ) -> int:
-        """Return which number of lanes per group has a program already, by default the first."""
-        environment = disk_cache.describe_trace_environment()
-        for n in numbers_of_lanes:
-            if (structure, argument_types, n, environment) in self._programs:
-                return n
-        return choose_lanes_per_group(
-            self._find_key(structure),
-            make_argument_shapes(argument_types),
-            numbers_of_lanes,
-            self._max_unrolled_entries,
-        )
 
     def _find_key(self, *further_values: Any) -> str | None:
         """Return the key of the function, or None if it has none."""
@@ -199,7 +186,9 @@ class CompiledBatchFunction:
         return make_key(self._lasting_key, *further_values)
 
     def _has_machine_code(self) -> bool:
-        return not _keys_without_machine_code or self._find_key() not in _keys_without_machine_code
+        return is_machine_code_available() and not (
+            _keys_without_machine_code and self._find_key() in _keys_without_machine_code
+        )
 
     def _use_xla_after(self, compilation_error: Exception) -> None:
         """Note that XLA computes this function, with one warning, or raise an unexpected error."""
@@ -263,12 +252,6 @@ def _call_with_leaves(function: Callable, structure: Any, *leaves: Any) -> Any:
     """Return `function(*trees)` for the leaves of the trees, and further arguments after them."""
     n_leaves = structure.num_leaves
     return function(*jax.tree.unflatten(structure, leaves[:n_leaves]), *leaves[n_leaves:])
-
-
-def _make_empty_results(function: Callable, leaves: Sequence[np.ndarray]) -> Any:
-    shapes = [jax.ShapeDtypeStruct((*x.shape[:-1], 1) if x.ndim else (), x.dtype) for x in leaves]
-    results = jax.eval_shape(function, *shapes)
-    return jax.tree.map(lambda x: np.empty((*x.shape[:-1], 0), x.dtype), results)
 
 
 def _run_by_blocks(
@@ -467,25 +450,18 @@ class _LaneFunctionVariant:
                 "arrays of one length."
             )
         (n_lanes,) = sizes
-        is_shared = [
-            axis is None and x.size <= MAX_SHARED_ENTRIES
-            for x, axis in zip(arrays, axes, strict=True)
-        ]
-        shared = [
-            entry for x, flag in zip(arrays, is_shared, strict=True) if flag for entry in x.ravel()
-        ]
-        with_lanes = [
-            np.ascontiguousarray(
-                np.moveaxis(x, 0, -1)
-                if axis == 0
-                else np.broadcast_to(x[..., None], (*x.shape, n_lanes))
-            )
-            for x, axis, flag in zip(arrays, axes, is_shared, strict=True)
-            if not flag
-        ]
-        shared_shapes = tuple(
-            x.shape if flag else None for x, flag in zip(arrays, is_shared, strict=True)
-        )
+        shared: list[Any] = []
+        with_lanes: list[np.ndarray] = []
+        shared_shapes: tuple[tuple[int, ...] | None, ...] = ()
+        for x, axis in zip(arrays, axes, strict=True):
+            is_shared = axis is None and x.size <= MAX_SHARED_ENTRIES
+            shared_shapes += (x.shape if is_shared else None,)
+            if is_shared:
+                shared += list(x.ravel())
+                continue
+            repeat = lambda x: np.broadcast_to(x[..., None], (*x.shape, n_lanes))
+            x = np.moveaxis(x, 0, -1) if axis == 0 else repeat(x)
+            with_lanes.append(np.ascontiguousarray(x))
         if shared_shapes not in self._batch_functions:
             self._batch_functions[shared_shapes] = self._compile_for_batches(shared_shapes)
         results = self._batch_functions[shared_shapes].run(shared, *with_lanes)

@@ -29,6 +29,7 @@ from vrw_jax.lanes.array_emitter import (
     make_lane_mixing_error,
     split_into_entry_arrays,
 )
+from vrw_jax.lanes.decompositions import DECOMPOSITIONS
 from vrw_jax.lanes.lazy_arrays import (
     LazyArray,
     LlvmArray,
@@ -561,6 +562,15 @@ def _emit_single_result(
     return [result_array]
 
 
+def _emit_array_product(
+    array_emitter: ArrayEmitter, primitive_call: PrimitiveCall, *operands: LlvmArray
+) -> LlvmArray:
+    """Return the product of two arrays, summed over axes of each array."""
+    multiply = partial(DECOMPOSITIONS["dot_general"], **primitive_call.primitive_params)
+    closed_jaxpr = jax.make_jaxpr(multiply)(*primitive_call.operand_avals)
+    return JaxprLowering(array_emitter).lower_jaxpr(closed_jaxpr, operands)[0]
+
+
 SINGLE_RESULT_RULES: dict[str, Callable[..., LlvmArray]] = {
     **dict.fromkeys(ELEMENTWISE_RULES, ArrayEmitter.emit_elementwise_array),
     "broadcast_in_dim": array_rules.emit_broadcast_array,
@@ -577,7 +587,7 @@ SINGLE_RESULT_RULES: dict[str, Callable[..., LlvmArray]] = {
     "stack": array_rules.emit_stacked_array,
     "transpose": array_rules.emit_transposed_array,
     "cumsum": array_rules.emit_cumulative_sum,
-    "dot_general": array_rules.emit_array_product,
+    "dot_general": _emit_array_product,
     **dict.fromkeys(array_rules.COMBINING_PRIMITIVE_BY_REDUCTION, array_rules.emit_reduced_array),
 }
 """Rules of primitives with one result, by the name of the primitive."""

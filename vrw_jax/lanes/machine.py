@@ -7,7 +7,6 @@ import platform
 import re
 import struct
 import sys
-from enum import IntEnum
 from typing import Any
 
 try:
@@ -68,11 +67,10 @@ ELF_SECTION_LAYOUT = struct.Struct("<IIQQQQIIQQ")
 """Layout of one entry of the section table of an ELF file, in the format of Python's `struct`."""
 
 
-class ElfSectionType(IntEnum):
-    """Types of ELF sections that the check of an object file distinguishes."""
-
-    ELF_STRING_TABLE = 3
-    ELF_ZERO_FILLED_MEMORY = 8  # memory for which the file contains no bytes
+ELF_STRING_TABLE_TYPE = 3
+"""Type of the ELF section that contains the names of all sections."""
+ELF_ZERO_FILLED_TYPE = 8
+"""Type of an ELF section for which the file contains no bytes."""
 
 
 @functools.cache
@@ -177,12 +175,11 @@ def require_object_file(object_code: bytes, function_name: str) -> None:
         for i in range(n_sections)
     ]
     for _, section_type, _, _, section_offset, section_length, *_ in elf_sections:
-        if (
-            section_type != ElfSectionType.ELF_ZERO_FILLED_MEMORY
-            and section_offset + section_length > len(object_code)
+        if section_type != ELF_ZERO_FILLED_TYPE and section_offset + section_length > len(
+            object_code
         ):
             raise ValueError("a section is cut off")
-    if elf_sections[name_section_index][1] != ElfSectionType.ELF_STRING_TABLE:
+    if elf_sections[name_section_index][1] != ELF_STRING_TABLE_TYPE:
         raise ValueError("it has no table of names")
 
 

@@ -83,14 +83,9 @@ Only the compilation of the JAX program needs the code, so LLVM can compile the 
 MACHINE_CODE_PRIMITIVE.multiple_results = True
 
 
-@MACHINE_CODE_PRIMITIVE.def_abstract_eval
-def _make_abstract_results(
-    *call_arguments: Any, result_shapes: Sequence[jax.ShapeDtypeStruct], **_: Any
-) -> list[Any]:
-    """Return the abstract values (shapes and dtypes) of the results that a machine code call
-    returns.
-    """
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
+MACHINE_CODE_PRIMITIVE.def_abstract_eval(
+    lambda *_, result_shapes, **__: [jax.core.ShapedArray(x.shape, x.dtype) for x in result_shapes]
+)
 
 
 _calling_program = jax.jit(
@@ -174,8 +169,9 @@ The value is chosen because the start of a task then takes a negligible time.
 
 ArgumentTypes = tuple[tuple[tuple[int, ...] | None, np.dtype], ...]
 """Shapes without lanes and dtypes of arguments. The shape of a number without lanes is None."""
-GetProgram = Callable[[ArgumentTypes, int], LaneProgram]
-"""Function that returns machine code for types of arguments and a number of lanes per group."""
+GetProgram = Callable[[ArgumentTypes, Sequence[int]], LaneProgram]
+"""Function of types of arguments and possible numbers of lanes per group, see
+`get_lane_program`."""
 
 
 def is_machine_code_available() -> bool:
@@ -196,11 +192,11 @@ def is_machine_code_available() -> bool:
 @functools.cache
 def _can_xla_call_machine_code() -> bool:
     """Return whether XLA can call machine code: whether a small test succeeds."""
-    get_program = lambda argument_types, lanes_per_group: get_lane_program(
+    get_program = lambda argument_types, numbers_of_lanes: get_lane_program(
         lambda x: x + 1.0,
         make_argument_shapes(argument_types),
         None,
-        lanes_per_group,
+        numbers_of_lanes,
         MAX_UNROLLED_ENTRIES,
     )
     increment = lambda x: call_machine_code(get_program, [x], _raise_error)
@@ -265,7 +261,7 @@ def call_machine_code(
         lanes_per_group = 1
     n_padding_lanes = -n_lanes % lanes_per_group
     argument_types = tuple((x.shape[:-1] if x.ndim else None, x.dtype) for x in argument_leaves)
-    lane_program = get_program(argument_types, lanes_per_group)
+    lane_program = get_program(argument_types, (lanes_per_group,))
     if n_padding_lanes:
         pad_with_last_lane = lambda x: jnp.concatenate(
             [x, jnp.repeat(x[..., -1:], n_padding_lanes, -1)], -1
@@ -287,7 +283,6 @@ def call_machine_code(
 
 def run_machine_code(
     get_program: GetProgram,
-    choose_lanes_per_group: Callable[[ArgumentTypes, Sequence[int]], int],
     argument_leaves: Sequence[np.ndarray],
 ) -> Any:
     """Return the results of a function of NumPy arrays, computed on all cores of the process.
@@ -299,13 +294,12 @@ def run_machine_code(
     n_lanes = next(x.shape[-1] for x in argument_leaves if x.ndim)
     # An empty batch needs no code: that of groups of one lane is compiled when it is needed.
     lanes_per_vector = count_lanes_per_256_bits(argument_leaves)
-    lanes_per_group = VECTORS_PER_GROUP * lanes_per_vector if n_lanes else 1
+    numbers_of_lanes = [VECTORS_PER_GROUP * lanes_per_vector if n_lanes else 1]
+    if 0 < n_lanes <= lanes_per_vector < numbers_of_lanes[0]:
+        numbers_of_lanes.insert(0, lanes_per_vector)
     argument_types = tuple((x.shape[:-1] if x.ndim else None, x.dtype) for x in argument_leaves)
-    if 0 < n_lanes <= lanes_per_vector < lanes_per_group:
-        lanes_per_group = choose_lanes_per_group(
-            argument_types, (lanes_per_vector, lanes_per_group)
-        )
-    lane_program = get_program(argument_types, lanes_per_group)
+    lane_program = get_program(argument_types, numbers_of_lanes)
+    lanes_per_group = lane_program.lanes_per_group
     if n_lanes == 0:
         result_types = lane_program.result_shapes_and_dtypes
         empty_results = [np.empty((*shape, 0), dtype) for shape, dtype in result_types]
@@ -326,8 +320,10 @@ def run_machine_code(
         for shape_without_lanes, result_dtype in lane_program.result_shapes_and_dtypes
     ]
     run_lane_kernel = _load_lane_kernel(machine_code.ffi_target_name, machine_code)
-    input_pointer_table = _make_pointer_table(padded_arguments)
-    output_pointer_table = _make_pointer_table(padded_results)
+    input_pointer_table, output_pointer_table = (
+        (ctypes.c_void_p * len(arrays))(*(x.ctypes.data for x in arrays))
+        for arrays in (padded_arguments, padded_results)
+    )
     compute_lane_groups_of_task = lambda first_lane_group: run_lane_kernel(
         input_pointer_table,
         output_pointer_table,
@@ -358,11 +354,6 @@ def _load_lane_kernel(code_name: str, machine_code: MachineCode) -> Callable:
         run_lane_kernel = c_function_type(loaded_code.find_function_address(LANE_KERNEL_NAME))
         _lane_kernels[code_name] = run_lane_kernel, loaded_code
     return _lane_kernels[code_name][0]
-
-
-def _make_pointer_table(numpy_arrays: Sequence[np.ndarray]) -> Any:
-    """Return a C array of pointers to the data of the NumPy arrays."""
-    return (ctypes.c_void_p * len(numpy_arrays))(*(x.ctypes.data for x in numpy_arrays))
 
 
 def compile_wasm_object(

@@ -287,7 +287,7 @@ def emit_sum(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> Llv
         return x
     if _equals_llvm_constant(x, 0):
         return y
-    return _emit_binary_instruction("add", operation, x, y)
+    return _emit_number_instruction("add", operation, x, y)
 
 
 def emit_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
@@ -296,7 +296,7 @@ def emit_difference(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue)
     """
     if _equals_llvm_constant(y, 0):
         return x
-    return _emit_binary_instruction("sub", operation, x, y)
+    return _emit_number_instruction("sub", operation, x, y)
 
 
 def emit_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
@@ -307,7 +307,7 @@ def emit_product(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) ->
         return x
     if _equals_llvm_constant(x, 1) or _equals_llvm_constant(y, 0):
         return y
-    return _emit_binary_instruction("mul", operation, x, y)
+    return _emit_number_instruction("mul", operation, x, y)
 
 
 def emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
@@ -318,8 +318,7 @@ def emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -
         return x
     has_float64 = operation.operand_dtype == np.float64
     flags = RECIPROCAL_DIVISION_FLAGS if has_float64 else FUSED_MULTIPLY_ADD_FLAGS
-    operands = operation.value_emitter.to_scalars_or_vectors(x, y)
-    return operation.llvm_builder.emit_binary(f"fdiv {' '.join(flags)}", *operands)
+    return emit_binary_instruction(f"fdiv {' '.join(flags)}", operation, x, y)
 
 
 def emit_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
@@ -354,15 +353,10 @@ def emit_absolute_value(operation: ElementwiseOperation, x: LlvmValue) -> LlvmVa
     return operation.llvm_builder.select(is_negative_value, operation.llvm_builder.neg(x), x)
 
 
-def _return_operand(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
-    """Return the operand unchanged."""
-    return x
-
-
-def emit_bitwise_operation(
+def emit_binary_instruction(
     opcode: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
 ) -> LlvmValue:
-    """Emit a bitwise instruction with two operands, and return its LLVM value."""
+    """Emit an instruction with two operands, and return its LLVM value."""
     return operation.llvm_builder.emit_binary(
         opcode, *operation.value_emitter.to_scalars_or_vectors(x, y)
     )
@@ -446,7 +440,7 @@ def _require_float_dtype(primitive_name: str, operation: ElementwiseOperation) -
         )
 
 
-def _emit_binary_instruction(
+def _emit_number_instruction(
     integer_opcode: str, operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue
 ) -> LlvmValue:
     """Emit an instruction with two operands and return its LLVM value.
@@ -457,9 +451,7 @@ def _emit_binary_instruction(
     llvm_opcode = (
         f"f{integer_opcode} {' '.join(FUSED_MULTIPLY_ADD_FLAGS)}" if is_float else integer_opcode
     )
-    return operation.llvm_builder.emit_binary(
-        llvm_opcode, *operation.value_emitter.to_scalars_or_vectors(x, y)
-    )
+    return emit_binary_instruction(llvm_opcode, operation, x, y)
 
 
 def emit_bits(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
@@ -536,10 +528,10 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "abs": emit_absolute_value,
     "add": emit_sum,
     "add_any": emit_sum,
-    "and": partial(emit_bitwise_operation, "and"),
+    "and": partial(emit_binary_instruction, "and"),
     "bitcast_convert_type": emit_bits,
     "convert_element_type": emit_conversion,
-    "copy": _return_operand,
+    "copy": lambda _, x: x,
     "div": emit_quotient,
     "eq": partial(emit_comparison, "=="),
     "ge": partial(emit_comparison, ">="),
@@ -554,15 +546,15 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "ne": partial(emit_comparison, "!="),
     "neg": emit_negative,
     "not": lambda operation, x: operation.llvm_builder.not_(x),
-    "or": partial(emit_bitwise_operation, "or"),
+    "or": partial(emit_binary_instruction, "or"),
     "select_n": emit_select,
-    "shift_left": partial(emit_bitwise_operation, "shl"),
-    "shift_right_arithmetic": partial(emit_bitwise_operation, "ashr"),
-    "shift_right_logical": partial(emit_bitwise_operation, "lshr"),
-    "square": lambda operation, x: _emit_binary_instruction("mul", operation, x, x),
-    "stop_gradient": _return_operand,
+    "shift_left": partial(emit_binary_instruction, "shl"),
+    "shift_right_arithmetic": partial(emit_binary_instruction, "ashr"),
+    "shift_right_logical": partial(emit_binary_instruction, "lshr"),
+    "square": lambda operation, x: _emit_number_instruction("mul", operation, x, x),
+    "stop_gradient": lambda _, x: x,
     "sub": emit_difference,
-    "xor": partial(emit_bitwise_operation, "xor"),
+    "xor": partial(emit_binary_instruction, "xor"),
     **{
         name: partial(emit_float_function, name)
         for name in ("cos", "exp", "floor", "log", "sin", "sqrt")
