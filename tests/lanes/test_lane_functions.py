@@ -391,3 +391,21 @@ def test_an_empty_batch_traces_a_function_once(has_machine_code, capsys, monkeyp
 def test_arguments_may_contain_none():
     add = lanes.jit(lambda tree, y: tree["a"] + y.sum())
     np.testing.assert_allclose(add.batch({"a": X[:, 0], "b": None}, X), X[:, 0] + X.sum(1))
+
+
+@pytest.mark.parametrize(
+    ("subscripts", "first", "second"),
+    [
+        ("ij,jk->ik", (9, 11), (11, 7)),  # more entries than are unrolled
+        ("ijk,jkl->il", (3, 4, 5), (4, 5, 2)),
+        ("bij,bjk->bik", (3, 2, 4), (3, 4, 2)),
+        ("ij,jk->ik", (2, 0), (0, 3)),
+    ],
+)
+def test_products_of_arrays_agree_with_numpy(subscripts, first, second):
+    random = np.random.default_rng(0)
+    a, b = random.normal(size=(5, *first)), random.normal(size=(5, *second))
+    products = lanes.jit(lambda a, b: jnp.einsum(subscripts, a, b)).batch(a, b)
+    expected = [np.einsum(subscripts, *pair) for pair in zip(a, b, strict=True)]
+    # Sums of at most 20 products of numbers of size 1, in another order.
+    np.testing.assert_allclose(products, expected, rtol=1e-12, atol=1e-14)
