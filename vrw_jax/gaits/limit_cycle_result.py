@@ -142,7 +142,7 @@ class LimitCycle(AbstractCycle):
         """Return an estimate of the discretization error, which in most cases exceeds the actual
         error.
 
-        See `collocation.estimate_mesh_error`. A gait whose estimate is above 1e-5 is rejected. More
+        See `gauss.estimate_mesh_error`. A gait whose estimate is above 1e-5 is rejected. More
         mesh intervals in `CycleOptions` reduce the error.
         """
         mesh_error = self._evaluate_on_mesh(
@@ -154,7 +154,7 @@ class LimitCycle(AbstractCycle):
     def takeoff_acceleration(self) -> Array:
         """Return the lowest acceleration of the rear foot at take-off over the gait steps, m/s^2.
 
-        See `margin_defaults`.
+        See `dynamics.compute_takeoff_acceleration`.
         """
         return self._zero_without_gait(
             self._evaluate_on_mesh(
@@ -171,7 +171,7 @@ class LimitCycle(AbstractCycle):
         """Return the linear response of the gait step to the slopes of uneven ground.
 
         The gait step depends on the slopes of two successive lines of the ground. The measures are
-        `slope_response.COLLOCATION_RESPONSE_MEASURES`.
+        `derivatives.COLLOCATION_RESPONSE_MEASURES`.
         """
         if self.period_n > 1:
             raise ValueError(
@@ -183,7 +183,7 @@ class LimitCycle(AbstractCycle):
     def gait_sensitivity(self, measure_name: str) -> Array:
         """Return the gait sensitivity norm of a measure, in the measure's unit per rad of slope.
 
-        See `slope_response.compute_sensitivity_norms`.
+        See `derivatives.compute_sensitivity_norms`.
         """
         response_index = COLLOCATION_RESPONSE_MEASURES.index(measure_name)
 

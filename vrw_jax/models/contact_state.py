@@ -493,7 +493,7 @@ def evaluate_guards(
     normal_forces = contact_quantities.normal_forces
     tangential_forces = contact_quantities.tangential_forces
     # In the limit of large friction, a resting foot begins to slide when its normal force vanishes
-    # (see `impacts.resolve_event`). A sliding foot lifts off when its friction vanishes.
+    # (see `contact_impacts.resolve_event`). A sliding foot lifts off when its friction vanishes.
     uses_friction_limit = friction == jnp.inf
     slip_signs = compute_slip_signs(contact_mode_dynamics.slot_modes)
     supporting_force = jnp.where(
