@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PathCollection
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -28,10 +27,12 @@ from vrw_jax.app.figure_style import (
     UNSTABLE_CYCLE_CODE,
     FigureWidth,
     StyledFigure,
+    add_color_bar,
     add_figure_legend,
     describe_quantity,
     draw_outcome_cells,
     figure_style,
+    find_cell_edges,
     find_width_inches,
     format_axis_label,
     format_value_label,
@@ -258,7 +259,7 @@ def draw_scan_slices(
         [_compute_displayed_outcome_codes(dataset) for dataset in panel_column_datasets]
     )
     outcome_codes = np.unique(outcome_codes_by_panel)
-    cell_edges = _find_cell_edges(scan[x].values), _find_cell_edges(scan[y].values)
+    cell_edges = find_cell_edges(scan[x].values), find_cell_edges(scan[y].values)
     for axes_of_row, measure_name in zip(panel_axes, panel_measures, strict=False):
         measure_values = np.stack([dataset[measure_name] for dataset in panel_column_datasets])
         color_scale = _make_color_scale(
@@ -269,7 +270,7 @@ def draw_scan_slices(
             cell_mesh = axes.pcolormesh(
                 *cell_edges, values_of_panel, cmap="viridis", norm=color_scale, rasterized=True
             )
-        _add_color_bar(
+        add_color_bar(
             figure,
             axes_of_row.tolist(),
             cell_mesh,
@@ -323,7 +324,7 @@ def draw_scan_samples(
     )
     for axes, measure_name in zip(panel_axes, measure_names, strict=False):
         point_collection = _draw_measure_samples(axes, scan, x, y, measure_name, marker_size)
-        _add_color_bar(
+        add_color_bar(
             figure,
             axes,
             point_collection,
@@ -397,7 +398,7 @@ def draw_parameter_pairs(
             axes.locator_params(nbins=2)
             axes.tick_params("x", rotation=90)
     if measure_name is not None and point_collection is not None:
-        _add_color_bar(
+        add_color_bar(
             figure,
             panel_axes.ravel().tolist(),
             point_collection,
@@ -507,7 +508,7 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
     width_inches = find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES)
     figure = StyledFigure(figsize=(width_inches, 1.6 * len(measure_names) + 0.6))
     panel_axes = figure.subplots(len(measure_names), 1, sharex=True, squeeze=False)[:, 0]
-    cell_edges = _find_cell_edges(scan[x].values)
+    cell_edges = find_cell_edges(scan[x].values)
     missing_gait_indices = np.flatnonzero(scan.outcome.values != Outcome.STEPPED)
     for axes, measure_name in zip(panel_axes, measure_names, strict=True):
         axes.plot(scan[x].values, scan[measure_name].values, marker=".", color=OKABE_ITO_BLUE)
@@ -546,37 +547,6 @@ def _make_color_scale(
     min_value, max_value = measure_values[is_in_range].min(), measure_values[is_in_range].max()
     is_logarithmic = measure_name in LOGARITHMIC_MEASURE_NAMES and min_value > 0.0
     return (LogNorm if is_logarithmic else Normalize)(min_value, max_value)
-
-
-def _add_color_bar(
-    figure: Figure,
-    axes: Axes | list[Axes],
-    colored_values: ScalarMappable,
-    measure_values: np.ndarray,
-    label_text: str,
-    **color_bar_settings: Any,
-) -> None:
-    """Add a color bar, whose ends are pointed if finite `measure_values` lie beyond them."""
-    min_shown_value, max_shown_value = colored_values.get_clim()
-    finite_values = measure_values[np.isfinite(measure_values)]
-    has_lower_values = bool((finite_values < min_shown_value).any())
-    has_higher_values = bool((finite_values > max_shown_value).any())
-    pointed_ends = ("neither", "min", "max", "both")[has_lower_values + 2 * has_higher_values]
-    figure.colorbar(colored_values, ax=axes, extend=pointed_ends, **color_bar_settings).set_label(
-        label_text
-    )
-
-
-def _find_cell_edges(cell_center_positions: np.ndarray) -> np.ndarray:
-    if len(cell_center_positions) == 1:
-        return cell_center_positions[0] + np.array([-0.5, 0.5]) * max(
-            abs(cell_center_positions[0]) * 0.01, 1e-6
-        )
-    inner_cell_edges = 0.5 * (cell_center_positions[1:] + cell_center_positions[:-1])
-    first_cell_edge, last_cell_edge = (
-        2.0 * cell_center_positions[[0, -1]] - inner_cell_edges[[0, -1]]
-    )
-    return np.array([first_cell_edge, *inner_cell_edges, last_cell_edge])
 
 
 def _compute_displayed_outcome_codes(scan: xr.Dataset) -> np.ndarray:

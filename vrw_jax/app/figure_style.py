@@ -19,6 +19,7 @@ import xarray as xr
 from cycler import cycler
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -550,6 +551,38 @@ def select_special_point_style(special_point_name: str) -> tuple[str, Any]:
     return OKABE_ITO_SKY_BLUE, SPECIAL_POINT_LINE_STYLES[
         line_style_index % len(SPECIAL_POINT_LINE_STYLES)
     ]
+
+
+def add_color_bar(
+    figure: Figure,
+    axes: Axes | list[Axes],
+    colored_values: ScalarMappable,
+    measure_values: np.ndarray,
+    label_text: str,
+    **color_bar_settings: Any,
+) -> None:
+    """Add a color bar, whose ends are pointed if finite `measure_values` lie beyond them."""
+    min_shown_value, max_shown_value = colored_values.get_clim()
+    finite_values = measure_values[np.isfinite(measure_values)]
+    has_lower_values = bool((finite_values < min_shown_value).any())
+    has_higher_values = bool((finite_values > max_shown_value).any())
+    pointed_ends = ("neither", "min", "max", "both")[has_lower_values + 2 * has_higher_values]
+    figure.colorbar(colored_values, ax=axes, extend=pointed_ends, **color_bar_settings).set_label(
+        label_text
+    )
+
+
+def find_cell_edges(cell_center_positions: np.ndarray) -> np.ndarray:
+    """Return the edges of cells with the given centers, halfway between these."""
+    if len(cell_center_positions) == 1:
+        return cell_center_positions[0] + np.array([-0.5, 0.5]) * max(
+            abs(cell_center_positions[0]) * 0.01, 1e-6
+        )
+    inner_cell_edges = 0.5 * (cell_center_positions[1:] + cell_center_positions[:-1])
+    first_cell_edge, last_cell_edge = (
+        2.0 * cell_center_positions[[0, -1]] - inner_cell_edges[[0, -1]]
+    )
+    return np.array([first_cell_edge, *inner_cell_edges, last_cell_edge])
 
 
 def draw_outcome_cells(

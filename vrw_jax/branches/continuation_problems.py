@@ -65,12 +65,8 @@ The tangent is the smallest friction coefficient for which a gait exists.
 """
 
 DOUBLE_SUPPORT_INDICATOR_NAMES = ("lambda_I4", "lambda_2_plus", "lambda_4_plus")
-BRANCH_ENDING_QUANTITIES = (
-    *DOUBLE_SUPPORT_INDICATOR_NAMES,
-    "duration_dls",
-    "duration_sls1",
-    "duration_sls2",
-)
+PHASE_DURATIONS = ("duration_dls", "duration_sls1", "duration_sls2")
+BRANCH_ENDING_QUANTITIES = (*DOUBLE_SUPPORT_INDICATOR_NAMES, *PHASE_DURATIONS)
 """Names of the quantities that end a branch if they vanish, because the order of events changes."""
 
 SECOND_PEAK_RATE_NAME = "second_peak_rate"

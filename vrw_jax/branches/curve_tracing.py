@@ -22,7 +22,7 @@ from vrw_jax.branches.branch import BIFURCATIONS, BRANCH_POINT, FOLD, Codim2Poin
 from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation import MAX_BRANCH_MESH_REFINEMENTS, continue_branches
-from vrw_jax.branches.continuation_problems import BranchWheel, CollocationProblem
+from vrw_jax.branches.continuation_problems import PHASE_DURATIONS, BranchWheel, CollocationProblem
 from vrw_jax.branches.curve_problems import (
     CONTINUED_QUANTITIES,
     DISCONTINUOUS_QUANTITIES,
@@ -100,9 +100,6 @@ CODIM2_OVERRUN_DISTANCE = 3e-3
 RELATIVE_CODIM2_TOLERANCE = 1e-9
 # Initial guess for a nonzero duration of double support, s.
 DLS_DURATION_GUESS_S = 0.1
-
-
-PHASE_DURATIONS = ("duration_dls", "duration_sls1", "duration_sls2")
 
 
 class CurveTracer(NamedTuple):

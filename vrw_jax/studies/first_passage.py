@@ -167,17 +167,15 @@ def _draw_failing_walks(
     and the walks fail in their last step. The slopes of the many walks are drawn from
     `walk_density`. Raise ValueError if no walk fails in its last step.
     """
-    n_effective_walks = 0.0
-    n_walkers = walker_groups.n_walkers
-    deviations_by_round: list[np.ndarray] = []
+    n_effective_walks, n_walkers = 0.0, walker_groups.n_walkers
+    deviations: list[np.ndarray] = []
     weights_by_round: list[np.ndarray] = []
     while n_effective_walks < N_FAILING_WALKS and len(weights_by_round) < MAX_SAMPLING_ROUNDS:
-        drawn_deviations = walk_density.draw_samples(n_walkers, walker_groups.random)
-        deviations_by_round.append(drawn_deviations)
-        weights_by_round.append(walker_groups.run_biased_walks(walk_density, drawn_deviations))
-        walk_weights = np.concatenate(weights_by_round)
-        if np.any(walk_weights):
-            n_effective_walks = np.sum(walk_weights) ** 2 / np.sum(walk_weights**2)
+        deviations.append(walk_density.draw_samples(n_walkers, walker_groups.random))
+        weights_by_round.append(walker_groups.run_biased_walks(walk_density, deviations[-1]))
+        weights = np.concatenate(weights_by_round)
+        if np.any(weights):
+            n_effective_walks = np.sum(weights) ** 2 / np.sum(weights**2)
     if n_effective_walks == 0.0:
         sd_text = f"{walker_groups.sd_name} {walker_groups.ground_sd:g}"
         raise ValueError(
@@ -185,17 +183,11 @@ def _draw_failing_walks(
             "so that the mean number of steps has no derivative: give a larger "
             f"{walker_groups.sd_name} or n_walkers."
         )
-    walk_indices = walker_groups.random.choice(
-        len(walk_weights), N_FAILING_WALKS, p=walk_weights / np.sum(walk_weights)
-    )
-    slope_deviations = np.concatenate(deviations_by_round)[walk_indices]
-    slope_deviation_norms = np.linalg.norm(slope_deviations, axis=1)
-    return (
-        walker_groups.states[walk_indices % n_walkers],
-        walker_groups.ground[walk_indices % n_walkers],
-        slope_deviations / slope_deviation_norms[:, None],
-        slope_deviation_norms,
-    )
+    walks = walker_groups.random.choice(len(weights), N_FAILING_WALKS, p=weights / np.sum(weights))
+    failing = np.concatenate(deviations)[walks]
+    norms, walkers = np.linalg.norm(failing, axis=1), walks % n_walkers
+    states, ground = walker_groups.states[walkers], walker_groups.ground[walkers]
+    return states, ground, failing / norms[:, None], norms
 
 
 MAX_QUADRATURE_NODES = 1600
@@ -514,12 +506,10 @@ def _differentiate_passage(
         for name, tangent in (tangent_by_name | {sd_name: ground_sd_tangent}).items()
         if not isinstance(tangent, SymbolicZero)
     }
-    sampled_passage, derivative_by_name = estimate_passage(
+    sampled_passage, derivatives = estimate_passage(
         params, float(ground_sd), differentiated_parameter_names=tuple(tangent_by_name)
     )
-    log_mean_steps_tangent = sum(
-        derivative_by_name[name] * tangent for name, tangent in tangent_by_name.items()
-    )
+    log_mean_steps_tangent = sum(derivatives[name] * x for name, x in tangent_by_name.items())
     # The mean distance of a step changes as that of a step of the gait.
     gait_distance, gait_distance_tangent = jax.jvp(
         lambda wheel: model.compute_foot_distance(
@@ -650,17 +640,16 @@ def _estimate_passage_by_sampling(
     the names of the parameters. Raise ValueError if the wheel has no gait, or if hardly any step
     succeeds.
     """
-    period_n = model.leg_period
-    limit_cycle_result: Any = limit_cycle(params, model=model, period_n=period_n)
+    gait: Any = limit_cycle(params, model=model, period_n=model.leg_period)
     kind = "wheel" if model.is_wheel else "walker"
-    if int(limit_cycle_result.outcome) != Outcome.STEPPED:
+    if int(gait.outcome) != Outcome.STEPPED:
         raise ValueError(
-            f"this {kind} has no gait from which a walk could begin: {limit_cycle_result.why} "
+            f"this {kind} has no gait from which a walk could begin: {gait.why} "
             f"Take a {kind} for which vrw.limit_cycle finds a gait."
         )
-    walker_groups = WalkerGroups(
+    groups = WalkerGroups(
         params,
-        np.asarray(limit_cycle_result.section_state),
+        np.asarray(gait.section_state),
         ground_sd,
         model,
         options,
@@ -669,52 +658,44 @@ def _estimate_passage_by_sampling(
         sd_name=sd_name,
     )
     try:
-        sampled_passage = sample_passage(
-            walker_groups, float(limit_cycle_result.spectral_radius), relative_tolerance, max_steps
-        )
-    except ExtinctGroupError as error:
+        sample = sample_passage(groups, float(gait.spectral_radius), relative_tolerance, max_steps)
+    except ExtinctGroupError as extinction:
         raise ValueError(
             f"{sd_name} is {ground_sd:g} {SD_UNITS[sd_name]}, with which hardly any step of this "
             f"{kind} succeeds: give a smaller one."
-        ) from error
+        ) from extinction
     derivative_by_name = {}
     if differentiated_parameter_names:
         derivative_by_name = differentiate_log_mean_steps(
-            walker_groups, sampled_passage.walk_density, differentiated_parameter_names
+            groups, sample.walk_density, differentiated_parameter_names
         )
-    failure_probability = sampled_passage.failure_probability
-    mean_steps = 1.0 / failure_probability if failure_probability else np.inf
-    if not failure_probability:
-        passage_status = PassageStatus.NO_FAILURE
-    elif sampled_passage.start_effect > relative_tolerance:
-        passage_status = PassageStatus.START_NOT_FORGOTTEN
-    elif not np.isfinite(sampled_passage.relative_error):
-        passage_status = PassageStatus.UNKNOWN_ERROR
-    elif sampled_passage.relative_error > relative_tolerance:
-        passage_status = PassageStatus.TOLERANCE_NOT_MET
-    else:
-        passage_status = PassageStatus.CONVERGED
-    n_states = len(sampled_passage.quasi_stationary_states)
-    passage_numbers = {
-        "mean_steps": mean_steps,
-        "mean_steps_from_gait": sampled_passage.mean_steps_from_gait,
-        "mean_distance": mean_steps * sampled_passage.mean_step_distance,
-        "distance_error": mean_steps
-        * (
-            sampled_passage.relative_error * sampled_passage.mean_step_distance
-            + sampled_passage.step_distance_error
-        ),
-        "failure_probability": failure_probability,
-        "kappa_2": sampled_passage.kappa_2,
-        "error": mean_steps * sampled_passage.relative_error,
-        "states": sampled_passage.quasi_stationary_states,
-        "weights": np.full(n_states, 1.0 / n_states),
-        "end_fractions": np.array(list(sampled_passage.fraction_by_outcome.values())),
+    probability, error = sample.failure_probability, sample.relative_error
+    mean_steps = 1.0 / probability if probability else np.inf
+    failures = {
+        PassageStatus.NO_FAILURE: not probability,
+        PassageStatus.START_NOT_FORGOTTEN: sample.start_effect > relative_tolerance,
+        PassageStatus.UNKNOWN_ERROR: not np.isfinite(error),
+        PassageStatus.TOLERANCE_NOT_MET: error > relative_tolerance,
     }
-    first_passage_result = FirstPassage(
-        **jax.tree.map(lambda x: jnp.asarray(x, walker_groups.gait_state.dtype), passage_numbers),
-        status=jnp.asarray(int(passage_status), jnp.int32),
-        end_names=tuple(sampled_passage.fraction_by_outcome),
-        n_steps=sampled_passage.n_sampled_steps,
+    status = next(filter(failures.get, failures), PassageStatus.CONVERGED)
+    states = sample.quasi_stationary_states
+    distance_error = error * sample.mean_step_distance + sample.step_distance_error
+    numbers = {
+        "mean_steps": mean_steps,
+        "mean_steps_from_gait": sample.mean_steps_from_gait,
+        "mean_distance": mean_steps * sample.mean_step_distance,
+        "distance_error": mean_steps * distance_error,
+        "failure_probability": probability,
+        "kappa_2": sample.kappa_2,
+        "error": mean_steps * error,
+        "states": states,
+        "weights": np.full(len(states), 1.0 / len(states)),
+        "end_fractions": np.array(list(sample.fraction_by_outcome.values())),
+    }
+    passage = FirstPassage(
+        **jax.tree.map(lambda x: jnp.asarray(x, groups.gait_state.dtype), numbers),
+        status=jnp.asarray(int(status), jnp.int32),
+        end_names=tuple(sample.fraction_by_outcome),
+        n_steps=sample.n_sampled_steps,
     )
-    return first_passage_result, derivative_by_name
+    return passage, derivative_by_name

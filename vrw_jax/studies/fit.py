@@ -17,7 +17,6 @@ from vrw_jax.base.checks import (
     check_int,
     check_names,
     check_numpy_reals,
-    check_range,
     check_real,
     check_type,
     require_known_name,
@@ -37,6 +36,7 @@ from vrw_jax.studies.fit_problem import (
     TIME_OFFSET,
     FitProblem,
     FitTarget,
+    describe_unknowns,
     measure_candidates,
     solve_fits,
 )
@@ -210,7 +210,7 @@ def _make_problem(
     if start_names:
         first = np.append(first, first_states[:, : len(entries)])
     n_numbers = table.values[0].size + len(priors)
-    lower, upper, scale, prior_means, prior_weights = _describe_unknowns(
+    lower, upper, scale, prior_means, prior_weights = describe_unknowns(
         unknown_names, first, bounds, priors, model.parameter_domains
     )
     if n_numbers < len(first):
@@ -474,43 +474,6 @@ def _count_steps(
             x, time, n_steps = step.section_state, time + float(step.duration), n_steps + 1
         n_needed = max(n_needed, n_steps)
     return n_needed
-
-
-def _describe_unknowns(
-    names: Sequence[str],
-    first: np.ndarray,
-    bounds: Mapping[str, Any],
-    priors: Mapping[str, Any],
-    domains: Mapping[str, Any],
-) -> tuple[np.ndarray, ...]:
-    """Return bounds, typical sizes, and means and inverse widths of the priors of unknowns."""
-    rows = []
-    for name, start in zip(names, first, strict=True):
-        domain, mean, weight = domains.get(name), 0.0, 0.0
-        low, high = (domain.lower_bound, domain.upper_bound) if domain else (-np.inf, np.inf)
-        size = 10.0 if domain and domain.unit != "1" else 1.0
-        if name.endswith(OFFSET_SUFFIX):
-            size = 0.01  # s or rad
-        if name in bounds:
-            low, high = check_range(f"the range of {name}", bounds[name])
-            if not low <= start <= high:
-                raise ValueError(
-                    f"the start has {name} {start:g}, outside its bounds ({low:g}, {high:g}): "
-                    "widen the bounds, or start inside them."
-                )
-        if name in priors:
-            mean, size = (check_real(f"the prior of {name}", x) for x in priors[name])
-            if size <= 0.0:
-                raise ValueError(
-                    f"the prior of {name} has the standard deviation {size:g}, but it is "
-                    "positive: give (mean, standard deviation)."
-                )
-            weight = 1.0 / size
-        rows.append((low, high, abs(start) or size, mean, weight))
-    lower, upper, *others = np.array(rows).T
-    large = 1e30  # beyond it, a bound is that of floating-point numbers
-    lower, upper = np.where(lower < -large, -np.inf, lower), np.where(upper > large, np.inf, upper)
-    return lower, upper, *others
 
 
 def _arrange_conditions(

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.base.checks import require_known_name
+from vrw_jax.base.checks import check_range, check_real, require_known_name
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.walker import compile_step
@@ -123,6 +123,43 @@ class _GaitMeasures(dict):
         if name in self.finder.cycle_measures:
             return self.cycle.measure(name)
         return self.finder.measure_reader(name, self.cycle, self.step)
+
+
+def describe_unknowns(
+    names: Sequence[str],
+    first: np.ndarray,
+    bounds: Mapping[str, Any],
+    priors: Mapping[str, Any],
+    domains: Mapping[str, Any],
+) -> tuple[np.ndarray, ...]:
+    """Return bounds, typical sizes, and means and inverse widths of the priors of unknowns."""
+    rows = []
+    for name, start in zip(names, first, strict=True):
+        domain, mean, weight = domains.get(name), 0.0, 0.0
+        low, high = (domain.lower_bound, domain.upper_bound) if domain else (-np.inf, np.inf)
+        size = 10.0 if domain and domain.unit != "1" else 1.0
+        if name.endswith(OFFSET_SUFFIX):
+            size = 0.01  # s or rad
+        if name in bounds:
+            low, high = check_range(f"the range of {name}", bounds[name])
+            if not low <= start <= high:
+                raise ValueError(
+                    f"the start has {name} {start:g}, outside its bounds ({low:g}, {high:g}): "
+                    "widen the bounds, or start inside them."
+                )
+        if name in priors:
+            mean, size = (check_real(f"the prior of {name}", x) for x in priors[name])
+            if size <= 0.0:
+                raise ValueError(
+                    f"the prior of {name} has the standard deviation {size:g}, but it is "
+                    "positive: give (mean, standard deviation)."
+                )
+            weight = 1.0 / size
+        rows.append((low, high, abs(start) or size, mean, weight))
+    lower, upper, *others = np.array(rows).T
+    large = 1e30  # beyond it, a bound is that of floating-point numbers
+    lower, upper = np.where(lower < -large, -np.inf, lower), np.where(upper > large, np.inf, upper)
+    return lower, upper, *others
 
 
 class FitProblem(eqx.Module):

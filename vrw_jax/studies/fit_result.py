@@ -116,27 +116,8 @@ def read_data(
     kind = "series" if TIME_COLUMN in table else "steps" if STEP_COLUMN in table else "gaits"
     units = {TIME_COLUMN: "s", HEIGHT_COLUMN: "m", **units}
     covariance = table.pop(COVARIANCE_NAME, covariance)
-    factor_by_name: dict[str, float] = {}
-    for name, column in table.items():
-        if not np.isfinite(column).all():
-            raise ValueError(
-                f"{name} contains NaN or an infinite number in row "
-                f"{np.argwhere(~np.isfinite(column))[0, -1]}, but every measurement is a number: "
-                "remove that row."
-            )
-        value_name = name.removesuffix(ERROR_SUFFIX)
-        unit = given_units.get(name) or given_units.get(value_name)
-        if unit is None:
-            continue
-        si_unit = units.get(value_name)
-        factors = {si_unit: 1.0} | UNIT_FACTORS.get(si_unit, {}) if si_unit else ALL_FACTORS
-        if unit not in factors:
-            raise ValueError(
-                f"{name} has the unit {unit!r}, but it is a quantity in {si_unit or 'SI units'}: "
-                f"give one of {', '.join(filter(None, factors))}."
-            )
-        factor_by_name[name] = factors[unit]
-        table[name] = column * factors[unit]
+    factors = {name: _find_factor(name, x, given_units, units) for name, x in table.items()}
+    table = {name: x * factors[name] for name, x in table.items()}
     label_names = (WALK_COLUMN, STEP_COLUMN, TIME_COLUMN)
     repeat = lambda column: np.broadcast_to(column, (*column.shape[:-1], n_rows))
     labels = {name: repeat(table.pop(name)) for name in label_names if name in table}
@@ -158,7 +139,7 @@ def read_data(
                 "and conditions: give one number for each row, or fit one data set after the other."
             )
     values = np.stack(np.broadcast_arrays(*(repeat(table[name]) for name in names)), -1)
-    scales = np.array([factor_by_name.get(name, 1.0) for name in names])
+    scales = np.array([factors[name] for name in names])
     errors, whitener = _read_errors(table, names, covariance, scales, values.shape[-2:])
     is_batch = values.ndim == 3
     for i, name in enumerate(names):
@@ -187,6 +168,27 @@ def read_data(
         labels,
         is_batch,
     )
+
+
+def _find_factor(
+    name: str, column: np.ndarray, given_units: Mapping[str, str], units: Mapping[str, str]
+) -> float:
+    """Return the factor from the given unit of a column to the SI unit; 1 without a given unit."""
+    if not np.isfinite(column).all():
+        raise ValueError(
+            f"{name} contains NaN or an infinite number in row "
+            f"{np.argwhere(~np.isfinite(column))[0, -1]}, but every measurement is a number: "
+            "remove that row."
+        )
+    value_name = name.removesuffix(ERROR_SUFFIX)
+    unit, si_unit = given_units.get(name) or given_units.get(value_name), units.get(value_name)
+    factors = {si_unit: 1.0} | UNIT_FACTORS.get(si_unit, {}) if si_unit else ALL_FACTORS
+    if unit is not None and unit not in factors:
+        raise ValueError(
+            f"{name} has the unit {unit!r}, but it is a quantity in {si_unit or 'SI units'}: "
+            f"give one of {', '.join(filter(None, factors))}."
+        )
+    return 1.0 if unit is None else factors[unit]
 
 
 def _read_table(data: Any) -> tuple[dict[str, np.ndarray], dict[str, str]]:

@@ -142,35 +142,24 @@ class SampledPassage(NamedTuple):
 def sample_passage(
     walker_groups: WalkerGroups, spectral_radius: float, relative_tolerance: float, max_steps: int
 ) -> SampledPassage:
-    """Return first-passage times, estimated from walks of groups of walkers.
+    """Return first-passage times, estimated from walks of groups of walkers on the gait.
 
-    Walks are sampled until the error is within the tolerance.
+    Walks are sampled until the error is within the tolerance, or until `max_steps` steps are taken.
+    Raise an `ExtinctGroupError` if no walker of a group survives a step.
 
-    Args:
-        walker_groups: groups of walkers on the gait.
-        spectral_radius: spectral radius of the gait.
-        relative_tolerance: relative error at which the sampling ends.
-        max_steps: number of gait steps after which no further walks begin.
-
-    Raises:
-        ExtinctGroupError: if no walker of a group survives a step.
+    - `spectral_radius`: spectral radius of the gait.
     """
     count_decay_steps = lambda remaining_start_effect, decay_factor: int(
         np.ceil(np.log(remaining_start_effect) / np.log(np.clip(decay_factor, 0.01, 0.99)))
     )
     leg_period = walker_groups.leg_period
-    n_biased_steps = min(
-        count_decay_steps(walker_groups.negligible_ground_line_effect, spectral_radius),
-        MAX_BIASED_GROUND_LINES // leg_period,
-    )
+    line_effect = walker_groups.negligible_ground_line_effect
+    n_biased_steps = count_decay_steps(line_effect, spectral_radius)
+    n_biased_steps = min(n_biased_steps, MAX_BIASED_GROUND_LINES // leg_period)
     max_start_effect = MAX_START_EFFECT_PER_TOL * relative_tolerance
-    n_forgetting_steps = int(
-        np.clip(
-            count_decay_steps(max_start_effect, spectral_radius),
-            walker_groups.min_forgetting_steps,
-            MAX_FORGETTING_STEPS,
-        )
-    )
+    n_steps = count_decay_steps(max_start_effect, spectral_radius)
+    least = walker_groups.min_forgetting_steps
+    n_forgetting_steps = int(np.clip(n_steps, least, MAX_FORGETTING_STEPS))
     surviving_fraction, n_completed_steps, step_transitions = _step_until_start_is_forgotten(
         walker_groups, n_forgetting_steps, relative_tolerance
     )
@@ -202,30 +191,23 @@ def sample_passage(
         relative_tolerance=relative_tolerance,
         max_steps=max_steps,
     )
-    n_effective_lines = count_decay_steps(
-        walker_groups.negligible_ground_line_effect, start_effect_factor
-    )
+    n_effective_lines = count_decay_steps(line_effect, start_effect_factor)
     n_failures_over_lines = n_effective_lines * np.mean(~step_transitions[-1].is_walker_alive)
+    is_failure_frequent = n_failures_over_lines > MIN_FAILURES_FOR_COUNTING
+    n_lines = leg_period * n_biased_steps
     failure_probability, relative_error, start_effect, walk_density = _weigh_or_count_failures(
-        walker_groups,
-        estimate_probability,
-        leg_period * n_biased_steps,
-        n_failures_over_lines > MIN_FAILURES_FOR_COUNTING,
-        max_steps,
+        walker_groups, estimate_probability, n_lines, is_failure_frequent, max_steps
     )
     if np.isnan(kappa_2):
         relative_error = np.inf
-    mean_step_distance, step_distance_error = _estimate_step_distance(
-        walker_groups, late_transitions
-    )
+    mean_distance, distance_error = _estimate_step_distance(walker_groups, late_transitions)
     # Steps after a failure, before all legs have had their turn, are not taken.
     n_missing_steps = leg_period - 1.0 - walker_groups.compute_mean_last_turn()
     failure_probability /= leg_period - failure_probability * n_missing_steps
     mean_steps_from_gait = np.inf
     if failure_probability > 0.0:
-        mean_steps_from_gait = float(
-            n_completed_steps + surviving_fraction * (1.0 / failure_probability - 1.0)
-        )
+        n_later_steps = surviving_fraction * (1.0 / failure_probability - 1.0)
+        mean_steps_from_gait = float(n_completed_steps + n_later_steps)
     outcome_weights: Any = collections.Counter()
     for (outcome_code, _), weight in walker_groups.weight_by_outcome.items():
         outcome_weights[outcome_code] += weight
@@ -234,8 +216,8 @@ def sample_passage(
         relative_error=relative_error,
         start_effect=start_effect,
         mean_steps_from_gait=mean_steps_from_gait,
-        mean_step_distance=mean_step_distance,
-        step_distance_error=step_distance_error,
+        mean_step_distance=mean_distance,
+        step_distance_error=distance_error,
         kappa_2=kappa_2 ** (1.0 / leg_period),
         quasi_stationary_states=walker_groups.stack_states_and_ground(),
         fraction_by_outcome={

@@ -286,12 +286,9 @@ def plan_scan(
         model = convert_model_argument(model)
         require_legs_in_turn_by_collocation(model, "vrw.scan")
         gait_finder = make_finder(
-            model,
-            base.n_legs,
-            period_n=model.leg_period,
-            cycle_options=cycle_options,
-            step_options=options,
-        )
+            model, base.n_legs,
+            period_n=model.leg_period, cycle_options=cycle_options, step_options=options,
+        )  # fmt: skip
     if cycle_options is not None and not isinstance(gait_finder.search_options, CycleOptions):
         raise ValueError(
             "cycle_options is given, but the gaits of this model are found on its return map: give "
@@ -300,10 +297,9 @@ def plan_scan(
     dtype = np.dtype(jnp.result_type(*jax.tree.leaves(base)))
     options.check_tolerances(dtype)
     gait_finder.search_options.check_tolerances(dtype)
-    default_chunk_size = (
-        batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else N_PASSAGE_SAMPLES_PER_CHUNK
-    )
-    chunk = default_chunk_size if chunk is None else check_int("chunk", chunk)
+    if chunk is None:
+        chunk = batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else N_PASSAGE_SAMPLES_PER_CHUNK
+    chunk = check_int("chunk", chunk)
     if design.size > MAX_SCAN_SAMPLES:
         raise ValueError(
             f"the design has {design.size:,} samples, but a scan takes {MAX_SCAN_SAMPLES:,} at "
@@ -317,13 +313,40 @@ def plan_scan(
         )
     for parameter_name in design.swept_parameters:
         check_parameter_name(parameter_name, model.parameter_names, "parameter of this model")
+    tol = None if tol is None else check_positive("tol", tol)
+    slope_sd = None if slope_sd is None else check_positive("slope_sd", slope_sd)
+    _check_tolerance_and_slopes(model, options, tol, slope_sd)
+    catalog, own_measures = _select_measures(gait_finder, measures, tol, slope_sd)
+    requested_measures = catalog.default_measures
+    if measures is not None:
+        requested_measures = check_names("measures", name_measures(measures))
+    measure_names = check_measure_names(requested_measures, catalog)
+    variable_names = []
+    for requested_measure in requested_measures:
+        variable_names.append(canonicalize_variable_name(requested_measure))
+        if tol is not None and requested_measure in measure_names:
+            variable_names.append(requested_measure + ERROR_VARIABLE_SUFFIX)
+    variable_names += catalog.always_included_variables
+    cycle_options = getattr(gait_finder, "cycle_options", cycle_options or CycleOptions())
+    own = tuple(own_measures.values())
+    request = EvaluationRequest(
+        measure_names, base, model, options, cycle_options, tol, slope_sd, own
+    )
+    result_layout = _make_result_layout(
+        design, variable_names, base, gait_finder, own_measures, dtype, chunk
+    )
+    return ScanPlan(design, request, catalog, result_layout, requested_measures, config_text)
+
+
+def _check_tolerance_and_slopes(
+    model: Any, options: StepOptions, tol: float | None, slope_sd: float | None
+) -> None:
+    """Raise an error unless the model has scans to a tolerance, or with random slopes."""
     if tol is not None:
-        tol = check_positive("tol", tol)
         model_fields: dict[str, Any] = type(model).__dataclass_fields__
         fixed_fields = model.fixed_fields_of_tolerance
         if fixed_fields is None or any(
-            getattr(model, field_name) != model_fields[field_name].default
-            for field_name in fixed_fields
+            getattr(model, name) != model_fields[name].default for name in fixed_fields
         ):
             raise ValueError(
                 f"tol is given and model is {model!r}, but a tolerance refers to unilateral "
@@ -336,7 +359,6 @@ def plan_scan(
                 "sample: drop one of them."
             )
     if slope_sd is not None:
-        slope_sd = check_positive("slope_sd", slope_sd)
         if model.leg_period > 1:
             raise ValueError(
                 "slope_sd is given and the legs alternate, but walks over random slopes have equal "
@@ -347,49 +369,28 @@ def plan_scan(
                 "tol and slope_sd are both given, but a scan to a tolerance has no measures of "
                 "walks over random slopes: drop one of them."
             )
-    if model.is_wheel:
-        measure_catalog = select_measure_catalog(model, tol, slope_sd)
-    else:
+
+
+def _select_measures(
+    gait_finder: Any, measures: Any, tol: float | None, slope_sd: float | None
+) -> tuple[MeasureCatalog, Mapping[str, Measure]]:
+    """Return the catalog of measures of a scan, and the requested measures of the user by name."""
+    model = gait_finder.model
+    if not model.is_wheel:
         names = gait_finder.differentiable_measures
-        measure_catalog = MeasureCatalog(
-            names, ("outcome", "spectral_radius"), names, model.parameter_names, names, 64
+        always_included = "outcome", "spectral_radius"
+        return MeasureCatalog(names, always_included, names, model.parameter_names, names, 64), {}
+    catalog = select_measure_catalog(model, tol, slope_sd)
+    own_measures = find_own_measures(measures, catalog.requestable_measures)
+    if own_measures and (not gait_finder.has_own_measures or tol is not None):
+        raise ValueError(
+            f"{', '.join(own_measures)} is a measure of your own, but it is known for gaits of "
+            "the paper's model only: take model=vrw.ViscoelasticWheel(), and no tol."
         )
-    own_measures = (
-        find_own_measures(measures, measure_catalog.requestable_measures) if model.is_wheel else {}
-    )
-    if own_measures:
-        if not gait_finder.has_own_measures or tol is not None:
-            raise ValueError(
-                f"{', '.join(own_measures)} is a measure of your own, but it is known for gaits of "
-                "the paper's model only: take model=vrw.ViscoelasticWheel(), and no tol."
-            )
-        measure_catalog = measure_catalog._replace(
-            requestable_measures=(*measure_catalog.requestable_measures, *own_measures),
-            differentiable_measures=(*measure_catalog.differentiable_measures, *own_measures),
-        )
-    requested_measures = (
-        measure_catalog.default_measures
-        if measures is None
-        else check_names("measures", name_measures(measures))
-    )
-    measure_names = check_measure_names(requested_measures, measure_catalog)
-    variable_names = []
-    for requested_measure in requested_measures:
-        variable_names.append(canonicalize_variable_name(requested_measure))
-        if tol is not None and requested_measure in measure_names:
-            variable_names.append(requested_measure + ERROR_VARIABLE_SUFFIX)
-    variable_names += measure_catalog.always_included_variables
-    cycle_options = getattr(gait_finder, "cycle_options", cycle_options or CycleOptions())
-    evaluation_request = EvaluationRequest(
-        measure_names, base, model, options, cycle_options, tol, slope_sd,
-        tuple(own_measures.values()),
-    )  # fmt: skip
-    result_layout = _make_result_layout(
-        design, variable_names, base, gait_finder, own_measures, dtype, chunk
-    )
-    return ScanPlan(
-        design, evaluation_request, measure_catalog, result_layout, requested_measures, config_text
-    )
+    return catalog._replace(
+        requestable_measures=(*catalog.requestable_measures, *own_measures),
+        differentiable_measures=(*catalog.differentiable_measures, *own_measures),
+    ), own_measures
 
 
 def describe_computing_environment() -> JsonObject:

@@ -489,55 +489,41 @@ def multifidelity_mean(
     check_type("measure", measure, str, "give the name of one, 'speed', say")
     require_known_name(measure, tuple(MEASURE_FUNCTIONS), "measure that every model has")
     check_choice("stoppers", stoppers, ("bilateral", "one-sided"))
-    tol = check_positive("tol", tol)
+    tol, seed = check_positive("tol", tol), check_int("seed", seed, 0)
     pilot = check_int("pilot", pilot, MIN_PILOT_GAITS, ", to estimate a variance")
-    seed = check_int("seed", seed, 0)
-    params, friction_by_wheel, batch_shape = broadcast_params_and_friction(params, friction)
-    n_wheels = len(friction_by_wheel)
+    params, friction, batch_shape = broadcast_params_and_friction(params, friction)
+    n_wheels = len(friction)
     if not batch_shape or n_wheels <= pilot:
         raise ValueError(
             f"there are {n_wheels} wheels and a pilot of {pilot}, but a mean needs more wheels "
             "than its pilot: give a batch, params.damping of shape (1000,), say."
         )
-
-    def measure_wheels(indices: np.ndarray) -> MeasureResult:
-        return measure_to_tolerance(
-            measure,
-            select_rows_on_device(params, indices),
-            GAIT_ERROR_FRACTION * tol,
-            friction=friction_by_wheel[indices],
-            stoppers=stoppers,
-        )
-
-    evaluate_control = functools.partial(
-        _evaluate_control, measure, params, friction_by_wheel, stoppers
-    )
-    pilot_wheels, other_wheels = np.split(
-        np.random.default_rng(seed).permutation(n_wheels), [pilot]
-    )
+    measure_wheels = lambda indices: measure_to_tolerance(
+        measure, select_rows_on_device(params, indices), GAIT_ERROR_FRACTION * tol,
+        friction=friction[indices], stoppers=stoppers,
+    )  # fmt: skip
+    evaluate_control = functools.partial(_evaluate_control, measure, params, friction, stoppers)
+    wheels = np.random.default_rng(seed).permutation(n_wheels)
+    pilot_wheels, other_wheels = wheels[:pilot], wheels[pilot:]
     pilot_results = measure_wheels(pilot_wheels)
-    has_pilot_gait = pilot_results.found
-    if np.sum(has_pilot_gait) < MIN_PILOT_GAITS:
+    if (n_pilot_gaits := np.sum(pilot_results.found)) < MIN_PILOT_GAITS:
         raise ValueError(
-            f"{np.sum(has_pilot_gait)} of the pilot's {pilot} wheels have a gait with contact, but "
+            f"{n_pilot_gaits} of the pilot's {pilot} wheels have a gait with contact, but "
             f"a mean needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
         )
-    pilot_values, mean_steps = _zero_missing(pilot_results), float(np.mean(pilot_results.n_steps))
-    plans = []
+    pilot_values, n_mean_steps = _zero_missing(pilot_results), np.mean(pilot_results.n_steps)
+    plans, n_others = [], len(other_wheels)
     for name, cost in CONTROL_VARIATES.items():
-        n_drawn, weights = _plan_sampling(
-            *pilot_values, evaluate_control(pilot_wheels, name), tol, len(other_wheels)
-        )
-        plans.append((n_drawn * mean_steps + cost * len(other_wheels), n_drawn, weights, name))
+        regressors = evaluate_control(pilot_wheels, name)
+        n_drawn, weights = _plan_sampling(*pilot_values, regressors, tol, n_others)
+        plans.append((n_drawn * float(n_mean_steps) + cost * n_others, n_drawn, weights, name))
     _, n_drawn, weights, control = min(plans, key=operator.itemgetter(0))
     drawn_results = measure_wheels(other_wheels[:n_drawn])
-    mean, standard_error = _estimate_mean(
-        *pilot_values,
-        *_zero_missing(drawn_results),
-        evaluate_control(other_wheels, control) @ weights,
-    )
-    gait_error_bounds = np.concatenate([x.error[x.found] for x in (pilot_results, drawn_results)])
-    n_steps = float(np.sum(pilot_results.n_steps) + np.sum(drawn_results.n_steps))
+    controls = evaluate_control(other_wheels, control) @ weights
+    mean, standard_error = _estimate_mean(*pilot_values, *_zero_missing(drawn_results), controls)
+    results = pilot_results, drawn_results
+    gait_error_bounds = np.concatenate([x.error[x.found] for x in results])
+    n_steps = float(sum(np.sum(x.n_steps) for x in results))
     return MultifidelityMean(
         value=mean,
         error=N_STANDARD_ERRORS * standard_error + float(np.mean(gait_error_bounds)),
@@ -545,7 +531,7 @@ def multifidelity_mean(
         n_high_fidelity=float(pilot + n_drawn),
         weight=float(weights[0]),
         cost=n_steps + CONTROL_VARIATES[control] * n_wheels,
-        cost_high_fidelity_only=mean_steps * pilot + plans[0][0],
+        cost_high_fidelity_only=float(n_mean_steps) * pilot + plans[0][0],
         measure=measure,
         control=control,
     )
