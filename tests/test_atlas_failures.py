@@ -275,8 +275,8 @@ def test_the_published_torus_point_is_not_itself_the_chenciner_point():
 
     from experiments.atlas.hybrid import modes
     from vrw_jax import StepOptions
-    from vrw_jax.flow.hybrid_simulation import simulate_hybrid
-    from vrw_jax.gaits.fixed_points import solve_fixed_point
+    from vrw_jax.continuation import solve_fixed_point
+    from vrw_jax.hybrid import simulate_hybrid
 
     case = import_atlas_module("chenciner")
     parts, options = modes(case.SYSTEM), StepOptions(rtol=1e-12, atol=1e-12, max_phase_time=60.0)

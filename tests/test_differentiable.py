@@ -13,8 +13,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax.continuation import solve_fixed_point
-from vrw_jax.flow.hybrid_simulation import Guard, Mode
-from vrw_jax.hybrid import simulate_hybrid
+from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
 
 PAGE = Path(__file__).parents[1] / "docs" / "choose.md"
 SLOPE = 0.3

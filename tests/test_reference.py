@@ -16,7 +16,7 @@ import xarray as xr
 from support.slow_variants import make_params_with_slow_marks
 
 import vrw_jax as vrw
-from vrw_jax.flow.hybrid_simulation import HybridSolution, Termination
+from vrw_jax.hybrid import HybridSolution, Termination
 from vrw_jax.wheel import PARAMETER_DOMAINS
 
 ROOT = Path(__file__).parent.parent

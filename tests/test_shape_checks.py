@@ -5,7 +5,7 @@ import pytest
 from jaxtyping import TypeCheckError
 from support import shape_checks
 
-from vrw_jax.gaits.floquet import floquet_multipliers
+from vrw_jax.continuation import floquet_multipliers
 
 SQUARE = 2.0 * jnp.eye(3)
 NOT_SQUARE = jnp.ones((3, 2))

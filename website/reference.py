@@ -16,7 +16,6 @@ from vrw_jax.app.config import (
     TuneConfig,
 )
 from vrw_jax.base import StepOptions, format_markdown_table
-from vrw_jax.base.measures import Measure
 from vrw_jax.models import MODEL_CLASSES, list_model_config_names
 from vrw_jax.models.measures import (
     CONTACT_MEASURES,
@@ -29,6 +28,7 @@ from vrw_jax.models.measures import (
     STOPPER_MARGIN_MEASURES,
     TRAJECTORY_MEASURES,
     UNILATERAL_STEP_MEASURES,
+    Measure,
 )
 from vrw_jax.wheel import PARAMETER_DOMAINS, WheelParams
 

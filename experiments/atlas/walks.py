@@ -10,8 +10,7 @@ import numpy as np
 
 import vrw_jax as vrw
 from vrw_jax import Outcome
-from vrw_jax.flow.integrate import PhaseEnd
-from vrw_jax.hybrid import GuardsAndMargins, integrate_phase
+from vrw_jax.hybrid import GuardsAndMargins, PhaseEnd, integrate_phase
 from vrw_jax.models.phase_sequence import ElementPhase, make_element_phase
 from vrw_jax.wheel import Motion, dynamics, make_paper_phases, transitions
 

@@ -13,8 +13,14 @@ from matplotlib.patches import Arc
 
 from experiments.shared.command import parse_folder_and_start_jax
 from vrw_jax.app import paper_reproduction as reproduction
-from vrw_jax.app.figure_style import LEG_1_COLOR, LEG_2_COLOR
-from vrw_jax.plot import DARK_GRAY_COLOR, PAGE_FIGURE_WIDTH_INCHES, figure_style, save
+from vrw_jax.plot import (
+    DARK_GRAY_COLOR,
+    LEG_1_COLOR,
+    LEG_2_COLOR,
+    PAGE_FIGURE_WIDTH_INCHES,
+    figure_style,
+    save,
+)
 
 METERS_PER_NEWTON = 1.0 / 280.0
 """Length of a force arrow per force."""

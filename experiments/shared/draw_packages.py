@@ -16,7 +16,7 @@ from matplotlib.patches import FancyBboxPatch, Polygon
 
 from experiments.shared.command import make_parser
 from tests.support.package_graph import ImportGraph
-from vrw_jax.app.figure_style import DARK_GRAY_COLOR, PAGE_FIGURE_WIDTH_INCHES, figure_style, save
+from vrw_jax.plot import DARK_GRAY_COLOR, PAGE_FIGURE_WIDTH_INCHES, figure_style, save
 
 ROOT = Path(__file__).parents[2]
 STEP, WIDTH, HEIGHT = 1.0, 4.9, 0.74

@@ -20,10 +20,9 @@ import vrw_jax as vrw
 import vrw_jax.continuation
 import vrw_jax.hybrid
 from vrw_jax.app import _contact_figures as _contact
-from vrw_jax.app._walk_figures import ground_forces
 from vrw_jax.branches import Branch, SpecialPoint
 from vrw_jax.branches.branch import FixedPoint
-from vrw_jax.plot import style
+from vrw_jax.plot import ground_forces, style
 from vrw_jax.wheel import ContactMode
 
 ROOT = Path(__file__).parents[2]

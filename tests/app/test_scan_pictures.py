@@ -5,8 +5,7 @@ import pytest
 import xarray as xr
 
 from vrw_jax import Outcome
-from vrw_jax.app._scan_figures import map_figure, scan_figures
-from vrw_jax.plot import style
+from vrw_jax.plot import map_figure, scan_figures, style
 
 
 @pytest.mark.parametrize("second", ["friction", "gravity"])

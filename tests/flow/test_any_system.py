@@ -15,14 +15,18 @@ from support.slow_variants import mark_slow
 import vrw_jax as vrw
 from vrw_jax import lanes
 from vrw_jax.continuation import solve_fixed_point
-from vrw_jax.flow.complementarity import LCPStatus, enumerate_lcp_solutions
-from vrw_jax.flow.orbits import (
+from vrw_jax.hybrid import (
+    Guard,
+    LCPStatus,
+    Mode,
+    Termination,
+    enumerate_lcp_solutions,
     flow_jacobian_determinant,
     product_multipliers,
     segment_maps,
+    simulate_hybrid,
     time_errors,
 )
-from vrw_jax.hybrid import Guard, Mode, Termination, simulate_hybrid
 
 PAGE = Path(__file__).parents[2] / "docs" / "any_system.md"
 TIGHT_OPTIONS = vrw.StepOptions.tight()

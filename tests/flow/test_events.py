@@ -7,7 +7,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import lanes
-from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
+from vrw_jax.hybrid import GuardsAndMargins, integrate_phase
 
 TIGHT_OPTIONS = vrw.StepOptions.tight()
 

@@ -10,8 +10,7 @@ from support.machine_code import CodeRegistrySpy
 from support.walkers import SIMPLEST_WALKER
 
 import vrw_jax as vrw
-from vrw_jax.flow.hybrid_system import HybridSystem
-from vrw_jax.hybrid import Guard, Mode, Termination
+from vrw_jax.hybrid import Guard, HybridSystem, Mode, Termination
 
 TIGHT = vrw.StepOptions.tight()
 

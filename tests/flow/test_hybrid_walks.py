@@ -10,10 +10,10 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax.continuation import solve_fixed_point
-from vrw_jax.flow.orbits import ReturnMap
 from vrw_jax.hybrid import (
     Guard,
     Mode,
+    ReturnMap,
     Termination,
     flow_jacobian_determinant,
     segment_maps,

@@ -459,7 +459,7 @@ def test_no_other_function_is_compiled():
         "flow/hybrid_simulation.py": 2,
         "flow/hybrid_system.py": 4,
         "flow/orbits.py": 4,
-        "gaits/derivatives.py": 2,
+        "gaits/derivatives.py": 1,
         "gaits/fixed_points.py": 1,
         "gaits/force_peaks.py": 1,
         "gaits/walker_finder.py": 1,
