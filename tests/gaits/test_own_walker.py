@@ -159,6 +159,33 @@ def test_an_optimum_is_followed_along_another_parameter():
     np.testing.assert_allclose(curve.dataset.objective, expected, rtol=1e-9)
 
 
+def test_both_bounds_of_a_measure_become_active_along_a_curve_of_optima():
+    """The best size is s, and its bounds are 0.3 and 0.7."""
+
+    class Sized(vrw.AbstractWalker):
+        measures = (
+            vrw.measure("gain", meaning="objective")(lambda step, p: -((p["a"] - p["s"]) ** 2)),
+            vrw.measure("size", meaning="limited")(lambda step, p: p["a"] + 0.0 * p["s"]),
+        )
+
+        def advance(self, params, x, options):
+            return vrw.AdvanceResult(0.5 * x + 0.5, jnp.ones(1))
+
+        def starts(self, params):
+            return jnp.array([1.0])
+
+    curve = vrw.tune(
+        {"a": 0.5, "s": 0.0}, "gain", ["a"], {"a": (-1.0, 2.0)}, {"size": (0.3, 0.7)},
+        model=Sized(), along=("s", (0.0, 1.0)),
+    )  # fmt: skip
+    lower, upper = (f"size at its {side} bound" for side in ("lower", "upper"))
+    assert [(x.before, x.after) for x in curve.changes] == [((lower,), ()), ((), (upper,))]
+    np.testing.assert_allclose([x.value for x in curve.changes], [0.3, 0.7], atol=1e-5)
+    prices = curve.dataset.price
+    np.testing.assert_allclose(prices.sel(limit=lower), [0.6, 0.0], atol=1e-6)
+    np.testing.assert_allclose(prices.sel(limit=upper), [0.0, 0.6], atol=1e-6)
+
+
 @pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
 def test_sensitivities_are_the_derivatives_of_the_closed_form(walker):
     """v = k / (1 - e), T = 2 v / g and h = v^2 / 2 g."""

@@ -420,7 +420,7 @@ class OptimumCurve:
     - `parameter`: name of the parameter along which the optimum is followed;
     - `dataset`: best free parameters, objective, and price of each limit by its name, over the
       dimension `point`, with the parameter as a coordinate. A price of 0 is that of an inactive
-      limit;
+      limit. The two bounds of a measure are two limits;
     - `changes`: changes of the set of active limits, as `ActiveSetChange`;
     - `ending`: sentence on how the curve ends.
 
@@ -455,8 +455,14 @@ def follow_optimum(
     max_evaluations: int,
 ) -> OptimumCurve:
     """Follow the optimum of a problem through the values of a parameter, in their order."""
+    measures = [x.removeprefix(UPPER_BOUND_PREFIX) for x in problem.constraint_names]
     limit_names = [
-        *(x.removeprefix(UPPER_BOUND_PREFIX) for x in problem.constraint_names),
+        *(
+            measure
+            if measures.count(measure) == 1
+            else f"{measure} at its {'lower' if measure == constraint else 'upper'} bound"
+            for constraint, measure in zip(problem.constraint_names, measures, strict=True)
+        ),
         *(f"{x} at its lower bound" for x in problem.free_parameters),
         *(f"{x} at its upper bound" for x in problem.free_parameters),
     ]
