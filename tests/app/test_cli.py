@@ -412,6 +412,15 @@ def test_every_kind_of_design_is_drawn(design: str, config: Path) -> None:
     assert (config.parent / "here" / "scan.png").stat().st_size > 5000
 
 
+def test_a_saltelli_scan_of_few_rows_is_drawn_without_indices(config: Path) -> None:
+    ranges = "damping = [100.0, 101.0]\nslope = [0.29, 0.3]\nstiffness = [500.0, 500.5]\n"
+    config.write_text(f'[saltelli]\nn = 4\n{ranges}[scan]\nmeasures = ["speed"]\n')
+    with pytest.warns(UserWarning, match="no Sobol' indices: only 4 of 4 rows.*need 64"):
+        result = run_command("scan", config, "--out", "here")
+    assert result.exit_code == 0, result.output
+    assert [path.name for path in (config.parent / "here").glob("*.png")] == ["scan_pairs.png"]
+
+
 @pytest.mark.slow
 def test_many_parameters_at_once_are_drawn_in_pairs_with_their_sobol_indices(config: Path) -> None:
     config.write_text(

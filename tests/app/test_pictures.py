@@ -106,6 +106,16 @@ def test_shades_of_a_basin_differ_from_the_colors_of_falls():
                 np.linalg.norm(shade - perceive_color(style.OUTCOME_LABELS_AND_COLORS[code][1]))
                 > MIN_COLOR_DISTANCE
             ), (steps, code)
+    mixed = basin_figure([result.isel({name: [1, 0] for name in over_values})], ["any"])
+    ordered = basin_figure([result.isel(dtheta_touchdown=[0, 1], dL1_touchdown=[0, 1])], ["any"])
+    for x, y in zip(mixed.axes[0].collections, ordered.axes[0].collections, strict=True):
+        np.testing.assert_array_equal(x.get_array(), y.get_array())
+    without_gait = result.assign(attractor=0 * result.attractor - 1)
+    assert basin_figure([without_gait], ["any"]).axes
+    with pytest.raises(ValueError, match=r"results\[0\] has 1 axes of starts"):
+        basin_figure([result.isel(dL1_touchdown=0)], ["any"])
+    with pytest.raises(ValueError, match="titles has 0 entries"):
+        basin_figure([result], [])
 
 
 def test_special_points_of_a_branch_have_their_own_colors_and_dashes():

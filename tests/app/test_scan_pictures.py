@@ -25,6 +25,29 @@ def test_a_scan_is_drawn_over_both_its_axes(second):
     assert speed.collections[0].get_array().shape == (4, 3)
 
 
+@pytest.mark.parametrize("n_parameters", [2, 3])
+def test_a_figure_of_a_grid_does_not_depend_on_the_order_of_its_values(n_parameters):
+    names = ["damping", "slope", "stiffness"][:n_parameters]
+    values = {name: [1.0, 2.0, 4.0] for name in names}
+    speed = np.arange(3.0**n_parameters).reshape([3] * n_parameters)
+    named = {"outcome": 0 * speed.astype(int), "speed": speed, "friction_fore": speed - 1.5}
+    scan = xr.Dataset({name: (names, array) for name, array in named.items()}, values)
+    mixed = scan.isel({name: [2, 0, 1] for name in names})
+
+    def list_drawn_values(figure):
+        arrays = [x.get_array() for axes in figure.axes for x in axes.collections]
+        curves = [path.vertices for x in figure.axes[0].collections for path in x.get_paths()]
+        return [x for x in (*arrays, *curves) if x is not None]
+
+    draw = lambda x: [
+        *scan_figures(x).values(),
+        map_figure(x.sel(dict.fromkeys(names[2:], 1.0)), "speed", []),
+    ]
+    for figures in zip(draw(scan), draw(mixed), strict=True):
+        for ordered, other in zip(*map(list_drawn_values, figures), strict=True):
+            np.testing.assert_array_equal(ordered, other)
+
+
 def make_scan(outcome: np.ndarray, speed: np.ndarray, radius: np.ndarray) -> xr.Dataset:
     over_values = ("damping", "slope")
     values = {"damping": [100.0, 150.0, 200.0], "slope": [0.28, 0.3]}

@@ -337,6 +337,19 @@ def basin_figure(
     require_variables_of_datasets(
         "results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)"
     )
+    for index, result in enumerate(results):
+        if result.attractor.ndim != 2:
+            raise ValueError(
+                f"results[{index}] has {result.attractor.ndim} axes of starts, but a panel shows "
+                "two: give vrw.basin a grid in which two quantities have several values."
+            )
+    titles = list(check_names("titles", titles, '"Table 1"'))
+    if len(titles) != len(results):
+        raise ValueError(
+            f"titles has {len(titles)} entries, but results has {len(results)}: give one title for "
+            "each result."
+        )
+    results = [result.sortby(list(result.attractor.dims)) for result in results]
     all_outcome_codes = np.concatenate(
         [basin_dataset.outcome.values.ravel() for basin_dataset in results]
     )
@@ -345,7 +358,7 @@ def basin_figure(
         basin_dataset.steps.where(basin_dataset.attractor >= 0) for basin_dataset in results
     ]
     max_n_steps_to_gait = max(
-        float(steps_to_gait.max()) for steps_to_gait in steps_to_gait_by_panel
+        1.0, *(float(x.max()) for x in steps_to_gait_by_panel), key=np.nan_to_num
     )
     figure, panel_axes = make_panel_grid(
         find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),

@@ -138,7 +138,8 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
     figures show fewer slices of a grid and fewer pairs of parameters. For a walker of your own, the
     figures show the first six measures that were asked for, and a warning names the others. A
     figure of pairs of parameters shows one measure. Of a measure with one value per leg, figures
-    show the smallest. Infinite values of parameters are left out with a warning.
+    show the smallest. Infinite values of parameters are left out with a warning, and so are Sobol'
+    indices if too few rows of a `saltelli` design have gaits.
 
     Args:
         scan: dataset that `vrw.scan` returns for a grid or for samples.
@@ -156,6 +157,7 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
     _warn_of_omitted_measures(scan)
     swept_parameters = _list_swept_parameters(scan, scan.coords)
     scan = _take_least_over_legs(_leave_out_infinite_values(scan, swept_parameters))
+    scan = scan.sortby([name for name in swept_parameters if name in scan.dims])
     varied_parameters = [
         parameter_name
         for parameter_name in swept_parameters
@@ -173,9 +175,12 @@ def scan_figures(scan: xr.Dataset, *, width: FigureWidth = None) -> dict[str, Fi
                 if _is_of_own_walker(scan)
                 else [name for name in DIFFERENTIABLE_MEASURES if name in scan]
             )
-            figures_by_name["sobol_indices"] = draw_sobol_indices(
-                sobol_indices(scan, measure_names), scan, width
-            )
+            try:
+                indices = sobol_indices(scan, measure_names)
+            except ValueError as error:
+                warnings.warn(f"scan_figures draws no Sobol' indices: {error}", stacklevel=3)
+            else:
+                figures_by_name["sobol_indices"] = draw_sobol_indices(indices, scan, width)
         return figures_by_name
     if len(varied_parameters) == 1:
         return FiguresByName(scan=draw_measure_curves(scan, varied_parameters[0], width))
@@ -503,7 +508,7 @@ def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:
             for parameter_name in _list_swept_parameters(scan, scan.dims)
             if parameter_name != x
         }
-    ).sortby(x)
+    )
     measure_names = _list_shown_measures(scan) or ["fore_foot_force"]
     width_inches = find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES)
     figure = StyledFigure(figsize=(width_inches, 1.6 * len(measure_names) + 0.6))
@@ -641,6 +646,7 @@ def map_figure(
     scan = _take_least_over_legs(scan)
     names = _list_swept_parameters(scan, scan.dims, SWEEPABLE_PARAMETERS)
     x, y = curves[0].parameters if curves else names
+    scan = scan.sortby([x, y])
     width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
     figure = StyledFigure(figsize=(width_inches, 0.62 * width_inches))
     axes = figure.subplots()
