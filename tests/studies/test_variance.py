@@ -162,6 +162,14 @@ def test_invalid_requests_for_indices_are_refused_in_one_sentence() -> None:
         vrw.saltelli(ISHIGAMI_RANGES, 100)
     with pytest.raises(ValueError, match="did you mean 'speed'"):
         vrw.sobol_indices(scan, ["sped"])
+    with pytest.raises(ValueError, match="measures is empty"):
+        vrw.sobol_indices(scan, [])
+    of_legs = scan.assign(force=scan.speed.expand_dims(leg=2, axis=1))
+    with pytest.raises(ValueError, match="'force' has the axes sample, leg, but"):
+        vrw.sobol_indices(of_legs, ["force"])
+    attrs = {"scan": {"design": vrw.saltelli(damping=(100.0, 200.0), n=64).describe_design()}}
+    with pytest.raises(ValueError, match="varies only damping"):
+        vrw.sobol_indices(scan.assign_attrs(attrs), ["speed"])
     with pytest.raises(ValueError, match=r"kind None.*saltelli"):
         vrw.sobol_indices(scan.drop_attrs(), ["speed"])
     scan.outcome.values[0] = vrw.Outcome.NO_CYCLE_FOUND

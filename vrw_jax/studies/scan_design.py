@@ -477,12 +477,24 @@ def sobol_indices(
             f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices "
             "need those of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
         )
+    if len(design["swept"]) < 2:
+        raise ValueError(
+            f"the scan varies only {design['swept'][0]}, which causes all variance of a measure: "
+            "give vrw.saltelli the ranges of two parameters or more."
+        )
     measure_names = list(check_names("measures", measures))
+    if not measure_names:
+        raise ValueError('measures is empty, but indices are of a measure: give ["speed"], say.')
     for name in ("outcome", *measure_names):
-        if name not in scan or scan[name].dims != ("sample",):
+        if name not in scan:
             raise ValueError(
                 f"{name!r} is no measure of this scan{format_name_suggestion(name, map(str, scan))}"
                 ": ask for one that was scanned."
+            )
+        if scan[name].dims != ("sample",):
+            raise ValueError(
+                f"{name!r} has the axes {', '.join(map(str, scan[name].dims))}, but indices need "
+                'one value per sample: reduce it, as by scan.min("leg", keep_attrs=True).'
             )
     positions = _locate_design_samples(scan, design["swept"], design["shape"][0])
     is_present = positions >= 0
