@@ -551,6 +551,13 @@ def test_a_gait_of_rigid_legs_is_printed(config: Path) -> None:
     assert "stable: multipliers" in result.stdout
 
 
+@pytest.mark.parametrize("command", ["gait", "robustness"])
+def test_a_wheel_without_a_gait_has_the_exit_code_of_no_result(command: str, config: Path) -> None:
+    config.write_text('[wheel]\nslope = 0.01\n[model]\nname = "rigid"\n[scan]\nslope_sd = 0.01\n')
+    result = run_command(command, config)
+    assert result.exit_code == 1, result.output
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "reason"), [(20.0, "model is valid"), (0.7, "not valid")])
 def test_a_gait_of_the_simplest_model_names_the_model_and_the_reason(

@@ -178,7 +178,8 @@ def run_gait_command(
     The walk begins near the gait of Table 1 of the paper, or at the start in the config. The
     command then finds the limit cycle of the wheel. With rigid legs or unilateral contact and a
     start in the config, this is the limit cycle near the end of the walk. With unilateral contact
-    and no start, it is the slowest attracting gait. The command writes no file.
+    and no start, it is the slowest attracting gait. The command writes no file. The exit code is 1
+    if no limit cycle is found.
 
     [bold]Examples[/bold]
 
@@ -227,6 +228,8 @@ def run_gait_command(
         )
         for gait_remark in filter(None, (missing_force_peaks_reason, model_selection_reason)):
             stdout_console.print(gait_remark)
+        if not limit_cycle_result.found:
+            raise typer.Exit(ExitCode.CHECK_FAILED)
 
 
 @app.command("explore")
@@ -502,7 +505,7 @@ def run_robustness_command(
     If the config has no design, the command prints the results for one wheel and writes no file. If
     it has a grid or samples, the command computes one sample after the other, and writes scan.zarr
     and figures (PNG and SVG) into the folder. After an interruption, the same command continues
-    where it stopped.
+    where it stopped. The exit code is 1 if one wheel without a design has no gait.
 
     [bold]Examples[/bold]
 
@@ -581,7 +584,8 @@ def run_tune_command(
     The optimization follows the branch of gaits with exact gradients. A walk of the tuned wheel
     then validates the result. The command writes path.zarr (every evaluated gait), tuning.md,
     wheel.toml (the tuned wheel) and figures (PNG and SVG) into the folder. The exit code is 1 if
-    the run does not end at an optimum. It is 2, and nothing is written, if the start has no gait.
+    the run does not end at an optimum. If the start has no gait, it is also 1, and nothing is
+    written.
 
     [bold]Examples[/bold]
 

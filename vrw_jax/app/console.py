@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import NoGaitError, Outcome
 from vrw_jax.base.progress import PROGRESS_VARIABLE
 from vrw_jax.gaits.cycle import format_floquet_multipliers
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
@@ -100,7 +100,8 @@ def report_command_errors(
 ) -> Iterator[None]:
     """Return a context manager that handles errors in a command.
 
-    It prints an error in one sentence and ends the command with exit code 2, or 130 after Ctrl-C.
+    It prints an error in one sentence and ends the command with exit code 2, with 1 if there is no
+    gait, or with 130 after Ctrl-C.
     """
     try:
         yield
@@ -112,6 +113,9 @@ def report_command_errors(
             "this asks for more memory than there is: give smaller designs, or fewer at once."
         )
         raise typer.Exit(ExitCode.USER_ERROR) from command_error
+    except NoGaitError as command_error:
+        print_error_sentence(str(command_error))
+        raise typer.Exit(ExitCode.CHECK_FAILED) from command_error
     except ValueError as command_error:
         print_error_sentence(str(command_error))
         raise typer.Exit(ExitCode.USER_ERROR) from command_error

@@ -9,6 +9,10 @@ from vrw_jax.base.printing import (
 )
 
 
+class NoGaitError(ValueError):
+    """Error of a computation that needs a gait, for a wheel or walker that has none."""
+
+
 class Outcome(StatusCode):
     """Outcome of a step. Only a step with the outcome STEPPED ends in a section state. Every other
     outcome ends the walk.

@@ -19,7 +19,7 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import NoGaitError, Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
@@ -566,7 +566,7 @@ def _solve_passage_by_quadrature(
         not is_traced
         and not float(model.make_vertical_rate_map(params).compute_fixed_point(params.slope)) > 0
     ):
-        raise ValueError(
+        raise NoGaitError(
             f"slope is {float(params.slope):g} rad, on which this rigid wheel has no gait: give a "
             "steeper one."
         )
@@ -643,7 +643,7 @@ def _estimate_passage_by_sampling(
     gait: Any = limit_cycle(params, model=model, period_n=model.leg_period)
     kind = "wheel" if model.is_wheel else "walker"
     if int(gait.outcome) != Outcome.STEPPED:
-        raise ValueError(
+        raise NoGaitError(
             f"this {kind} has no gait from which a walk could begin: {gait.why} "
             f"Take a {kind} for which vrw.limit_cycle finds a gait."
         )

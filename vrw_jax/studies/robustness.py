@@ -24,7 +24,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import NoGaitError, Outcome
 from vrw_jax.base.printing import AbstractPrintable, LabelAndText, describe_step_ending
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
@@ -191,7 +191,7 @@ def gait_sensitivity(
         not has_traced_leaf(limit_cycle_result)
         and int(limit_cycle_result.outcome) != Outcome.STEPPED
     ):
-        raise ValueError(
+        raise NoGaitError(
             f"there is no gait whose sensitivity could be computed: {limit_cycle_result.why} Take "
             "parameters for which vrw.limit_cycle finds a gait."
         )

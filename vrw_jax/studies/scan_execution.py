@@ -26,7 +26,7 @@ from vrw_jax.base.checks import check_callable, check_names, check_path, check_t
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import NoGaitError, Outcome
 from vrw_jax.base.progress import announce_wait, report_progress
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.special_point_curves import (
@@ -546,7 +546,7 @@ def follow_special_points(
     - `on_stage`: function that is called with a description of each stage.
     """
     if not np.any(scanned_samples.outcome.values == Outcome.STEPPED):
-        raise ValueError("no gait was found on the grid: choose another.")
+        raise NoGaitError("no gait was found on the grid: choose another.")
     return SpecialPointMap(
         scanned_samples, *trace_special_points(scanned_samples, base_wheel, wheel_model, on_stage)
     )

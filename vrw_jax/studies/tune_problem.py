@@ -29,7 +29,7 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import NoGaitError, Outcome
 from vrw_jax.base.walker import check_parameters, is_own_walker
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
@@ -340,7 +340,7 @@ class TuneProblem:
                 start_trial = self.evaluate_trial(normalized_parameters, None, start)
         if not start_trial.has_gait_on_branch:
             start_outcome = Outcome(int(start_trial.outcome))
-            raise ValueError(
+            raise NoGaitError(
                 f"the start has no gait to tune ({start_outcome.name}: "
                 f"{start_outcome.meaning[:-1]}"
                 "): start from parameters that have one."
