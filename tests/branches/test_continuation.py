@@ -313,6 +313,27 @@ def test_a_branch_starts_at_a_pitchfork():
     assert abs(border.value) < LOCATION_TOLERANCE
 
 
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda _, x, p: x + 0.3 * (p * x - x**2), lambda x: x),
+        (lambda _, x, p: pitchfork(0.0, x, p), np.square),
+    ],
+    ids=["transcritical", "pitchfork"],
+)
+def test_a_crossing_branch_is_continued_to_both_sides(function, expected):
+    """x = 0 is crossed by x = p, or by x² = p."""
+    trivial = vrw.continue_map(function, [0.0], -0.5, (-1.0, 1.2))
+    (crossing,) = trivial.special_points
+    branch = vrw.continue_map(function, [0.0], -0.5, (-1.0, 1.2), switch_at=crossing)
+    x = branch.dataset.x.values[:, 0]
+    np.testing.assert_allclose(expected(x), branch.values, atol=1e-9)
+    assert np.min(x) < -0.9
+    assert np.max(x) > 0.9
+    assert [point.kind for point in branch.special_points] == ["branch_point"]
+    assert branch.ends == ("The parameter's range ended.",) * 2
+
+
 def test_a_component_that_is_only_round_off_does_not_set_its_unit():
     noisy = lambda _, x, r: jnp.stack(
         [evaluate_logistic(_, x[0], r), 0.5 * x[1] + jnp.cos(x[0]) ** 2 + jnp.sin(x[0]) ** 2 - 1.0]

@@ -124,11 +124,14 @@ class Continuation(ArclengthDriver):
     """Continuation of the branches of several wheels, with what locates their special points.
 
     - `wheels`: a tree of arrays with a leading axis over wheels;
-    - `crossed_tangent`: tangent of a known branch at the start, which the continued branch crosses.
+    - `crossed_tangent`: tangent of a known branch at the start, which the continued branch crosses;
+    - `is_doubled`: whether the continued branch then has twice the period of the known branch, so
+      that both of its halves contain the same gaits.
     """
 
     wheels: Any
     crossed_tangent: np.ndarray | None = None
+    is_doubled: bool = False
 
     @property
     def location_unit(self) -> float:
@@ -226,9 +229,11 @@ class Continuation(ArclengthDriver):
             start = self._find_crossing_branch(z[0], p[0], self.crossed_tangent)
             if start is None:
                 return {}
-            signs = np.sign([start.fraction_rate])
-            (track,) = self._continue_from(np.array([0]), start.z[None], np.array([start.p]), signs)
-            return {0: [Track([], ContinuationStatus.BRANCH_SWITCHED), track]}
+            outward = np.sign(start.fraction_rate)
+            signs = np.array([outward] if self.is_doubled else [-outward, outward])
+            rows, p = np.repeat(start.z[None], len(signs), 0), np.repeat([start.p], len(signs))
+            tracks = self._continue_from(np.zeros(len(signs), int), rows, p, signs)
+            return {0: [Track([], ContinuationStatus.BRANCH_SWITCHED), *tracks][-2:]}
         owners = np.repeat(np.flatnonzero(is_requested), 2)
         signs = np.tile([-1.0, 1.0], len(owners) // 2)
         tracks = self._continue_from(owners, z[owners], p[owners], signs)

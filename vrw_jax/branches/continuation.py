@@ -252,7 +252,7 @@ def continue_branch(
         measures: measures of your own, see `vrw.measure`, for the dataset of the branch. For a
             walker of yours, also names of its measures.
         switch_at: a branch point or period doubling of the branch through `params`. The branch that
-            crosses there is continued, or that of gaits of twice the period.
+            crosses there is continued to both sides, or that of gaits of twice the period.
 
     Returns:
         A `Branch`. If there is no gait from which to start, `outcome` is the reason.
@@ -360,16 +360,16 @@ def continue_branches(
     limits, options = np.array(check_range("bounds", bounds)), check_arclength_options(options)
     if n_wheels == 0:
         return ()
-    tangent = None
+    crossing: Any = ()
     if switch_at is not None:
         n_periods, tangent = parse_switch_point(switch_at, 1.0, limits)
-        problem_fields["period_n"] = n_periods * period_n
+        problem_fields["period_n"], crossing = n_periods * period_n, (tangent, n_periods > 1)
         if n_wheels > 1:
             raise ValueError("switch_at is for one wheel, but the batch has more: give one wheel.")
         cycle = select_rows_on_device(switch_at.cycle, None)
     value = model.get_parameter(params, name) if switch_at is None else switch_at.value
     return _continue_gait_branches(
-        params, value, cycle, cycle_options, problem_fields, options, limits, n_wheels, tangent
+        params, value, cycle, cycle_options, problem_fields, options, limits, n_wheels, crossing
     )
 
 
@@ -429,11 +429,13 @@ def _continue_gait_branches(
     options: ArclengthOptions,
     bounds: np.ndarray,
     n_wheels: int,
-    crossed_tangent: np.ndarray | None,
+    crossing: tuple[np.ndarray, bool] | tuple[()],
 ) -> tuple[Branch, ...]:
     """Return the branches of wheels from their start gaits, see `find_branch_starts`.
 
-    - `value`: value of the continued parameter at the start of each branch.
+    - `value`: value of the continued parameter at the start of each branch;
+    - `crossing`: tangent of the known branch that is crossed at the start, and whether it has half
+      the period.
     """
     model, (name,) = problem_fields["model"], problem_fields["continued_names"]
     # The batch is padded to a power of two, because each size compiles programs.
@@ -455,7 +457,7 @@ def _continue_gait_branches(
         has_start = start.outcomes == Outcome.STEPPED
         has_start &= np.arange(len(has_start)) < n_wheels
         branch_data = continue_and_locate_special_points(
-            Continuation(start.problem, options, bounds, start.wheels, crossed_tangent),
+            Continuation(start.problem, options, bounds, start.wheels, *crossing),
             start.z,
             np.asarray(parameter_values),
             has_start,

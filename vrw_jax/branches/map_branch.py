@@ -167,7 +167,8 @@ def continue_map(
             of its change within the bounds if it is larger.
         options: `ArclengthOptions` of the branch.
         switch_at: a branch point or period doubling of the branch through (x, p), at which the
-            other branch begins: that which crosses there, or that of the second iterate.
+            other branch begins: that which crosses there, to both sides, or that of the second
+            iterate.
 
     Returns:
         A `Branch`: the fixed points, their stability, the special points, and why the branch ends.
@@ -279,13 +280,15 @@ def trace_fixed_points(
         units = estimate_state_units(problem.function, args, np.asarray(x), p, limits)
     units = tuple(np.asarray(check_state_units(units, x)).tolist())
     problem = dataclasses.replace(problem, units=units)
-    start, start_p, tangent = np.asarray(x), p, None
+    start, start_p = np.asarray(x), p
+    crossing: Any = ()
     if switch_at is not None:
         n, tangent = parse_switch_point(switch_at, problem.section_units, limits)
         problem = dataclasses.replace(problem, period_n=n * problem.period_n)
+        crossing = tangent, n > 1
         start, start_p, *_ = switch_at.point
     (data,) = continue_and_locate_special_points(
-        Continuation(problem, options, np.array(limits), select_tree_rows(args, None), tangent),
+        Continuation(problem, options, np.array(limits), select_tree_rows(args, None), *crossing),
         (start / problem.section_units)[None],
         np.array([start_p], float),
         np.array([True]),
