@@ -17,6 +17,7 @@ from vrw_jax.app.reports import write_branch_report
 from vrw_jax.branches.arclength import ArclengthDriver, MapProblem, run_together
 from vrw_jax.branches.branch_location import locate_function_roots
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase
+from vrw_jax.gaits.fixed_points import estimate_state_units
 
 RADIUS_AT_200 = 0.32861954  # Table 1: published for orientation beside the physics
 LOCATION_TOLERANCE = 1e-9
@@ -340,6 +341,17 @@ def test_a_component_that_is_only_round_off_does_not_set_its_unit():
     )
     branch = vrw.continue_map(noisy, [0.6, 1e-17], 2.5, (2.0, 3.5))
     assert abs(special_points_by_kind(branch)["period_doubling"] - 3.0) < LOCATION_TOLERANCE
+
+
+def test_the_remainder_of_an_iteration_towards_the_origin_sets_no_unit():
+    turn = jnp.array([[0.8, -0.6], [0.6, 0.8]])
+    spiral = lambda _, x, p: jnp.exp(p) * (turn @ x) * (1.0 - x @ x)
+    for remainder in ([1e-64, 0.0], [1e-18, -1e-20]):
+        units = estimate_state_units(spiral, None, np.array(remainder), -0.5, (-1.0, 1.0))
+        np.testing.assert_array_equal(units, 1.0)
+    small = lambda u, x, r: u * evaluate_logistic(None, x / u, r)
+    units = estimate_state_units(small, 1e-20, np.array([0.6e-20]), 2.5, (2.0, 3.5))
+    assert 0.5e-20 < units[0] < 2e-20
 
 
 def test_a_branch_along_a_conserved_quantity_names_the_multiplier_1():

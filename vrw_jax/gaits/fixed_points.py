@@ -472,6 +472,17 @@ NOISE_PROBES = 1e-12 * np.arange(32.0)
 are chosen because the quadratic terms of the map are then far below its round-off.
 """
 
+MAX_NEWTON_REMAINDER = 1e-10
+"""Largest size of a component that may be the remainder of a Newton iteration towards 0. The value
+is chosen because the searches for gaits end at corrections of that size. A component is such a
+remainder if it also is no fixed point compared with its size.
+"""
+
+MIN_REMAINDER_RESIDUAL = 1e-6
+"""Smallest residual of a remainder as a fraction of its size. The value is chosen because Newton's
+method leaves far smaller residuals at a fixed point, unless a multiplier is almost 1.
+"""
+
 MIN_UNIT_PER_NOISE = 1e11
 """Smallest unit of a component as a multiple of the round-off of its image. The value is chosen
 because ten times the round-off is then the default tolerance of 1e-10.
@@ -487,7 +498,7 @@ def estimate_state_units(
     parameter if the change is larger. The change solves the quadratic equation of the branch in the
     direction of its tangent, so that the change is finite at a fold. The size scales with the units
     of state and parameter. It exceeds the round-off of the map, and is 1 for a component that is
-    zero and remains zero.
+    zero and remains zero. The remainder of a Newton iteration towards zero counts as zero.
     """
 
     def linearize(x: np.ndarray, p: Any) -> tuple[np.ndarray, ...]:
@@ -499,6 +510,12 @@ def estimate_state_units(
     with np.errstate(all="ignore"):
         parameter_range = parameter_bounds[1] - parameter_bounds[0]
         image, jacobian, rate = (values[0] for values in linearize(x, p))
+        residual_limits = np.where(
+            abs(x) < MAX_NEWTON_REMAINDER, MIN_REMAINDER_RESIDUAL * abs(x), np.inf
+        )
+        if (is_remainder := abs(image - x) > residual_limits).any():
+            x = np.where(is_remainder, 0.0, x)
+            image, jacobian, rate = (values[0] for values in linearize(x, p))
         forcing = parameter_range * rate
         is_size_unknown = (x == 0.0) & (forcing == 0.0)
         if is_size_unknown.any():
