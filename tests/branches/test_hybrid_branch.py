@@ -354,6 +354,12 @@ def test_a_margin_that_is_zero_at_a_computed_gait_is_found():
             vrw.continue_branch(
                 {"p": 0.25}, "p", (0.1, 0.4), model=walker, margins={name: margins["low"]}
             )
+    # The step can't last longer than a mode may.
+    options = vrw.StepOptions(max_phase_time=0.3)
+    branch = vrw.continue_branch({"p": 0.25}, "p", (0.2, 0.4), model=walker, step_options=options)
+    assert branch.ends[1].startswith(
+        "Beyond it, no guard ends the mode within StepOptions.max_phase_time"
+    )
 
 
 def test_wrong_arguments_of_a_map_are_refused_before_the_continuation():

@@ -198,6 +198,13 @@ class AbstractContinuationProblem(abc.ABC):
         """Return a sentence that describes the end of a branch."""
         return f"{end_name.replace('_', ' ')} at {parameter_value:.9g} ends it."
 
+    def explain_stalled_end(self, quantities: QuantitiesByName) -> str:
+        """Return a sentence on why Newton's method finds nothing beyond a point, or "".
+
+        - `quantities`: quantities of this point, with an axis of length 1.
+        """
+        return ""
+
 
 class ContinuationStatus(StatusCode):
     """Reason for which a continuation ended in one direction."""

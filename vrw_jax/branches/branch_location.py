@@ -634,15 +634,20 @@ def continue_and_locate_special_points(
         roots.sort(key=lambda root: root.pair[0] + root.fraction * np.ptp(root.pair))
         special_points = [locator.make_special_point(root, False) for root in roots]
         end_reasons = [status.meaning for status in statuses[owner]]
+        rows = select_tree_rows(joined, joined.owners == owner)
         for end in (0, 1):
             if (located_end := located_ends.get((owner, end))) is None:
+                if statuses[owner][end] == ContinuationStatus.STEP_SIZE_UNDERFLOW:
+                    last = select_tree_rows(rows.quantities, np.array([-end]))
+                    end_reasons[end] = (
+                        continuation.problem.explain_stalled_end(last) or end_reasons[end]
+                    )
                 continue
             end_point = locator.make_special_point(located_end, True)
             special_points.insert(end * len(special_points), end_point)
             end_reasons[end] = continuation.problem.describe_branch_end(
                 end_point.name, end_point.value
             )
-        rows = select_tree_rows(joined, joined.owners == owner)
         end_names = [point.name for point in special_points if point.ends_branch]
         branches[owner] = BranchData(
             rows.points,

@@ -336,6 +336,15 @@ MarginFunctions = Mapping[str, Callable[[Array, Any], Array]]
 """Functions of state and parameters by name, which are positive in admissible gaits."""
 
 
+MODE_DURATION = "longest_mode_duration"
+"""Name of the longest time in one mode in a step."""
+
+PHASE_TIME_TOLERANCE = 1e-3
+"""Relative distance from the longest allowed time of a mode below which this time ends a branch.
+The value is chosen because the last continuation step is far shorter.
+"""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WalkerProblem(ReturnMapProblem):
     """Continuation problem of the gaits of a walker of the user.
@@ -377,6 +386,7 @@ class WalkerProblem(ReturnMapProblem):
         quantities |= {margin.name: np.full(len(states), np.inf) for margin in self.margins}
         measures = (*self.margins, *self.own_measures)
         codes, outcome = [], np.full(len(states), int(Outcome.STEPPED))
+        longest = np.zeros(len(states))
         for _ in range(self.period_n):
             step = step_batch_of_walker(walker, params, states, options)
             quantities["period"] = quantities["period"] + step.duration
@@ -394,6 +404,7 @@ class WalkerProblem(ReturnMapProblem):
                 quantities[margin.name] = np.minimum(quantities[margin.name], minimum)
             if isinstance(walker, HybridSystem):
                 codes.append(np.column_stack([step.n_events, step.events]))
+                longest = np.fmax(longest, step.mode_durations.max(1))
             outcome = np.where(outcome == Outcome.STEPPED, step.outcome, outcome)
             states = step.section_state
         for margin in self.margins:
@@ -401,7 +412,18 @@ class WalkerProblem(ReturnMapProblem):
         return quantities | {
             EVENT_ORDER: number_rows(np.concatenate([np.zeros((len(states), 1)), *codes], 1)),
             "outcome": outcome,
+            MODE_DURATION: longest,
         }
+
+    def explain_stalled_end(self, quantities: QuantitiesByName) -> str:
+        limit = float(self.step_options.max_phase_time)
+        (duration,) = quantities[MODE_DURATION]
+        if abs(duration / limit - 1.0) > PHASE_TIME_TOLERANCE:
+            return ""
+        return (
+            f"Beyond it, no guard ends the mode within StepOptions.max_phase_time ({limit:g} s): "
+            "give step_options with a longer time."
+        )
 
     def label(self, quantities: QuantitiesByName) -> tuple[dict, dict]:
         x = quantities["x"]
