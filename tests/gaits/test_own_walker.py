@@ -590,7 +590,7 @@ CALLS = {
         BALL_PARAMS, 1.0, model=KICKED_SYSTEM, tol=0.2, n_walkers=1024
     ),
     "vrw.gait_sensitivity": lambda: vrw.gait_sensitivity(
-        BALL_PARAMS, "height", model=KICKED_SYSTEM
+        BALL_PARAMS, "height", model=KICKED_SYSTEM, guess=[2.0]
     ),
     "vrw.measure_basins": lambda: vrw.measure_basins(
         follow_kicked_system(), {"velocity": (1.0, 5.0)}, model=KICKED_SYSTEM, n_points=1

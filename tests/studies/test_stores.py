@@ -253,8 +253,19 @@ def test_of_two_simultaneous_scans_one_creates_the_store(
     assert [path.name for path in tmp_path.iterdir()] == ["s.zarr"]
 
 
+def test_a_folder_in_place_of_a_file_is_named(complete_store: Path) -> None:
+    file = complete_store / "speed" / CHUNK_FILE
+    file.unlink()
+    file.mkdir()
+    with (
+        pytest.warns(UserWarning, match="1 damaged chunk"),
+        pytest.raises(ValueError, match=r"speed/c/1/0 is a folder, but .*: remove the folder"),
+    ):
+        run_plan(make_plan(), complete_store, evaluate=evaluate_arithmetically)
+
+
 def test_an_unwritable_folder_is_refused_in_one_sentence() -> None:
-    with pytest.raises(OSError, match="no store can be made at /proc/x"):
+    with pytest.raises(ValueError, match="no store can be made at /proc/x"):
         run_plan(make_plan(), "/proc/x", evaluate=evaluate_arithmetically)
 
 

@@ -958,7 +958,7 @@ def register_wrong_calls() -> None:
     add_wrong_call(
         "tune from where nothing walks",
         lambda: tune(params=vrw.WheelParams(slope=0.02)),
-        "ValueError",
+        "NoGaitError",
         "no gait",
     )
     add_wrong_call(
@@ -1198,6 +1198,21 @@ def register_wrong_calls() -> None:
         "tuning_figure": plot.tuning_figure,
     }.items():
         add_wrong_calls(f"plot {name}", draw, many, "")
+
+    walks = [vrw.simulate(table_1, n_steps=1)]
+    for name in ("foot_height", "rear_force"):
+        add_wrong_call(
+            f"plot {name} over a misspelt parameter",
+            lambda name=name: getattr(plot, name)(walks, "dampin"), "ValueError", "'damping'",
+        )  # fmt: skip
+    add_wrong_call(
+        "an animation that is no GIF file",
+        lambda: plot.save_animation([], 40, "walk.xyz"), "ValueError", ".gif",
+    )  # fmt: skip
+    add_wrong_call(
+        "measures of a gait without names",
+        lambda: vrw.limit_cycle(table_1).measures(), "TypeError", "give names",
+    )  # fmt: skip
 
     add_wrong_call(
         "a name that is not there", lambda: vrw.limit_cycel, "AttributeError", "limit_cycle"

@@ -54,7 +54,13 @@ from vrw_jax.app.figure_style import (
     require_variables_of_datasets,
     typeset_greek_symbols,
 )
-from vrw_jax.base.checks import check_int, check_path, check_positive, check_type
+from vrw_jax.base.checks import (
+    check_int,
+    check_path,
+    check_positive,
+    check_type,
+    require_known_name,
+)
 from vrw_jax.models.measures import MEASURES, PHASE_NAMES
 
 NO_WALK_REMEDY = "give vrw.simulate(params, model=...), of any model of the wheel"
@@ -316,6 +322,8 @@ def _format_gait_lines(
 ) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
     """Yield each gait with the style and the label of its line, for matplotlib."""
     for gait, line_style in zip(gaits, itertools.cycle(GAIT_LINE_STYLES), strict=False):
+        names = [x.removeprefix("parameter_") for x in gait.attrs if x.startswith("parameter_")]
+        require_known_name(vary, names, "parameter of these gaits")
         label = format_value_label(vary, gait.attrs[f"parameter_{vary}"])
         yield gait, {"linestyle": line_style, "label": label}
 
@@ -631,7 +639,7 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str |
         Path: the path of the GIF file.
 
     Raises:
-        TypeError: if `frames` is not a list, or `path` is not a path.
+        TypeError, ValueError: if `frames` is not a list, or `path` is not that of a GIF file.
         OSError: if the file cannot be written.
 
     Examples:
@@ -643,6 +651,10 @@ def save_animation(frames: Sequence[Image.Image], milliseconds: int, path: str |
     """
     check_type("frames", frames, (list, tuple), "give those of vrw.plot.walk_frames")
     path = check_path("path", path, 'give a file, such as "walk.gif"')
+    if path.suffix.lower() != ".gif":
+        raise ValueError(
+            f'path is {path}, but an animation is a GIF file: end its name with ".gif".'
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     largest_areas: dict[Any, int] = {}  # number of pixels of each color in a frame
     for frame_image in frames:

@@ -271,8 +271,13 @@ class AbstractCycle(AbstractPrintable):
         ](self)
 
     @announce_wait("measures of a gait", "20 s")
-    def measures(self, measure_names: Iterable[str | Measure]) -> dict[str, Array]:
+    def measures(self, measure_names: Iterable[str | Measure] | None = None) -> dict[str, Array]:
         """Return the requested measures by name. Only these measures are traced."""
+        if measure_names is None:
+            raise TypeError(
+                "measure_names is None, but a gait has many measures, some of which take long: "
+                'give names, such as ["speed"].'
+            )
         measure_names = tuple(measure_names)
         force_peaks = (
             {} if FORCE_PEAK_MEASURES.keys().isdisjoint(measure_names) else self.force_peaks

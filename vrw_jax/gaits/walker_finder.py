@@ -361,7 +361,7 @@ def _check_search(
         propose = functools.partial(propose_starts, walker)
         guesses = jax.vmap(propose, (axes,))(params) if has_batch else propose(params)
     else:
-        guesses = check_reals("guess", guess)[..., None, :]
+        guesses = jnp.atleast_1d(check_reals("guess", guess))[..., None, :]
     one_guess = guesses[(0,) * (guesses.ndim - 1)]
     one_params = jax.tree.map(lambda leaf: leaf if leaf.ndim == 0 else leaf[0], params)
     _, _, options = check_arguments(walker, one_params, one_guess, options, 1)
@@ -576,8 +576,9 @@ class WalkerFinder(AbstractGaitFinder):
 
     def find_cycle(self, params: Any, cycle_guess: Any = None) -> HybridGait:  # type: ignore[override]
         guesses = propose_starts(self.model.walker, params) if cycle_guess is None else cycle_guess
+        guesses = jnp.atleast_2d(jnp.asarray(guesses))
         return find_gait_from_guesses(
-            (self.model.walker, self.period_n), params, jnp.atleast_2d(guesses), self.step_options
+            (self.model.walker, self.period_n), params, guesses, self.step_options
         )
 
     def make_initial_guess(self, parameter_values: ParameterValues) -> Array:
@@ -630,7 +631,8 @@ def make_walker_finder(
     - `guess`: section coordinates from which each search begins, instead of the walker's starts.
     """
     params, guess = check_one_walker(params), convert_gait_guess(guess)
-    start = propose_starts(walker, params) if guess is None else guess
+    start = propose_starts(walker, params) if guess is None else check_reals("guess", guess)
+    start = jnp.atleast_1d(start)
     coordinates = name_coordinates(walker, jnp.shape(start)[-1])
     check_measure_names(walker, coordinates)
     described_measures = {

@@ -637,8 +637,8 @@ def _estimate_passage_by_sampling(
     `mean_steps`.
 
     The derivatives are those with respect to the parameters `differentiated_parameter_names`, by
-    the names of the parameters. Raise ValueError if the wheel has no gait, or if hardly any step
-    succeeds.
+    the names of the parameters. Raise ValueError if the wheel has no gait, or if all walks
+    of a group fail in one step.
     """
     gait: Any = limit_cycle(params, model=model, period_n=model.leg_period)
     kind = "wheel" if model.is_wheel else "walker"
@@ -661,8 +661,9 @@ def _estimate_passage_by_sampling(
         sample = sample_passage(groups, float(gait.spectral_radius), relative_tolerance, max_steps)
     except ExtinctGroupError as extinction:
         raise ValueError(
-            f"{sd_name} is {ground_sd:g} {SD_UNITS[sd_name]}, with which hardly any step of this "
-            f"{kind} succeeds: give a smaller one."
+            f"{sd_name} is {ground_sd:g} {SD_UNITS[sd_name]}, with which all walks of a group of "
+            f"{groups.n_walkers_per_group:,} failed in one step: give a smaller one, or a "
+            "larger n_walkers."
         ) from extinction
     derivative_by_name = {}
     if differentiated_parameter_names:

@@ -239,6 +239,11 @@ def _compute_and_write_chunks(
             }
             try:
                 result_store.write_chunk(chunk_index, chunk_results)
+            except IsADirectoryError as file_error:
+                raise ValueError(
+                    f"{file_error.filename2 or file_error.filename} is a folder, but the scan "
+                    "writes a file there: remove the folder, and run the same again."
+                ) from file_error
             except OSError as disk_error:
                 if disk_error.errno not in (errno.ENOSPC, errno.EDQUOT):
                     raise

@@ -583,10 +583,9 @@ def create_empty_store(
     except OSError as creation_error:
         if read_stored_manifest(store_path) is None:
             creation_failure_reason = creation_error.strerror or "no folder can be made there"
-            raise OSError(
-                creation_error.errno,
+            raise ValueError(
                 f"no store can be made at {store_path} ({creation_failure_reason}): give a place "
-                "of your own",
+                "of your own."
             ) from creation_error
 
 
