@@ -119,7 +119,8 @@ _DESIGNS = {
     "samples": "one sample per position in lists of equal length, `parameter = [1.0, 2.0]`",
     "sobol": "`n` samples from a scrambled Sobol' sequence, with `n` a power of two",
     "uniform": "`n` independent samples",
-    "saltelli": "`n` groups of samples for `sobol_indices`, with `n` a power of two",
+    "saltelli": "`n` groups of samples for `sobol_indices`, with `n` a power of two, at least 64 "
+    "for a figure of the indices",
 }
 _ON_DESIGNS = (
     "A config has at most one design. The parameters are those of `[wheel]`, and `friction` for "
