@@ -674,7 +674,7 @@ class AimedBall(JuggledBall):
         (lambda: vrw.first_passage(BALL_PARAMS, 0.1, model=JuggledBall()), "does not declare"),
         (lambda: vrw.gait_sensitivity(BALL_PARAMS, "period", model=BALL_SYSTEM), "not declare"),
         (
-            lambda: vrw.gait_sensitivity(BALL_PARAMS, "speed", model=KICKED_SYSTEM),
+            lambda: vrw.gait_sensitivity(BALL_PARAMS, "speed", model=KICKED_SYSTEM, guess=[2.0]),
             "a step of this walker.*period, height",
         ),
         (
