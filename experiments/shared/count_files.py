@@ -7,12 +7,13 @@ apart, because a reader stops at a public name of that package. Without CALL, ea
 process of its own without a cache on disk, because a trace from a cache runs no functions.
 """
 
+import cProfile
 import itertools
+import pstats
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 
 import jax
 import numpy as np
@@ -51,22 +52,19 @@ CALLS: dict[str, Callable[[], object]] = {
 
 
 def list_files(call: Callable[[], object]) -> tuple[list[str], list[str]]:
-    """Return the files of which a function runs in a call, in the order of their first calls.
+    """Return the files of which a function runs in a call, by name.
 
     The second list contains the files of `lanes`.
     """
-    files: dict[str, None] = {}
-
-    def record(frame: FrameType, event: str, _: object) -> None:
-        """Add the file of a called function of the library."""
-        path = Path(frame.f_code.co_filename)
-        is_counted = event == "call" and frame.f_code.co_name != "<module>"
-        if is_counted and path.is_relative_to(LIBRARY_FOLDER):
-            files[path.relative_to(LIBRARY_FOLDER).as_posix()] = None
-
-    sys.setprofile(record)
-    call()
-    sys.setprofile(None)
+    profile = cProfile.Profile()
+    profile.runcall(call)
+    functions = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+    paths = {Path(file) for file, _, function in functions if function != "<module>"}
+    files = sorted(
+        path.relative_to(LIBRARY_FOLDER).as_posix()
+        for path in paths
+        if path.is_relative_to(LIBRARY_FOLDER)
+    )
     is_compiler = lambda file: file.startswith("lanes/")
     return list(itertools.filterfalse(is_compiler, files)), list(filter(is_compiler, files))
 
