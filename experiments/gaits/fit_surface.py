@@ -16,9 +16,8 @@ import numpy as np
 
 import vrw_jax as vrw
 from experiments.shared.command import make_parser, parse_and_start_jax
-from vrw_jax.gaits import N_GAUSS_NODES, CollocationSolution
+from vrw_jax.gaits import N_GAUSS_NODES, CollocationSolution, phase_sequence
 from vrw_jax.gaits import collocation_search as search
-from vrw_jax.gaits import phase_sequence as surface
 from vrw_jax.lanes import apply_function_in_blocks
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters, stack_parameters
 
@@ -30,7 +29,7 @@ PARAMETER_BOX = {
 }
 N_WHEELS, N_STAGES, SEED = 8192, 80, 5
 GAIT_OF_TABLE_1 = ((-0.6827, 1.0492), (0.4343, 0.3330, 0.0497))
-SURFACE_PATH = Path(surface.__file__).with_name("surface.npz")
+SURFACE_PATH = Path(phase_sequence.__file__).with_name("surface.npz")
 
 
 def find_gaits_by_continuation(
@@ -65,7 +64,7 @@ def find_gaits_by_continuation(
 
 def main() -> None:
     parse_and_start_jax(make_parser(__doc__))
-    steps = tuple(mesh.n_intervals for mesh in surface.GAIT_SURFACE_MESHES)
+    steps = tuple(mesh.n_intervals for mesh in phase_sequence.GAIT_SURFACE_MESHES)
     options = dataclasses.replace(
         vrw.CycleOptions(), max_newton_iterations=20, mesh_intervals=steps
     )
@@ -78,7 +77,7 @@ def main() -> None:
     search_result = find_gaits_by_continuation(problem, jnp.asarray(parameters))
     is_found = np.asarray(search_result.collocation_state.has_cycle) > 0.5
     solution = search_result.collocation_state.solution
-    time_unit = float(surface.compute_time_unit(table_1))  # L0 = 1 m in Table 1.
+    time_unit = float(phase_sequence.compute_time_unit(table_1))  # L0 = 1 m in Table 1.
     rows = [
         solution.section_state[0],
         solution.section_state[1] * time_unit,
@@ -89,12 +88,14 @@ def main() -> None:
     unknowns = np.stack([np.asarray(row) for row in rows])[:, is_found]
 
     wheels = make_wheel_from_parameters(jnp.asarray(parameters[:, is_found]), 8)
-    coordinates = np.stack([np.asarray(x) for x in surface.compute_surface_coordinates(wheels)])
+    coordinates = np.stack(
+        [np.asarray(x) for x in phase_sequence.compute_surface_coordinates(wheels)]
+    )
     centre, spread = coordinates.mean(1), coordinates.std(1)
     features = np.stack(
         [
             np.asarray(x)
-            for x in surface.evaluate_monomials(
+            for x in phase_sequence.evaluate_monomials(
                 tuple((coordinates - centre[:, None]) / spread[:, None])
             )
         ]

@@ -82,10 +82,13 @@ def test_a_closed_curve_is_continued_until_it_closes():
 @pytest.mark.parametrize(("name", "factor"), [("period_doubling", 0.75), ("fold", -0.25)])
 def test_bifurcations_of_henon_are_on_their_parabolas(name, factor):
     params = {"a": 0.2, "b": 0.3}
+    gait = vrw.limit_cycle(params, model=Henon(), guess=[0.7, 0.2])
+    with pytest.raises(ValueError, match="give params, which cycle has"):
+        vrw.continue_special_point(name, ("a", "b"), gait, model=Henon())
     curve = vrw.continue_special_point(
         name,
         ("a", "b"),
-        vrw.limit_cycle(params, model=Henon(), guess=[0.7, 0.2]),
+        gait,
         model=Henon(),
         params=params,
         bounds={"a": (-1.0, 3.5), "b": (-1.4, 0.6)},

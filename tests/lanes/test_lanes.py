@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from vrw_jax.flow import with_batched_jvp
 from vrw_jax.lanes import map_in_batches
+from vrw_jax.lanes.autodiff import with_batched_jvp
 
 
 @pytest.mark.parametrize(("n", "widths"), [(1, [1]), (3, [4]), (4, [4]), (9, [4, 4, 1])])

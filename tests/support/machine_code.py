@@ -8,9 +8,10 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from vrw_jax.lanes import code_cache as code
 from vrw_jax.lanes import program
-from vrw_jax.lanes import program as ffi
 
-_REGISTERED = ffi.LOADED_CODE_BY_FFI_TARGET  # XLA never releases code and accepts one code per name
+_REGISTERED = (
+    program.LOADED_CODE_BY_FFI_TARGET
+)  # XLA never releases code and accepts one code per name
 
 
 @contextlib.contextmanager
@@ -55,8 +56,7 @@ class CodeRegistrySpy:
         self._monkeypatch.setattr(code, "_recent_traces", OrderedDict())
         self._monkeypatch.setattr(program, "_lane_kernels", {})
         registered = PersistentRegistry()
-        for module in (ffi, program):
-            self._monkeypatch.setattr(module, "LOADED_CODE_BY_FFI_TARGET", registered)
+        self._monkeypatch.setattr(program, "LOADED_CODE_BY_FFI_TARGET", registered)
 
     def _trace(self, *arguments):
         self.n_traces += 1

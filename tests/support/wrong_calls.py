@@ -582,7 +582,7 @@ def register_wrong_calls() -> None:
     add_wrong_call(
         "sensitivities of no gait",
         lambda: vrw.sensitivities(vrw.WheelParams(slope=0.02)),
-        "ValueError",
+        "NoGaitError",
         "no gait",
     )
     add_wrong_call(

@@ -505,7 +505,7 @@ def run_robustness_command(
     If the config has no design, the command prints the results for one wheel and writes no file. If
     it has a grid or samples, the command computes one sample after the other, and writes scan.zarr
     and figures (PNG and SVG) into the folder. After an interruption, the same command continues
-    where it stopped. The exit code is 1 if one wheel without a design has no gait.
+    where it stopped. Without a design, the exit code is 1 if the wheel has no gait.
 
     [bold]Examples[/bold]
 
@@ -584,7 +584,7 @@ def run_tune_command(
     The optimization follows the branch of gaits with exact gradients. A walk of the tuned wheel
     then validates the result. The command writes path.zarr (every evaluated gait), tuning.md,
     wheel.toml (the tuned wheel) and figures (PNG and SVG) into the folder. The exit code is 1 if
-    the run does not end at an optimum. If the start has no gait, it is also 1, and nothing is
+    the run does not end at an optimum. It is also 1 if the start has no gait; nothing is then
     written.
 
     [bold]Examples[/bold]

@@ -100,8 +100,8 @@ def report_command_errors(
 ) -> Iterator[None]:
     """Return a context manager that handles errors in a command.
 
-    It prints an error in one sentence and ends the command with exit code 2, with 1 if there is no
-    gait, or with 130 after Ctrl-C.
+    It prints an error in one sentence and ends the command with exit code 2. The exit code is 1 if
+    there is no gait, and 130 after Ctrl-C.
     """
     try:
         yield

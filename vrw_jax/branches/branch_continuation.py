@@ -223,7 +223,8 @@ class Continuation(ArclengthDriver):
     ) -> dict[int, list[Track]]:
         """Continue the requested branches, and return two tracks for each index of a wheel.
 
-        The first track decreases the parameter.
+        The first track decreases the parameter. On a branch that crosses, it goes back through the
+        crossing.
         """
         if self.crossed_tangent is not None:
             start = self._find_crossing_branch(z[0], p[0], self.crossed_tangent)

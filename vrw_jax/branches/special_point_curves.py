@@ -282,6 +282,10 @@ def continue_special_point(
         ['fold', 'hit_planted_impulse']
     """
     if is_own_walker(model):
+        if params is None:
+            raise ValueError(
+                "a curve of a walker of yours needs its parameters: give params, which cycle has."
+            )
         return continue_walker_special_point(
             model, params, name, parameters, bounds, cycle, options, step_options, margins
         )

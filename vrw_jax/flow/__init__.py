@@ -7,4 +7,3 @@ from vrw_jax.flow.solver_steps import (
     load_explicit_tableau,
     sample_batch_phase,
 )
-from vrw_jax.lanes.autodiff import with_batched_jvp

@@ -72,7 +72,7 @@ class Guard(NamedTuple):
     ends_walk: bool = False
 
     def wrap_functions(self, wrap: Callable, wrap_reset: Callable) -> "Guard":
-        """Return the guard in which its functions, and its reset, have been replaced."""
+        """Return the guard with `wrap` applied to its functions, and `wrap_reset` to its reset."""
         armed = None if self.armed is None else wrap(self.armed)
         return self._replace(value=wrap(self.value), reset=wrap_reset(self.reset), armed=armed)
 

@@ -474,8 +474,8 @@ are chosen because the quadratic terms of the map are then far below its round-o
 
 MAX_NEWTON_REMAINDER = 1e-10
 """Largest size of a component that may be the remainder of a Newton iteration towards 0. The value
-is chosen because the searches for gaits end at corrections of that size. A component is such a
-remainder if it also is no fixed point compared with its size.
+is chosen because the searches for gaits end at corrections of that size. Its residual
+must also exceed `MIN_REMAINDER_RESIDUAL` times its size.
 """
 
 MIN_REMAINDER_RESIDUAL = 1e-6

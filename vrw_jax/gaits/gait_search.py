@@ -23,7 +23,7 @@ from vrw_jax.base.checks import (
 from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure, find_own_measures, name_measures
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.outcomes import NoGaitError, Outcome
 from vrw_jax.base.printing import format_numbers
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
@@ -492,7 +492,7 @@ def sensitivities(
         gait_measures = gait_measures if start is None else measure_gait(start)
     if int(gait_measures.outcome) != Outcome.STEPPED:
         failure_outcome = Outcome(int(gait_measures.outcome))
-        raise ValueError(f"there is no gait to differentiate: {failure_outcome.meaning}")
+        raise NoGaitError(f"there is no gait to differentiate: {failure_outcome.meaning}")
     unit_of = lambda name: (own_measures.get(name) or gait_finder.get_measure(name)).unit
     units = [unit_of(name) for name in measure_names]
     return _make_sensitivity_table(gait_finder, params, measure_names, units, gait_measures)

@@ -232,11 +232,11 @@ def _solve_level(
         x, z, _ = force_solution.hub_motion
         if is_impact:
             contact_impulse = s.m * (sin * (x - motion.vx) + cos * (z - motion.vz) + motion.dL)
-            stoppers = contact_impulse, force_solution.length_motion
+            stopper_motion = contact_impulse, force_solution.length_motion
         else:
             outward_leg_motion = free_motion.leg_motion + sin * x + cos * z
-            stoppers = s.m * outward_leg_motion, outward_leg_motion
-        return LevelSolution(chosen_combination, force_solution, *stoppers)
+            stopper_motion = s.m * outward_leg_motion, outward_leg_motion
+        return LevelSolution(chosen_combination, force_solution, *stopper_motion)
 
     return solve_stopper_lcp(solve, contact_law, motion, *stoppers, tolerances)
 

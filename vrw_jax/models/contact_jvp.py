@@ -78,7 +78,7 @@ def find_slot_contacts(
 class WheelForceSolution(NamedTuple):
     """Forces of ground and stoppers, and the resulting motion of the hub and of all legs.
 
-    The fields are described in `contact_modes.SlotForceSolution`.
+    The fields are described in `SlotForceSolution`.
     """
 
     tangential_forces: SlotArray

@@ -144,7 +144,8 @@ def sample_passage(
 ) -> SampledPassage:
     """Return first-passage times, estimated from walks of groups of walkers on the gait.
 
-    Walks are sampled until the error is within the tolerance, or until `max_steps` steps are taken.
+    Walks are sampled until the error is within the tolerance. After `max_steps` steps, and a few
+    first rounds, no further walks begin.
     Raise an `ExtinctGroupError` if no walker of a group survives a step.
 
     - `spectral_radius`: spectral radius of the gait.
@@ -238,8 +239,9 @@ def _weigh_or_count_failures(
 ) -> tuple[float, float, float, GaussianMixture]:
     """Return the result of `_estimate_failure_probability`, and the density of sampled walks.
 
-    Frequent failures are counted, and rare ones are made frequent by importance sampling. If its
-    error is unknown, failures are counted too, if enough of them are expected.
+    Frequent failures are counted, and rare ones are made frequent by importance sampling. If the
+    error of importance sampling is unknown, failures are counted too, if enough of them are
+    expected.
     """
     density = GaussianMixture.make_isotropic_gaussian(n_ground_lines, 1.0)
     probability, error, start_effect = 0.0, np.inf, 0.0

@@ -16,6 +16,7 @@ store's attributes.
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import math
@@ -156,8 +157,8 @@ class StoredMetadata:
         ]
         if self._do_mark_attributes_differ:
             damaged.append(CHECKSUM_GROUP_NAME)
-        attributes = self.store_attributes.items()
-        if any(self._root_attributes.get(name, x) != x for name, x in attributes):
+        sealed_attributes = self.mark_attributes.get(STORE_ATTRIBUTES_KEY, {}).items()
+        if any(self._root_attributes.get(name, x) != x for name, x in sealed_attributes):
             damaged.append("attributes")
         return damaged
 
@@ -582,11 +583,11 @@ def create_empty_store(
             temporary_path.rename(store_path)
     except OSError as creation_error:
         if read_stored_manifest(store_path) is None:
-            creation_failure_reason = creation_error.strerror or "no folder can be made there"
-            raise ValueError(
-                f"no store can be made at {store_path} ({creation_failure_reason}): give a place "
-                "of your own."
-            ) from creation_error
+            reason = creation_error.strerror or "no folder can be made there"
+            message = f"no store can be made at {store_path} ({reason}): give a place of your own."
+            if creation_error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise OSError(creation_error.errno, message) from creation_error
+            raise ValueError(message) from creation_error
 
 
 @contextlib.contextmanager

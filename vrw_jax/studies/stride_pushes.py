@@ -54,7 +54,7 @@ class SmallestDisturbance(AbstractPrintable):
     - `time`: instant of the disturbance after the start of the gait, s;
     - `phase_index`: index of the phase or mode of that instant in `phase_names`;
     - `outcome`: Outcome that ends the walk after a slightly larger disturbance; STEPPED if the walk
-      continues, but not on this gait;
+      has not reached this gait after `max_steps` steps;
     - `profile_times`: instants of the profile of sizes, s, shape (instants,);
     - `profile_phase_indices`: index of the phase at each instant of the profile, shape (instants,);
     - `backward_sizes`, `forward_sizes`: smallest sufficient change in each direction at each
@@ -89,7 +89,10 @@ class SmallestDisturbance(AbstractPrintable):
         if not np.isfinite(self.size):
             return "No disturbance of the tried sizes leaves the basin."
         if self.outcome == Outcome.STEPPED:
-            return "The walker walks on, but not on this gait."
+            return (
+                "After max_steps steps, the walker has not reached this gait: it has another one, "
+                "or a larger max_steps gives a larger size."
+            )
         return Outcome(int(self.outcome)).meaning
 
     def summary_rows(self) -> list[LabelAndText]:

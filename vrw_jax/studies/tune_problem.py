@@ -452,6 +452,7 @@ def make_tune_problem(
     free: Sequence[str],
     bounds: ParameterBounds,
     constraints: ConstraintSpecification | None,
+    *,
     model: ModelLike | None = None,
     options: StepOptions | None = None,
     cycle_options: CycleOptions | None = None,

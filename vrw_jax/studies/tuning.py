@@ -627,8 +627,9 @@ def tune(
     tolerance, seed = check_positive("tolerance", tolerance), check_int("seed", seed, 0)
     start_seconds = time.perf_counter()
     problem = make_tune_problem(
-        params, objective, free, bounds, constraints, model, options, cycle_options
-    )
+        params, objective, free, bounds, constraints,
+        model=model, options=options, cycle_options=cycle_options,
+    )  # fmt: skip
     name_and_values = None if along is None else check_along(problem, along)
     exploration, start = None, problem.normalized_start
     if n_starts > 1:
