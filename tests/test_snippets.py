@@ -50,7 +50,7 @@ def run_page(page, capsys, tmp_path, monkeypatch):
             continue
         capsys.readouterr()
         exec(code, names)
-        if block["output"]:
+        if block["output"] is not None:
             assert capsys.readouterr().out.split() == block["output"].split()
     return names
 
