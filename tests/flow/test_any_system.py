@@ -577,3 +577,16 @@ def test_units_of_forces_and_gaps_do_not_change_the_solutions_of_contact_problem
         entries = random.normal(size=(3, 4))
         counts.add(count_solutions(entries[:, :3], entries[:, 3], *units))
     assert counts >= {0, 1, 2, 3, 4}
+
+
+def test_functions_may_contain_traced_integers_and_flags_in_jit():
+    def position_after(time, x, n, is_stiff):
+        force = lambda y: jnp.where(is_stiff, -4.0 * n * y[1], 0.0)
+        oscillate = lambda y: jnp.stack([1.0 + 0.0 * y[0], y[2], force(y)])
+        end = Guard(lambda y: time - y[0], lambda y: y)
+        start = jnp.stack([0.0 * x, x, 0.0 * x])
+        return simulate_hybrid((Mode(oscillate, (end,)),), start, events=1).state[1]
+
+    differentiate = jax.jit(jax.jacfwd(position_after, argnums=1), static_argnums=0)
+    # The frequency is 6 rad/s. The tolerance is a hundred times that of a solver step.
+    assert float(differentiate(1.0, 1.0, 9, True)) == pytest.approx(np.cos(6.0), abs=1e-8)

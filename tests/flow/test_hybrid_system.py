@@ -373,3 +373,37 @@ def test_wrong_shapes_name_the_function_and_the_state():
         wrong.step((), [1.0, 0.0])
     with pytest.raises(ValueError, match="its shape must be"):
         BALL.step(BALL_PARAMS, np.ones((3, 1)))
+
+
+HELD_OSCILLATOR = HybridSystem(
+    modes={
+        "swing": Mode(
+            lambda y, p: jnp.stack([1.0 + 0.0 * y[0], y[2], -(p["omega"] ** 2) * (y[1] - 0.2)]),
+            {"end": Guard(lambda y, p: 1.0 - y[0], lambda y, p: y.at[0].add(-1.0))},
+        )
+    },
+    section="end",
+    state=("time", "position", "velocity"),
+    project=lambda y, p: y[1:],
+    embed=lambda x, p: jnp.stack([0.0 * x[0], *x]),
+)
+
+
+@pytest.mark.filterwarnings("ignore:XLA computes")  # implicit solvers have no machine code
+@pytest.mark.parametrize(
+    ("solver", "tolerance"),
+    # Tangents have errors of 1e-8 of their size in a solver step, in about 100 steps. The implicit
+    # solver has more steps.
+    [("Dopri8", 1e-6), ("Kvaerno5", 1e-5)],
+)
+def test_derivatives_of_an_oscillator_at_rest_are_those_of_its_motion(solver, tolerance):
+    omega = 100.0
+    take_step = lambda x: (
+        vrw.step(
+            {"omega": omega}, x, model=HELD_OSCILLATOR, options=vrw.StepOptions(solver=solver)
+        ).section_state
+    )
+    jacobian = jax.jacfwd(take_step)(jnp.array([0.2, 0.0]))
+    c, s = np.cos(omega), np.sin(omega)
+    scale = np.array([[1.0, 1.0 / omega], [omega, 1.0]])
+    np.testing.assert_allclose(jacobian / scale, [[c, s], [-s, c]], atol=tolerance)

@@ -138,7 +138,8 @@ def announce_wait(
 ) -> Callable[[FunctionType], FunctionType]:
     """Return a decorator for public functions that may last more than some seconds.
 
-    They run with the default settings of JAX. Calls within another decorated call print nothing.
+    The decorator computes nothing. It prints what is compiled, and sets JAX's default settings.
+    Calls within another decorated call print nothing.
 
     - `compiled_programs`: programs that the first call of a process compiles;
     - `compile_time`: duration of that compilation without a cache, in CPU time, as text.

@@ -14,6 +14,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,6 +44,7 @@ from vrw_jax.flow.solver_steps import (
     sample_batch_phase,
     take_rk_step,
 )
+from vrw_jax.lanes.autodiff import find_maximum_over_directions
 from vrw_jax.lanes.batching import is_inside_jit
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 
@@ -116,6 +118,7 @@ def integrate_phase(
     options: StepOptions,
     state_units: StateArray | None = None,
     kinks: PhaseKinks | None = None,
+    controls_tangents: bool = True,
 ) -> PhaseEnd:
     """Return the end of the phase that begins at `start_state`, where a guard first falls to zero.
 
@@ -127,7 +130,8 @@ def integrate_phase(
     The integration also detects a guard that is negative only inside a solver step. If two guards
     are zero at the same time, the first in the list ends the phase. If `is_active` is False,
     nothing is integrated. Errors are those of the solver for the tolerances of `options`. The
-    absolute tolerance is multiplied by `state_units`, whose default is 1.
+    absolute tolerance is multiplied by `state_units`, whose default is 1. With `controls_tangents`,
+    the solver steps of a Jacobian also suit its tangents.
     """
     options = lax.stop_gradient(options)
     evaluate, n_guards = guards_and_margins.evaluate_guards_and_margins, guards_and_margins.n_guards
@@ -146,7 +150,7 @@ def integrate_phase(
     def make_phase(
         field: VectorField, evaluate: EvaluateGuardsAndMargins, sides: tuple = ()
     ) -> tuple[BatchPhase, ButcherTableau]:
-        phase, tableau = _make_phase(field, options, state_units)
+        phase, tableau = _make_phase(field, options, state_units, controls_tangents)
         n_all_guards = n_guards + len(sides)
         phase = phase._replace(
             evaluate_guards=lambda state: evaluate(state.v[0])[:n_all_guards],
@@ -287,7 +291,10 @@ def is_machine_code_better(system: Any, options: StepOptions, n_recorded_numbers
 
 
 def _make_phase(
-    field: VectorField, options: StepOptions, state_units: StateArray | None
+    field: VectorField,
+    options: StepOptions,
+    state_units: StateArray | None,
+    controls_tangents: bool,
 ) -> tuple[BatchPhase, ButcherTableau]:
     """Return the phase of a vector field without guards, and the tableau of its solver.
 
@@ -311,23 +318,82 @@ def _make_phase(
     )
 
     def take_solver_step(state: StageState, h: Scalar) -> tuple[list[StageState], Array]:
-        stage_states, error = take_step(state, h)
-        start, end = jnp.abs(state.v[0]), jnp.abs(stage_states[-1].v[0])
-        tolerance = atol + options.rtol * jnp.maximum(start, end)
+        tangent_error: Any = 0.0
+        if controls_tangents:
+            stage_states, error, tangent_error = _take_step_with_tangent_error(
+                take_step, (atol, options.rtol), state, h
+            )
+        else:
+            stage_states, error = take_step(state, h)
+        tolerance = _compute_tolerance(stage_states, atol, options.rtol)
         squared_error = jnp.maximum(jnp.mean(jnp.square(error / tolerance)), min_squared_error)
+        squared_error = jnp.maximum(squared_error, tangent_error)
         return stage_states, lax.stop_gradient(
             jnp.where(jnp.isfinite(squared_error), squared_error, jnp.inf)
         )
 
-    return (
-        BatchPhase(
-            evaluate_rates,
-            lambda _: jnp.zeros((0,)),
-            take_solver_step=take_solver_step,
-            has_exact_events=True,
-        ),
-        tableau,
+    phase = BatchPhase(
+        evaluate_rates,
+        lambda _: jnp.zeros((0,)),
+        take_solver_step=take_solver_step,
+        take_last_step=(lambda state, h: take_step(state, h)[0]) if controls_tangents else None,
+        has_exact_events=True,
     )
+    return phase, tableau
+
+
+def _compute_tolerance(stage_states: list[StageState], atol: Any, rtol: Scalar) -> StateArray:
+    """Return the largest error of each component in a solver step."""
+    start, end = jnp.abs(stage_states[0].v[0]), jnp.abs(stage_states[-1].v[0])
+    return atol + rtol * jnp.maximum(start, end)
+
+
+MAX_TANGENT_ERROR = 100.0
+"""Largest error of a tangent in a solver step, relative to its size, in relative tolerances.
+
+The value is chosen because tangents of a motion that excites all its frequencies have smaller
+errors, so that their solver steps are those of the motion.
+"""
+
+
+def _take_step_with_tangent_error(
+    take_step: Callable, tolerances: tuple, state: StageState, h: Scalar
+) -> tuple[list[StageState], Array, Scalar]:
+    """Return stages and error of a solver step, and the error of the tangents in a Jacobian.
+
+    The latter is the mean square of the errors divided by their tolerance, for the least accurate
+    tangent. If a part of the state rests, only tangents show how fast its equations are.
+
+    - `take_step`: function of `state` and `h` that returns stages and errors;
+    - `tolerances`: absolute and relative tolerance.
+    """
+    constants, step_code = eqx.partition(
+        eqx.filter_closure_convert(take_step, state, h), eqx.is_array
+    )
+    step = lambda constants, *arguments: eqx.combine(constants, step_code)(*arguments)
+    step_with_rule = jax.custom_jvp(
+        lambda _tolerances, *arguments: (*step(*arguments), jnp.zeros_like(arguments[-1]))
+    )
+
+    @step_with_rule.defjvp
+    def compute_step_jvp(primals: tuple, tangents: tuple) -> tuple:
+        (stage_states, error), (stage_tangents, error_tangent) = jax.jvp(
+            step, primals[1:], tangents[1:]
+        )
+        atol, rtol = primals[0]
+        weights = 1.0 / _compute_tolerance(stage_states, atol, rtol)
+        compute_size = lambda x: jnp.mean(jnp.square(x * weights))
+        size = jnp.maximum(*[compute_size(stage_tangents[i].v[0]) for i in (0, -1)])
+        tangent_error = compute_size(error_tangent) / (size * (MAX_TANGENT_ERROR * rtol) ** 2)
+        tangent_error = find_maximum_over_directions(
+            lax.stop_gradient(jnp.where(jnp.isfinite(tangent_error), tangent_error, 0.0))
+        )
+        return (
+            (stage_states, error, tangent_error),
+            (stage_tangents, error_tangent, jnp.zeros_like(tangent_error)),
+        )
+
+    return step_with_rule(tolerances, constants, state, h)
 
 
 def _make_diffrax_step(
@@ -399,6 +465,6 @@ def sample_phase(
     The first sample is `start_state` and the last is the state after `duration`, s. The absolute
     tolerance is multiplied by `state_units`.
     """
-    phase, tableau = _make_phase(vector_field, options, state_units)
+    phase, tableau = _make_phase(vector_field, options, state_units, controls_tangents=True)
     lengths = divide_equally(duration, n_samples)
     return sample_batch_phase(phase, tableau, (), (start_state,), lengths, options)[:, 0]

@@ -210,7 +210,9 @@ def compute_jacobian_columns(
     differentiate = lambda tangents: jax.jvp(
         evaluate_at_selected_leaves, selected_leaves, tangents, has_aux=True
     )
-    differentiate_in_directions = jax.vmap(differentiate, out_axes=(None, 0, None))
+    differentiate_in_directions = jax.vmap(
+        differentiate, out_axes=(None, 0, None), axis_name=_DIRECTIONS_AXIS
+    )
     if not n_directions_at_once or n_vectors <= n_directions_at_once:
         float_outputs, jacobian_columns, nonfloat_outputs = differentiate_in_directions(
             unit_tangents
@@ -240,6 +242,20 @@ def _apply_columns(columns: PyTree, tangents: Sequence[Array]) -> PyTree:
     return jax.tree.map(
         lambda x: jnp.sum(x * weights.reshape(-1, *(1,) * (x.ndim - 1)), 0, x.dtype), columns
     )
+
+
+_DIRECTIONS_AXIS = "directions"
+
+
+def find_maximum_over_directions(x: Array) -> Array:
+    """Return the maximum over all directions that `compute_jacobian_columns` computes together.
+
+    A JVP rule may use it for a value. Elsewhere, directions are unknown, and the result is zero.
+    """
+    try:
+        return jnp.max(lax.all_gather(x, _DIRECTIONS_AXIS), axis=0)
+    except NameError:  # The axis does not exist.
+        return jnp.zeros_like(x)
 
 
 ExecutionWrapper = Callable[[BatchFunction, int], BatchFunction]

@@ -74,9 +74,11 @@ def wrap_with_saved_trace(
     def evaluate_saved_trace(*arguments: Any) -> Any:
         if _is_exporting_trace.get() or not store.find_cache_folder():
             return traced_function(*arguments)
-        return _load_or_export_trace(traced_function, arguments, find_key).call(
-            *jax.tree.leaves(arguments)
-        )
+        try:
+            trace = _load_or_export_trace(traced_function, arguments, find_key)
+        except NotImplementedError:  # JAX cannot export a function that calls back into Python.
+            return traced_function(*arguments)
+        return trace.call(*jax.tree.leaves(arguments))
 
     return evaluate_saved_trace
 
