@@ -84,7 +84,7 @@ The value is chosen because a ratio near 1 would cut off regular elements.
 
 def integrate_batch_phase(
     make_phase: MakeBatchPhase,
-    phase_constants: Any,
+    equation_constants: Any,
     held_constants: Vector,
     tableau: ButcherTableau,
     q: Vector,
@@ -96,8 +96,8 @@ def integrate_batch_phase(
 ) -> PhaseEnd:
     """Return the end of a phase that begins at positions `q` and rates `v`, for each batch element.
 
-    - `make_phase`: function that returns the phase for `phase_constants` and `held_constants`;
-    - `phase_constants`, `held_constants`: constants of the equations, see
+    - `make_phase`: function that returns the phase for `equation_constants` and `held_constants`;
+    - `equation_constants`, `held_constants`: constants of the equations, see
       `solver_steps.MakeBatchPhase`;
     - `tableau`: tableau of the Runge-Kutta method;
     - `q`, `v`: tuples of arrays (batch,), one array per coordinate;
@@ -110,14 +110,14 @@ def integrate_batch_phase(
     that take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. Their
     integration stops early, and the caller integrates them again in a batch of stragglers.
 
-    The result is differentiable with respect to `phase_constants`, `held_constants`, `q` and `v`,
-    see `tangents`.
+    The result is differentiable with respect to `equation_constants`, `held_constants`, `q` and
+    `v`, see `tangents`.
     """
 
     def integrate(
-        phase_tangents: Any, phase_constants: Any, held_constants: Vector, *arguments: Any
+        phase_tangents: Any, equation_constants: Any, held_constants: Vector, *arguments: Any
     ) -> tuple[PhaseEnd, Any]:
-        phase = make_phase(phase_constants, held_constants)
+        phase = make_phase(equation_constants, held_constants)
         return integrate_to_event(phase, phase_tangents, tableau, *arguments)
 
     integrate_with_rule = jax.custom_jvp(lambda *arguments: integrate(None, *arguments)[0])
@@ -126,10 +126,10 @@ def integrate_batch_phase(
     @lanes.with_default_jax_settings
     def compute_integration_jvp(primals: tuple, state_tangents: tuple) -> tuple[PhaseEnd, PhaseEnd]:
         def integrate_with_tangents(primals: tuple, directions: tuple) -> tuple[PhaseEnd, Any]:
-            phase_constants_tangents, held_constants, q, v = directions
+            equation_constants_tangents, held_constants, q, v = directions
             start_tangents = stack_directions((*q, *v, *held_constants))
             phase_tangents = PhaseTangents(
-                make_phase, primals[0], primals[1], phase_constants_tangents, start_tangents
+                make_phase, primals[0], primals[1], equation_constants_tangents, start_tangents
             )
             phase_end, search_end = integrate(phase_tangents, *primals)
             end_tangents = compute_phase_end_jvp(tableau, phase_tangents, phase_end, search_end)
@@ -154,7 +154,7 @@ def integrate_batch_phase(
         )
 
     return integrate_with_rule(
-        phase_constants, held_constants, q, v, is_active, initial_dt, options, straggler_count
+        equation_constants, held_constants, q, v, is_active, initial_dt, options, straggler_count
     )
 
 

@@ -395,7 +395,9 @@ def compute_margin_minima_jvp(
     no first-order effect. `start_state` and `end_state` are the states at the start and at the end
     of the phase, and `end_tangents` are the tangents of the end state.
     """
-    phase = phase_tangents.make_phase(phase_tangents.phase_constants, phase_tangents.held_constants)
+    phase = phase_tangents.make_phase(
+        phase_tangents.equation_constants, phase_tangents.held_constants
+    )
     phase_and_solver = phase, solver_step_function, phase_tangents
     evaluate_margins = lambda phase, state: jnp.stack(phase.evaluate_margins(state))
     compute_margin_tangents = functools.partial(phase_tangents.evaluate_tangents, evaluate_margins)

@@ -40,8 +40,8 @@ def stack_directions(directions: Vector) -> Array:
 @functools.partial(jax.jit, static_argnums=0)
 def _compute_stage_jacobians(
     make_phase: MakeBatchPhase,
-    phase_constants: Any,
-    phase_constants_directions: Any,
+    equation_constants: Any,
+    equation_constants_directions: Any,
     held_constants: Vector,
     stage_states: list[StageState],
 ) -> tuple[Array, Array]:
@@ -62,7 +62,7 @@ def _compute_stage_jacobians(
             state_components[n : 2 * n],
             StageAccelerations(sin, cos, tuple(accelerations)),
         )
-        implicit_dynamics = make_phase(phase_constants, held_constants).implicit_dynamics
+        implicit_dynamics = make_phase(equation_constants, held_constants).implicit_dynamics
         implicit_dynamics = ImplicitDynamics(*[jax.jit(f) for f in implicit_dynamics])
         evaluate_residual = lambda *constants: make_phase(
             *constants
@@ -70,8 +70,8 @@ def _compute_stage_jacobians(
         compute_acceleration_derivative = lambda *tangent: _solve_acceleration(
             implicit_dynamics, stage_state, jax.jvp(evaluate_residual, *tangent)[1]
         )
-        zero_phase_constants, zero_held_constants, zero_accelerations = jax.tree.map(
-            jnp.zeros_like, (phase_constants, held_constants, tuple(accelerations))
+        zero_equation_constants, zero_held_constants, zero_accelerations = jax.tree.map(
+            jnp.zeros_like, (equation_constants, held_constants, tuple(accelerations))
         )
         jacobian_columns = []
         for unit_vector in _make_unit_vectors((*stage_state.q, *stage_state.v)):
@@ -89,17 +89,18 @@ def _compute_stage_jacobians(
             )
         jacobian_columns += [
             compute_acceleration_derivative(
-                (phase_constants, held_constants), (zero_phase_constants, unit_vector)
+                (equation_constants, held_constants), (zero_equation_constants, unit_vector)
             )
             for unit_vector in _make_unit_vectors(held_constants)
         ]
-        differentiate_by_phase_constants = lambda phase_constants_direction: (
+        differentiate_by_equation_constants = lambda equation_constants_direction: (
             compute_acceleration_derivative(
-                (phase_constants, held_constants), (phase_constants_direction, zero_held_constants)
+                (equation_constants, held_constants),
+                (equation_constants_direction, zero_held_constants),
             )
         )
         return jnp.stack(jacobian_columns, 1), map_directions(
-            differentiate_by_phase_constants, phase_constants_directions, is_unrolled=True
+            differentiate_by_equation_constants, equation_constants_directions, is_unrolled=True
         )
 
     return lax.map(
@@ -137,7 +138,7 @@ def _solve_acceleration(
 def _propagate_tangents(
     tableau: ButcherTableau,
     state_jacobians: Array,
-    phase_constants_tangents: Array,
+    equation_constants_tangents: Array,
     start_tangents: Array,
     h: Array,
 ) -> Array:
@@ -148,7 +149,7 @@ def _propagate_tangents(
     n = state_jacobians.shape[1]
 
     def propagate_tangent_direction(tangent_direction: tuple[Array, Array]) -> Array:
-        phase_constants_tangent, start_tangent = tangent_direction
+        equation_constants_tangent, start_tangent = tangent_direction
         start_position_tangents = tuple(start_tangent[:n])
         start_rate_tangents = tuple(start_tangent[n : 2 * n])
         held_constants_tangents = tuple(start_tangent[2 * n :])
@@ -160,7 +161,7 @@ def _propagate_tangents(
                 functools.reduce(
                     lax.add,
                     map(lax.mul, state_jacobians[i, coordinate_index], state_tangents),
-                    phase_constants_tangent[i, coordinate_index],
+                    equation_constants_tangent[i, coordinate_index],
                 )
                 for coordinate_index in range(n)
             ]
@@ -172,7 +173,7 @@ def _propagate_tangents(
 
     return map_directions(
         propagate_tangent_direction,
-        (jnp.moveaxis(phase_constants_tangents, 1, 0), start_tangents),
+        (jnp.moveaxis(equation_constants_tangents, 1, 0), start_tangents),
     )
 
 
@@ -180,9 +181,9 @@ class PhaseTangents(NamedTuple):
     """Tangents of the start state, of the constants and of the held constants of a phase."""
 
     make_phase: MakeBatchPhase
-    phase_constants: Any
+    equation_constants: Any
     held_constants: Vector
-    phase_constants_tangents: Any  # tree of the constants, directions first
+    equation_constants_tangents: Any  # tree of the constants, directions first
     # tangents of positions, rates, held constants, (directions, components, batch)
     start_tangents: Array
 
@@ -206,8 +207,8 @@ class PhaseTangents(NamedTuple):
         """
         stage_jacobians = _compute_stage_jacobians(
             self.make_phase,
-            self.phase_constants,
-            self.phase_constants_tangents,
+            self.equation_constants,
+            self.equation_constants_tangents,
             self.held_constants,
             stage_states,
         )
@@ -225,7 +226,7 @@ class PhaseTangents(NamedTuple):
         directions: Array,
     ) -> tuple[Array, Array]:
         """Return the time derivative of a function, and the result of `evaluate_tangents`."""
-        phase = self.make_phase(self.phase_constants, self.held_constants)
+        phase = self.make_phase(self.equation_constants, self.held_constants)
         _, (rate,) = phase.evaluate_with_rates(
             lambda state: (evaluate_function(phase, state),), state
         )
@@ -243,17 +244,17 @@ class PhaseTangents(NamedTuple):
         """
 
         def evaluate_for_constants(
-            phase_constants: Any, held_constants: Vector, q: Vector, v: Vector
+            equation_constants: Any, held_constants: Vector, q: Vector, v: Vector
         ) -> Any:
-            phase = self.make_phase(phase_constants, held_constants)
+            phase = self.make_phase(equation_constants, held_constants)
             return evaluate_function(phase, phase.make_state(q, v))
 
         n, direction_components = len(state.q), tuple(jnp.moveaxis(directions, 1, 0))
         return compute_each_jvp(
             evaluate_for_constants,
-            (self.phase_constants, self.held_constants, state.q, state.v),
+            (self.equation_constants, self.held_constants, state.q, state.v),
             (
-                self.phase_constants_tangents,
+                self.equation_constants_tangents,
                 direction_components[2 * n :],
                 direction_components[:n],
                 direction_components[n : 2 * n],

@@ -414,7 +414,7 @@ class IntervalTangents(NamedTuple):
     """Tangents of an interval between two events, with the methods of `flow.PhaseTangents`."""
 
     make_phase: Callable[[Any, Array], BatchPhase]  # for constants and rows of quantities
-    phase_constants: Any  # floating-point arrays of the dynamics
+    equation_constants: Any  # floating-point arrays of the dynamics
     push_to_constants: Callable[[Array], Any]  # from tangents of columns to those of the constants
     tangents: TangentBatch
     start_tangents: Array  # tangents of coordinates, rates and losses, (tangents, rows, batch)
@@ -423,7 +423,7 @@ class IntervalTangents(NamedTuple):
     @property
     def zero_constants_tangent(self) -> Any:
         """Return the tangent of constants that do not vary."""
-        return jax.tree.map(jnp.zeros_like, self.phase_constants)
+        return jax.tree.map(jnp.zeros_like, self.equation_constants)
 
     def linearize(
         self, function: Callable[[BatchPhase, StageState], Array], q: Any, v: Any, rows: Array
@@ -433,11 +433,11 @@ class IntervalTangents(NamedTuple):
         - `rows`: rows of `ContactQuantities` at the state, which are not computed again.
         """
 
-        def evaluate(phase_constants: Any, q: Array, v: Array) -> Array:
-            phase = self.make_phase(phase_constants, rows)
+        def evaluate(equation_constants: Any, q: Array, v: Array) -> Array:
+            phase = self.make_phase(equation_constants, rows)
             return function(phase, phase.make_state(q, v))
 
-        return jax.linearize(evaluate, self.phase_constants, q, v)[1]
+        return jax.linearize(evaluate, self.equation_constants, q, v)[1]
 
     def propagate_to_step_end(
         self,

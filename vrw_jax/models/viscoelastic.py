@@ -251,10 +251,9 @@ def _compile_step(model: ViscoelasticWheel, engine: str, records_margins: bool) 
     """
 
     def take_element_step(params: WheelParams, x: SectionState, options: StepOptions) -> Any:
-        """Compute a step of one wheel.
+        """Compute a step of one wheel by the engine "diffrax", or higher derivatives of any engine.
 
-        If the batch kernel is the engine, this function is used only for second and higher
-        derivatives. The results still report the name of the batch kernel's engine.
+        The results report the name of the requested engine.
         """
         phase_sequence = model._run_phases(params, x, options, records_margins)
         return (
