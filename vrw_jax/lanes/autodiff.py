@@ -123,6 +123,8 @@ def differentiate(
 ) -> Callable:
     """Return a function of trees of arrays with derivatives in every mode, to any order.
 
+    Without a derivative, the result only calls the compiled `function`.
+
     - `reference`: function with the same result, from which derivatives are computed;
     - `make_column_function`: function of the structure of the arguments and of `argnums`, numbers
       of leaves. It returns a function of all leaves, whose results are those of

@@ -288,7 +288,7 @@ class AbstractPhase(abc.ABC):
 
     @property
     def n_kinks(self) -> int:
-        """Return the number of kinks of the forces of all legs with a force."""
+        """Return the number of kinks of the forces of all legs; 0 for the law of the paper."""
         return len(self.legs_with_force) * count_kinks(self.s.leg_force)
 
     def compute_margins(self, phase_instant: "PhaseInstant") -> Vector:
