@@ -4,6 +4,7 @@ As a program the module makes all calls in a process without the annotation chec
 prints {name: [error type, message, file that raised it]}.
 """
 
+import dataclasses
 import functools
 import json
 import math
@@ -651,6 +652,20 @@ def register_wrong_calls() -> None:
             f"a step of a HybridSystem with {name}",
             lambda c=changes: make_drop(**c).step({}, [1.0, 0.0]), "ValueError", words,
         )  # fmt: skip
+    add_wrong_call(
+        "invariants of a HybridSystem by name",
+        lambda: dataclasses.replace(make_drop(), invariants={"energy": lambda y, p: y[0]}),
+        "TypeError", "give a tuple of functions",
+    )  # fmt: skip
+    add_wrong_call(
+        "a domain without an upper bound",
+        lambda: vrw.parameter(1.0, domain=(0.0, None)), "TypeError", "math.inf",
+    )  # fmt: skip
+    add_wrong_call(
+        "laws of the legs of an own walker",
+        lambda: vrw.compare_laws({"period": [1.0], "period_error": [0.1]}, {"gravity": 9.81}),
+        "TypeError", "vrw.WheelParams",
+    )  # fmt: skip
     add_wrong_call(
         "a step of a HybridSystem from single numbers",
         lambda: make_drop().step({}, np.ones(2, np.float32)), "ValueError", "np.asarray(x, float)",

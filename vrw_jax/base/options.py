@@ -92,7 +92,13 @@ def parameter(
         >>> QuadraticDamper().c2
         60.0
     """
-    lower_bound, upper_bound = domain
+    try:
+        lower_bound, upper_bound = map(float, domain)
+    except (TypeError, ValueError):
+        raise TypeError(
+            f"domain is {domain!r}, but it is a lower and an upper bound: give two numbers, and "
+            "math.inf where there is no bound."
+        ) from None
     parameter_domain = ParameterDomain(
         symbol, unit, lower_bound, upper_bound, meaning, lower_bound > -math.inf
     )

@@ -262,7 +262,7 @@ def name_missing_parameters(params: Any) -> Iterator[None]:
             raise
         raise ValueError(
             f"a function of the walker reads {missing}, but params is a {kind}, which contains "
-            f"{', '.join(names)}: add it to params, or correct the function."
+            f"{', '.join(names) or 'nothing'}: add it to params, or correct the function."
         ) from error
 
 

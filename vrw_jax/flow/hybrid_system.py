@@ -144,6 +144,9 @@ class HybridSystem(AbstractWalker):
                 if guard.target_mode is not None:
                     require_known_name(guard.target_mode, tuple(self.modes), "mode")
         require_known_name(self.section, tuple(self.guard_names), "guard")
+        check_type("invariants", self.invariants, Sequence, "give a tuple of functions")
+        for invariant in self.invariants:
+            check_callable("an invariant", invariant, "of state and parameters")
         for name in self.ground:
             require_known_name(name, ("height", "slope"), "property of the ground")
         for measure in self.measures:

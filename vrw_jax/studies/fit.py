@@ -637,7 +637,6 @@ def compare_laws(
         'linear'
     """
     free = check_names("free", free, '"damping", "stiffness"')
-    laws = make_leg_laws(params) | dict(laws or {})
     n_folds = check_int("n_folds", n_folds, 0)
     base_model: Any = resolve_finder(params, model, None).model
     if not hasattr(base_model, "leg_force"):
@@ -645,6 +644,7 @@ def compare_laws(
             f"model is a {type(base_model).__name__}, which has no law of its own for the legs: "
             "give vrw.ViscoelasticWheel()."
         )
+    laws = make_leg_laws(params) | dict(laws or {})
     fits, prediction_errors = {}, []
     for name, law in laws.items():
         law_model = dataclasses.replace(base_model, leg_force=law)
