@@ -99,8 +99,15 @@ def index_by_arrays(x, k):
     )
 
 
+def divide_with_remainder(x, k):
+    divisors = jnp.stack([k - 1, -k, 3 + k])  # 0 and -1 among them
+    floats = jnp.stack([x, 1e6 * x, x - x]) % jnp.stack([0.3 * x, -0.7 * x, x])
+    return lax.rem(7 * k - 9, divisors), k % divisors, floats, jnp.fmod(x, 0.2)
+
+
 FUNCTIONS = (
     call_elementary_functions,
+    divide_with_remainder,
     index_by_arrays,
     halve_until_small,
     sum_by_scan,
@@ -374,7 +381,7 @@ def test_nan_is_an_extreme_entry_and_no_entries_have_a_sum():
 
 
 @pytest.mark.parametrize("has_machine_code", [True, False])
-def test_an_empty_batch_traces_a_function_once(has_machine_code, capsys, monkeypatch):
+def test_an_empty_batch_traces_a_function_once(has_machine_code, capsys, monkeypatch, tmp_path):
     if not has_machine_code:
         disable_machine_code(monkeypatch)
 
@@ -382,9 +389,10 @@ def test_an_empty_batch_traces_a_function_once(has_machine_code, capsys, monkeyp
         print("traced")
         return 2.0 * x
 
-    for _ in range(3):
-        compiled = lanes.compile_batch_function(double)
-        assert compiled.run(np.ones((2, 0), np.float32)).dtype == np.float32
+    with use_cache_folder(tmp_path):
+        for _ in range(3):
+            compiled = lanes.compile_batch_function(double)
+            assert compiled.run(np.ones((2, 0), np.float32)).dtype == np.float32
     assert capsys.readouterr().out.count("traced") == 1
 
 

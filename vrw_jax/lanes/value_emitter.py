@@ -321,6 +321,20 @@ def emit_quotient(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -
     return emit_binary_instruction(f"fdiv {' '.join(flags)}", operation, x, y)
 
 
+def emit_remainder(operation: ElementwiseOperation, x: LlvmValue, y: LlvmValue) -> LlvmValue:
+    """Emit the remainder of x / y, which has the sign of x, and return its LLVM value."""
+    if operation.operand_dtype.kind == "f":
+        return emit_binary_instruction("frem", operation, x, y)
+    # A division by zero, or of the least integer by -1, would stop the process.
+    x, y = operation.value_emitter.to_scalars_or_vectors(x, y)
+    builder, emit_constant = operation.llvm_builder, operation.value_emitter.make_llvm_constant
+    zero, one, minus_one = (emit_constant(y.type, number) for number in (0, 1, -1))
+    is_zero = builder.emit_comparison("icmp eq", y, zero)
+    is_minus_one = builder.emit_comparison("icmp eq", y, minus_one)
+    divisor = builder.select(is_zero, one, builder.select(is_minus_one, one, y))
+    return builder.select(is_zero, x, builder.emit_binary("srem", x, divisor))
+
+
 def emit_integer_power(operation: ElementwiseOperation, x: LlvmValue) -> LlvmValue:
     """Emit the power of `x` with a constant integer exponent by repeated squaring, and return its
     LLVM value.
@@ -547,6 +561,7 @@ ELEMENTWISE_RULES: dict[str, ElementwiseRule] = {
     "neg": emit_negative,
     "not": lambda operation, x: operation.llvm_builder.not_(x),
     "or": partial(emit_binary_instruction, "or"),
+    "rem": emit_remainder,
     "select_n": emit_select,
     "shift_left": partial(emit_binary_instruction, "shl"),
     "shift_right_arithmetic": partial(emit_binary_instruction, "ashr"),
