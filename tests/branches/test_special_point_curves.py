@@ -292,6 +292,19 @@ def test_branches_turn_back_at_the_meeting_of_a_margin_and_a_fold(step_margin_cu
         assert abs(fold - stiffness) < 1e-9
 
 
+@pytest.mark.slow
+def test_a_curve_begins_at_a_fold_where_the_search_finds_no_gait(table_1_cycle):
+    """At a fixed parameter, Newton's method is singular at a fold."""
+    curve = vrw.continue_special_point("fold", CURVE_PARAMETERS, table_1_cycle, bounds=CURVE_BOX)
+    damping, stiffness = curve.values[1]
+    assert damping < 100.0
+    before = vrw.WheelParams(damping=damping, stiffness=stiffness - 10.0)
+    branch = vrw.continue_branch(before, "stiffness", (stiffness - 20.0, stiffness + 20.0))
+    (fold,) = [point for point in branch.special_points if point.name == "fold"]
+    assert abs(fold.value - stiffness) < 1e-8
+    assert not fold.cycle.found
+
+
 class FoldCircle(vrw.AbstractWalker):
     """Its folds are at a^2 + c^2 = 1/4."""
 

@@ -138,6 +138,18 @@ class BranchWheel(NamedTuple):
     is_phase_active: Any = ()
 
 
+@dataclass(frozen=True)
+class GaitSearch:
+    """Search for the gait at a point of a branch, near `guess`, which can be pickled."""
+
+    finder: Any
+    values: np.ndarray  # values of the parameters of the model
+    guess: Any
+
+    def __call__(self) -> Any:
+        return self.finder.find_cycle_from_values(*jax.device_put((self.values, self.guess)))
+
+
 def make_walker(model: Any, values: Any, n_legs: int) -> tuple[Any, Any]:
     """Return a walker, of a user or a wheel, and its parameters with the given values."""
     model, params = model.from_parameter_values(values, n_legs)
@@ -192,9 +204,7 @@ class AbstractGaitProblem(AbstractContinuationProblem):
         return z
 
     def make_point_reader(self, wheel: BranchWheel, point: ContinuationPoint) -> Callable:
-        # A partial call can be pickled.
-        return functools.partial(
-            _find_cycle,
+        return GaitSearch(
             self.make_finder(),
             self.replace_parameters(wheel, point.p),
             self.make_guess(wheel, point.z),
@@ -417,10 +427,6 @@ class CollocationProblem(AbstractGaitProblem):
                 evaluate, POINT_BATCH_SIZES, values, z, states
             )
         return states, quantities
-
-
-def _find_cycle(finder: Any, values: np.ndarray, guess: Any) -> Any:
-    return finder.find_cycle_from_values(*jax.device_put((values, guess)))
 
 
 @eqx.filter_jit

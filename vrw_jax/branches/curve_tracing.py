@@ -147,15 +147,14 @@ class CurveTracer(NamedTuple):
         for special_point in itertools.chain(*(branch.special_points for branch in branches)):
             if not can_continue_special_point(special_point.name):
                 continue
-            cycle = special_point.cycle
-            parameters, state = jax.tree.map(
-                np.asarray, (cycle.parameters, cycle.collocation_state)
-            )
-            wheel, z = BranchWheel(parameters, state.is_phase_active), state.solution
+            # Newton's method at a fixed parameter may miss the gait, such as at a fold.
+            search: Any = special_point.find_cycle
+            parameters, z = search.values, search.guess.solution
+            wheel = BranchWheel(parameters, search.guess.is_phase_active)
             name = choose_continued_special_point_name(special_point.name, wheel, z)
             indices = map(self.model.parameter_names.index, self.parameter_names)
             values = tuple(float(parameters[index]) for index in indices)
-            seeds.append(CurveSeed(name, values, cycle.system, wheel, z))
+            seeds.append(CurveSeed(name, values, search.finder.collocation_system, wheel, z))
         return seeds
 
     def trace_curves(
