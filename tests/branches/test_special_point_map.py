@@ -83,6 +83,7 @@ def test_samples_with_too_coarse_a_mesh_do_not_count_as_missing_gaits():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("error:Polyfit")  # no singular fit at a stalled end
 def test_each_sign_change_of_a_scan_is_near_a_curve():
     grid = vrw.grid(damping=np.linspace(4.0, 240.0, 60), stiffness=np.linspace(350.0, 700.0, 36))
     scan = vrw.scan(grid, ["dls_fraction", *SPECIAL_POINT_MEASURES])

@@ -376,11 +376,15 @@ class _SpecialPointLocator(NamedTuple):
             index = int(last[-1])
             for name, values in self.table.tests.items():
                 test, margin = self.continuation.find_test_function(name), values[last]
-                if test is None or test.kind != BORDER_COLLISION or not margin[-1] > 0.0:
+                if test is None or test.kind != BORDER_COLLISION:
                     continue
-                # The parameter is a quadratic polynomial of the margin, evaluated at zero.
-                root = float(np.polyval(np.polyfit(margin, p[last] - p[index], 2), 0.0))
-                if margin[-1] < margin[-2] < margin[0] and abs(root) <= max_distance:
+                if not 0.0 < margin[-1] < margin[-2] < margin[0]:
+                    continue
+                # The parameter is a quadratic polynomial of the margin, evaluated at zero. A fit to
+                # large and nearly equal margins, instead of their differences, is singular.
+                fit = np.polyfit(margin - margin[-1], p[last] - p[index], 2)
+                root = float(np.polyval(fit, -margin[-1]))
+                if abs(root) <= max_distance:
                     located_ends[owner, end] = Root.of_test(
                         (index, index), name, name, **self._locate_at(index, root)
                     )
