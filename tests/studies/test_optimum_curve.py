@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.leg_laws import QuadraticDamper, make_wheel
+from support.walkers import BALL_PARAMS, JuggledBall
 
 import vrw_jax as vrw
 
@@ -57,6 +58,19 @@ def test_optima_along_a_parameter_of_the_law_are_gaits_with_the_law():
         wheel = vrw.WheelParams(damping=float(damping))
         gait = vrw.limit_cycle(wheel, model=make_wheel(QuadraticDamper(float(c2))))
         assert float(gait.speed) == pytest.approx(float(speed), abs=1e-9)
+
+
+def test_a_limit_changes_on_the_way_there_and_on_the_way_back():
+    """The velocity k / (1 - e) reaches 2 m/s at e = 1/2, with the largest k of 1 m/s."""
+    curve = vrw.tune(
+        BALL_PARAMS, "velocity", ["kick"], {"kick": (0.5, 1.0)}, {"velocity": (None, 2.0)},
+        model=JuggledBall(), along=("ball.restitution", (0.4, 0.6, 0.4)),
+    )  # fmt: skip
+    # A limit within 1e-5 of its change between the bounds counts as active.
+    np.testing.assert_allclose(curve.dataset.kick, [1.0, 0.8, 1.0], atol=1e-5)
+    np.testing.assert_allclose([change.value for change in curve.changes], 0.5, atol=1e-5)
+    assert curve.changes[0].before == curve.changes[-1].after == ("kick at its upper bound",)
+    assert ("velocity",) in [change.after for change in curve.changes]
 
 
 def test_arguments_of_a_curve_are_refused_in_one_sentence():

@@ -495,7 +495,7 @@ def follow_optimum(
             f"{failures[-1]} Give other bounds or constraints, or a better start."
         )
     optima, changes = [first], []
-    accuracy = CHANGE_LOCATION_ACCURACY * abs(float(values[-1]) - float(values[0]))
+    accuracy = CHANGE_LOCATION_ACCURACY * float(np.ptp(values))
 
     def locate_changes(left: _Optimum, right: _Optimum) -> list[ActiveSetChange]:
         if left.active == right.active:
