@@ -447,6 +447,7 @@ def test_every_start_is_in_the_basin_of_a_stable_gait(walker):
     basin = vrw.basin(BALL_PARAMS, {"velocity": [0.5, 1.0, 5.0]}, model=walker)
     assert basin.attractor.values.tolist() == [0, 0, 0]
     np.testing.assert_allclose(basin.orbit_state.values[0, 0], [2.0], atol=1e-6)
+    assert basin.attrs["starts"] == "on the section"
 
 
 def test_a_scan_has_the_closed_form_and_its_derivatives_and_knows_the_code(tmp_path):

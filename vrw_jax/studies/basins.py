@@ -170,7 +170,9 @@ def basin(
     basin_attributes = {
         "title": "Basins of attraction",
         "most_steps": max_steps,
-        "starts": "after landing"
+        "starts": "on the section"
+        if own_walker is not None
+        else "after landing"
         if start_component_names == POST_LANDING_COMPONENT_NAMES
         else "before touchdown",
     }
