@@ -335,6 +335,27 @@ def test_a_crossing_branch_is_continued_to_both_sides(function, expected):
     assert branch.ends == ("The parameter's range ended.",) * 2
 
 
+def test_a_doubling_of_a_switched_branch_doubles_its_period_again():
+    """x -> a - x² doubles its period at 3/4, at 5/4, and at 1.3680989394 (Feigenbaum's cascade)."""
+    follow = lambda **keywords: vrw.continue_map(
+        lambda _, x, a: a - x**2, [0.5], 0.75 - 1e-3, (0.5, 1.39), **keywords
+    )
+    branch = follow()
+    for value, period_n in ((0.75, 2), (1.25, 4), (1.3680989394, 8)):
+        (doubling,) = [x for x in branch.special_points if x.kind == "period_doubling"]
+        assert abs(doubling.value - value) < 1e-9
+        branch = follow(switch_at=doubling)
+        assert branch.period_n == period_n
+        assert branch.stable[0]
+        x = orbit = branch.section_states[-1]
+        distances = []
+        for _ in range(period_n):
+            x = branch.values[-1] - x**2
+            distances.append(float(np.abs(x - orbit)[0]))
+        assert distances[-1] < 1e-8
+        assert min(distances[:-1]) > 1e-4
+
+
 def test_a_component_that_is_only_round_off_does_not_set_its_unit():
     noisy = lambda _, x, r: jnp.stack(
         [evaluate_logistic(_, x[0], r), 0.5 * x[1] + jnp.cos(x[0]) ** 2 + jnp.sin(x[0]) ** 2 - 1.0]

@@ -202,7 +202,8 @@ class SpecialPoint:
     - `point`: fixed point next to the special point, on the side that belongs to the branch;
     - `ends_branch`: whether the branch ends at the special point;
     - `find_cycle`: function that finds the gait at the special point, for the property `cycle`;
-    - `n_multipliers`: number of multipliers that cross the unit circle, 0 for other kinds.
+    - `n_multipliers`: number of multipliers that cross the unit circle, 0 for other kinds;
+    - `period_n`: number of steps after which the gaits of the branch repeat.
 
     Examples:
         >>> logistic = lambda _, x, r: r * x * (1.0 - x)
@@ -218,6 +219,7 @@ class SpecialPoint:
     ends_branch: bool
     find_cycle: Callable[[], Any] | None = field(default=None, repr=False, compare=False)
     n_multipliers: int = 0
+    period_n: int = 1
 
     @functools.cached_property
     def cycle(self) -> Any:

@@ -251,8 +251,9 @@ def continue_branch(
             distance to a guard. Their minima over the gait are measures of the branch.
         measures: measures of your own, see `vrw.measure`, for the dataset of the branch. For a
             walker of yours, also names of its measures.
-        switch_at: a branch point or period doubling of the branch through `params`. The branch that
-            crosses there is continued to both sides, or that of gaits of twice the period.
+        switch_at: a branch point or period doubling of the branch through `params`, or of one that
+            was switched to. The branch that crosses there is continued to both sides, or that of
+            gaits of twice its period.
 
     Returns:
         A `Branch`. If there is no gait from which to start, `outcome` is the reason.
@@ -356,14 +357,14 @@ def continue_branches(
         "measures_force_peaks": force_peaks,
         "own_measures": select_measures(measures, ()),
     }
-    n_wheels = _check_branches(params, cycle, cycle_options, **problem_fields)
+    known = cycle if switch_at is None else switch_at
+    n_wheels = _check_branches(params, known, cycle_options, **problem_fields)
     limits, options = np.array(check_range("bounds", bounds)), check_arclength_options(options)
     if n_wheels == 0:
         return ()
     crossing: Any = ()
     if switch_at is not None:
-        n_periods, tangent = parse_switch_point(switch_at, 1.0, limits)
-        problem_fields["period_n"], crossing = n_periods * period_n, (tangent, n_periods > 1)
+        problem_fields["period_n"], crossing = parse_switch_point(switch_at, 1.0, limits)
         if n_wheels > 1:
             raise ValueError("switch_at is for one wheel, but the batch has more: give one wheel.")
         cycle = select_rows_on_device(switch_at.cycle, None)

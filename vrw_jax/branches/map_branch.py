@@ -132,7 +132,8 @@ def make_branch(
         dataset_attributes,
     )
     ends = data.end_reasons
-    return Branch(name, dataset, data.special_points, ends, outcome, params, period_n)
+    points = tuple(dataclasses.replace(x, period_n=period_n) for x in data.special_points)
+    return Branch(name, dataset, points, ends, outcome, params, period_n)
 
 
 @announce_wait("the map and its derivatives", "10 s")
@@ -166,9 +167,9 @@ def continue_map(
             are measured. By default, the unit of a component is its size at the start, or the size
             of its change within the bounds if it is larger.
         options: `ArclengthOptions` of the branch.
-        switch_at: a branch point or period doubling of the branch through (x, p), at which the
-            other branch begins: that which crosses there, to both sides, or that of the second
-            iterate.
+        switch_at: a branch point or period doubling of the branch through (x, p), or of one that
+            was switched to, at which the other branch begins: that which crosses there, to both
+            sides, or that of twice the number of iterates.
 
     Returns:
         A `Branch`: the fixed points, their stability, the special points, and why the branch ends.
@@ -202,9 +203,11 @@ SWITCHED_KINDS = {BRANCH_POINT: 1, PERIOD_DOUBLING: 2}
 """Numbers of iterates of the map whose fixed points cross the branch, by the kind of the point."""
 
 
-def parse_switch_point(switch_at: SpecialPoint, units: Any, limits: Any) -> tuple[int, np.ndarray]:
-    """Return how many periods of the known branch a period of the switched branch has, and the
-    tangent of the known branch in the coordinates of arc length.
+def parse_switch_point(
+    switch_at: SpecialPoint, units: Any, limits: Any
+) -> tuple[int, tuple[np.ndarray, bool]]:
+    """Return the period of the switched branch, the tangent of the known branch in the coordinates
+    of arc length, and whether the known branch has half the period.
     """
     check_type("switch_at", switch_at, SpecialPoint, "give one of branch.special_points")
     if switch_at.kind not in SWITCHED_KINDS:
@@ -214,7 +217,8 @@ def parse_switch_point(switch_at: SpecialPoint, units: Any, limits: Any) -> tupl
         )
     tangent = switch_at.point.tangent
     scales = np.append(np.broadcast_to(units, len(tangent) - 1), np.ptp(limits))
-    return SWITCHED_KINDS[switch_at.kind], tangent / scales
+    n = SWITCHED_KINDS[switch_at.kind]
+    return n * switch_at.period_n, (tangent / scales, n > 1)
 
 
 NO_START_TEXT = (
@@ -283,9 +287,8 @@ def trace_fixed_points(
     start, start_p = np.asarray(x), p
     crossing: Any = ()
     if switch_at is not None:
-        n, tangent = parse_switch_point(switch_at, problem.section_units, limits)
-        problem = dataclasses.replace(problem, period_n=n * problem.period_n)
-        crossing = tangent, n > 1
+        period_n, crossing = parse_switch_point(switch_at, problem.section_units, limits)
+        problem = dataclasses.replace(problem, period_n=period_n)
         start, start_p, *_ = switch_at.point
     (data,) = continue_and_locate_special_points(
         Continuation(problem, options, np.array(limits), select_tree_rows(args, None), *crossing),
