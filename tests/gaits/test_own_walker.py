@@ -104,6 +104,22 @@ def test_gaits_far_from_the_starts_are_found_by_walks_everywhere():
     assert tuned.value == pytest.approx(3.0, rel=1e-9)
 
 
+@pytest.mark.parametrize("walker", [JuggledBall(), BALL_SYSTEM], ids=["class", "system"])
+def test_a_batch_has_the_derivatives_of_its_elements_by_one_of_several_parameters(walker):
+    """T = 2 k / (1 - e) / g, where only k is differentiated; the last ball does not fly."""
+    e, kicks = np.array([0.5, 0.6, 0.5]), jnp.array([1.0, 2.0, -1.0])
+
+    def find_periods(kicks):
+        params = {"ball": {"restitution": e}, "kick": kicks}
+        return vrw.limit_cycles(params, model=walker).period
+
+    expected = np.where(kicks > 0.0, 2.0 / (1.0 - e) / GRAVITY, 0.0)
+    for jacobian in (jax.jacfwd, lambda f: jax.jit(jax.jacrev(f))):
+        np.testing.assert_allclose(jacobian(find_periods)(kicks), np.diag(expected), rtol=1e-9)
+    gradient = jax.grad(lambda kicks: find_periods(kicks).sum())(kicks)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-9)
+
+
 def test_starts_may_be_lists_and_belong_to_each_element_of_a_batch():
     class Logistic(vrw.AbstractWalker):
         def advance(self, params, x, options):

@@ -381,7 +381,7 @@ def make_return_map(
 
     def map_section_state(x: Array) -> Array:
         step = walker.advance_checked(params, x, options)
-        return step.section_state * jnp.where(step.outcome == Outcome.STEPPED, 1.0, jnp.nan)
+        return jnp.where(step.outcome == Outcome.STEPPED, step.section_state, jnp.nan)
 
     return map_section_state
 

@@ -329,7 +329,8 @@ def _find_missing_inside_jit(
         starts[rows] = ends
         return starts.reshape(guesses.shape)
 
-    def find_from_walk() -> HybridGait:
+    # The values are operands, because a custom derivative in a branch must not close over them.
+    def find_from_walk(params: Any, guesses: Array, gait: HybridGait) -> HybridGait:
         starts = call_python(
             walk,
             jax.typeof(guesses),
@@ -339,7 +340,8 @@ def _find_missing_inside_jit(
         found = find_gait_from_guesses((walker, period_n), params, starts, options)
         return select_trees_by_condition(found.converged, found, gait)
 
-    return lax.cond(gait.converged, lambda: gait, find_from_walk)
+    keep = lambda params, guesses, gait: gait
+    return lax.cond(gait.converged, keep, find_from_walk, params, guesses, gait)
 
 
 def _check_search(
