@@ -184,7 +184,7 @@ def test_a_mean_combines_few_unilateral_gaits_with_all_gaits_of_the_paper():
 def test_the_mean_of_wheels_that_are_all_computed_has_no_sampling_error():
     has_gait = np.ones(12, bool)
     drawn = (np.array([2.0]), has_gait[:1], np.array([1.9]))
-    assert _estimate_mean(np.full(12, 2.0), has_gait, *drawn) == (2.0, 0.0)
+    assert _estimate_mean(np.full(12, 2.0), has_gait, *drawn, True) == (2.0, 0.0)
 
 
 def test_a_mean_includes_only_wheels_with_a_gait():
@@ -205,3 +205,29 @@ def test_a_mean_includes_only_wheels_with_a_gait():
         assert wrong < (
             mean.error if selection else 1e-4 * tol
         )  # the same answers, summed otherwise
+
+
+@pytest.mark.slow
+def test_errors_of_means_are_as_stated_if_few_wheels_have_no_gait():
+    """Over seeds: about 95 % of the errors are within two standard errors, and few above `tol`.
+
+    The pilot samples of most seeds contain no wheel without a gait.
+    """
+    rng, tol, n_seeds = np.random.default_rng(0), 1e-2, 20
+    random_columns = (
+        rng.uniform(*ends, 150) for ends in ((100.0, 210.0), (420.0, 600.0), (0.27, 0.31))
+    )
+    wheels = vrw.WheelParams(
+        **dict(zip(("damping", "stiffness", "slope"), random_columns, strict=True))
+    )
+    every = vrw.measure_to_tolerance("speed", wheels, 1e-4, friction=15.0)
+    assert 0.9 < np.mean(every.found) < 1.0
+    means = [
+        vrw.multifidelity_mean("speed", wheels, tol, friction=15.0, pilot=12, seed=seed)
+        for seed in range(n_seeds)
+    ]
+    errors = np.array([mean.value for mean in means]) - np.mean(every.value[every.found])
+    assert np.sqrt(np.mean(errors**2)) < tol
+    # Fewer than 16 of 20 have a probability of 0.3 % at a coverage of 95 %.
+    assert np.sum(np.abs(errors) < [mean.error for mean in means]) >= 16
+    assert np.median([mean.n_high_fidelity for mean in means]) < 75

@@ -519,9 +519,11 @@ def multifidelity_mean(
         plans.append((n_drawn * float(n_mean_steps) + cost * n_others, n_drawn, weights, name))
     _, n_drawn, weights, control = min(plans, key=operator.itemgetter(0))
     drawn_results = measure_wheels(other_wheels[:n_drawn])
-    controls = evaluate_control(other_wheels, control) @ weights
-    mean, standard_error = _estimate_mean(*pilot_values, *_zero_missing(drawn_results), controls)
-    results = pilot_results, drawn_results
+    regressors, results = evaluate_control(other_wheels, control), (pilot_results, drawn_results)
+    have_gaits = _have_all_gaits(np.concatenate([x.found for x in results]), regressors)
+    mean, standard_error = _estimate_mean(
+        *pilot_values, *_zero_missing(drawn_results), regressors @ weights, have_gaits
+    )
     gait_error_bounds = np.concatenate([x.error[x.found] for x in results])
     n_steps = float(sum(np.sum(x.n_steps) for x in results))
     return MultifidelityMean(
@@ -600,18 +602,24 @@ def _plan_sampling(
     sum of this quantity over all wheels is zero.
     """
     gait_fraction = float(np.mean(has_gait))
-    centered_values = pilot_values - np.mean(pilot_values) / gait_fraction * has_gait
+    pilot_mean = np.mean(pilot_values) / gait_fraction
+    centered_values = pilot_values - pilot_mean * has_gait
+    # With the mean subtracted, a wheel without a gait in either model needs no weight of the second
+    # column, which a pilot sample without such wheels cannot determine.
+    subtract_mean = np.array([[1.0, 0.0], [-pilot_mean, 1.0]])
+    regressors = regressors @ subtract_mean
     centered_regressors = regressors - np.mean(regressors, axis=0)
     weights, _, rank, _ = np.linalg.lstsq(
         centered_regressors, centered_values, rcond=SINGULAR_VALUE_TOLERANCE
     )
     squared_residuals = float(np.sum((centered_values - centered_regressors @ weights) ** 2))
-    squared_residuals += _compute_unseen_wheel_variance(has_gait, centered_values)
+    if not _have_all_gaits(has_gait, regressors):
+        squared_residuals += float(np.var(centered_values))
     variance = squared_residuals / (len(centered_values) - 1 - int(rank))
     sampling_tolerance = (1.0 - GAIT_ERROR_FRACTION) * tolerance
     n_required = variance * (N_STANDARD_ERRORS / (sampling_tolerance * gait_fraction)) ** 2
     n_drawn = math.ceil(n_required / (1.0 + n_required / n_remaining))
-    return min(n_remaining, max(MIN_PILOT_GAITS, n_drawn)), weights
+    return min(n_remaining, max(MIN_PILOT_GAITS, n_drawn)), subtract_mean @ weights
 
 
 def _estimate_mean(
@@ -620,11 +628,13 @@ def _estimate_mean(
     drawn_values: np.ndarray,
     drawn_has_gait: np.ndarray,
     control_values: np.ndarray,
+    have_gaits: bool,
 ) -> tuple[float, float]:
     """Return the mean of a measure and its standard error.
 
     - `control_values`: weighted control variates of all wheels outside the pilot sample. The drawn
-      wheels come first.
+      wheels come first;
+    - `have_gaits`: whether all wheels have a gait in both models, as far as computed.
     """
     n_remaining, n_drawn = len(control_values), len(drawn_values)
     n_gaits = np.sum(pilot_has_gait) + n_remaining * np.mean(drawn_has_gait)
@@ -635,17 +645,16 @@ def _estimate_mean(
     if n_drawn == n_remaining:  # The gaits of all wheels are computed, perhaps of one only.
         return float(mean), 0.0
     squared_residuals = n_drawn * np.var(differences - mean * drawn_has_gait)
-    squared_residuals += _compute_unseen_wheel_variance(
-        pilot_has_gait, pilot_values - mean * pilot_has_gait
-    )
+    if not have_gaits:
+        squared_residuals += np.var(pilot_values - mean * pilot_has_gait)
     variance = squared_residuals / (n_drawn - 1) / n_drawn * (1.0 - n_drawn / n_remaining)
     return float(mean), float(n_remaining / n_gaits * math.sqrt(variance))
 
 
-def _compute_unseen_wheel_variance(has_gait: np.ndarray, centered_values: np.ndarray) -> float:
-    """Return the variance due to one more wheel whose control variate is wrong.
+def _have_all_gaits(has_gait: np.ndarray, regressors: np.ndarray) -> bool:
+    """Return whether all wheels have a gait in both models, as far as computed.
 
-    A wheel may have a gait in the paper's model and no gait with unilateral contact. A small sample
-    may contain no such wheel. The result is zero if all wheels in the pilot sample have a gait.
+    Otherwise some wheels may have a gait in one model only, so that their control variate is wrong.
+    A small sample may contain no such wheel. The variance of one is therefore added.
     """
-    return 0.0 if np.all(has_gait) else float(np.var(centered_values))
+    return bool(np.all(has_gait) and np.all(regressors[:, 1] == regressors[0, 1]))
