@@ -1,6 +1,7 @@
 """A map shows each curve of special points over the measure, and the points where curves meet."""
 
 import numpy as np
+import pytest
 import xarray as xr
 
 import vrw_jax as vrw
@@ -33,3 +34,44 @@ def test_special_point_curves_and_codimension_two_points_are_drawn_at_their_valu
     (cells,) = axes.collections
     np.testing.assert_array_equal(np.ma.getmaskarray(cells.get_array()), (share > 0.3).T)
     assert axes.get_xlim() == (C[0], C[-1])
+
+
+def make_curve(parameters, *codim2_points):
+    line = xr.Dataset(
+        {"spectral_radius": ("point", [0.5, 0.5])},
+        {"damping": ("point", [60.0, 90.0]), "stiffness": ("point", [420.0, 580.0])},
+    )
+    return vrw.SpecialPointCurve("fold", parameters, line, codim2_points, ("", ""))
+
+
+SCAN = xr.Dataset(
+    {name: (("damping", "stiffness"), np.zeros((5, 4), int)) for name in ("speed", "outcome")},
+    {"damping": C, "stiffness": K},
+)
+
+
+def test_curves_may_have_their_parameters_in_either_order():
+    meeting = Codim2Point("period_doubling", (500.0, 100.0), False)
+    swapped = make_curve(("stiffness", "damping"), meeting)
+    axes = map_figure(SCAN, "speed", [make_curve(("damping", "stiffness")), swapped]).axes[0]
+    first, _, second, _, points = axes.lines
+    np.testing.assert_array_equal(second.get_xydata(), first.get_xydata())
+    np.testing.assert_array_equal(points.get_xydata(), [[100.0, 500.0]])
+
+
+def test_the_legend_names_only_what_is_drawn():
+    figure = map_figure(SCAN, "speed", [make_curve(("damping", "stiffness"))])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["fold"]
+
+
+@pytest.mark.parametrize(
+    ("scan", "curves", "message"),
+    [
+        (SCAN.expand_dims(slope=[0.3]), [], "the scan is over stiffness, damping, slope"),
+        (SCAN.isel(damping=0), [], "the scan is over stiffness, but a map is over two"),
+        (SCAN, [make_curve(("damping", "slope"))], "a curve is over damping and slope, but"),
+    ],
+)
+def test_a_map_of_other_parameters_is_refused_in_one_sentence(scan, curves, message):
+    with pytest.raises(ValueError, match=message):
+        map_figure(scan, "speed", curves)

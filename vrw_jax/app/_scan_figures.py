@@ -645,6 +645,17 @@ def map_figure(
     )
     scan = _take_least_over_legs(scan)
     names = _list_swept_parameters(scan, scan.dims, SWEEPABLE_PARAMETERS)
+    if len(names) != 2:
+        raise ValueError(
+            f"the scan is over {', '.join(names) or 'samples'}, but a map is over two parameters: "
+            "give vrw.scan of a grid of two, or a part of a larger one by scan.sel."
+        )
+    for curve in curves:
+        if set(curve.parameters) != set(names):
+            raise ValueError(
+                f"a curve is over {' and '.join(curve.parameters)}, but the scan is over "
+                f"{' and '.join(names)}: give curves in the parameters of the scan."
+            )
     x, y = curves[0].parameters if curves else names
     scan = scan.sortby([x, y])
     width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
@@ -666,28 +677,34 @@ def map_figure(
         for is_drawn, line_width in ((is_stable, 1.2), (~is_stable, 0.5)):
             # Each piece includes the first point of the next piece. The curve has one legend entry.
             is_drawn_or_next = is_drawn | np.append(False, is_drawn[:-1])
-            points = np.where(is_drawn_or_next[:, None], curve.values, np.nan)
+            points = [np.where(is_drawn_or_next, curve.dataset[name], np.nan) for name in (x, y)]
             label = None
             if is_drawn.any() and curve.name not in labeled:
                 labeled.add(curve.name)
                 label = typeset_greek_symbols(describe_violation(curve.name))
             axes.plot(
-                *points.T,
+                *points,
                 color=color,
                 linestyle=line_style,
                 linewidth=line_width,
                 label=label,
                 path_effects=[Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()],
             )
-    axes.plot(
-        *np.reshape([point.values for curve in curves for point in curve.codim2_points], (-1, 2)).T,
-        "o",
-        color="black",
-        markersize=2.5,
-        markerfacecolor="white",
-        markeredgewidth=0.6,
-        label="two special points at once",
-    )
+    meetings = [
+        dict(zip(curve.parameters, point.values, strict=True))
+        for curve in curves
+        for point in curve.codim2_points
+    ]
+    if meetings:
+        axes.plot(
+            *([meeting[name] for meeting in meetings] for name in (x, y)),
+            "o",
+            color="black",
+            markersize=2.5,
+            markerfacecolor="white",
+            markeredgewidth=0.6,
+            label="two special points at once",
+        )
     axes.set(
         xlabel=format_axis_label(x, dataset=scan),
         ylabel=format_axis_label(y, dataset=scan),
