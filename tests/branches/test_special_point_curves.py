@@ -141,6 +141,7 @@ def test_walkers_with_an_invariant_or_several_steps_double_their_period_on_parab
     a, b = curve.values.T
     np.testing.assert_allclose(a + conserved, evaluate(b), atol=1e-8)
     assert np.ptp(b) == pytest.approx(0.6, abs=1e-8)
+    assert curve.ends == ("The second parameter's range ended.",) * 2
 
 
 CURVE_PARAMETERS = ("damping", "stiffness")

@@ -275,6 +275,11 @@ class GaitCurveProblem(AbstractCurveProblem):
         edge = TestFunction("lost", "The second parameter's range ends.", True)
         return {**self.gaits.test_functions, RANGE_EDGE: edge}
 
+    def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
+        if end_name == RANGE_EDGE:
+            return "The second parameter's range ended."
+        return super().describe_branch_end(end_name, parameter_value)
+
     @property
     def location_unit(self) -> float | None:  # type: ignore[override]
         return self.gaits.location_unit
