@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.files import assert_netcdf_round_trip
 from support.slow_variants import mark_slow
+from support.walkers import JuggledBall
 
 import vrw_jax as vrw
 from vrw_jax import tune
@@ -94,6 +95,20 @@ def find_max_dls_trial(tuned: vrw.TuneResult):
         np.array([float(getattr(tuned.params, n)) for n in FREE_PARAMETERS]) - problem.lower_bounds
     ) / problem.bound_widths
     return problem.evaluate_trial(u, None)
+
+
+def test_an_iterate_just_inside_an_active_constraint_is_not_taken_for_the_optimum():
+    """The velocity 1 / (1 - e) of a ball is at least 2 m/s, so that the least e is 1/2.
+
+    As the velocity is convex, the step from e = 0.501 leaves a slack of 8e-6 m/s.
+    """
+    start = {"ball": {"restitution": 0.501}, "kick": 1.0}
+    tuned = vrw.tune(
+        start, {"velocity": -1.0}, ["ball.restitution"], {"ball.restitution": (0.2, 0.8)},
+        {"velocity": 2.0}, model=JuggledBall(),
+    )  # fmt: skip
+    # The tolerance of the first-order condition, 1e-6, times the change between the bounds.
+    assert tuned.value == pytest.approx(-2.0, abs=1e-6 * 4.0 * 0.6)
 
 
 def test_no_wheel_on_a_grid_around_the_optimum_is_better(max_dls_result):

@@ -437,7 +437,8 @@ class OptimalityConditions(NamedTuple):
     """
 
     price_ranges: np.ndarray  # (n_limits, 2): smallest and largest price that satisfy the condition
-    # residual of the first-order condition, relative to the objective's largest gradient
+    # residual of the first-order condition, with the slacks of limits that have a price, relative
+    # to the objective's largest gradient
     kkt_residual: float
     has_kink: np.ndarray  # whether the gradient jumps: first the objective, then the constraints
 
@@ -490,6 +491,8 @@ def compute_optimality_conditions(
         [np.zeros((n_limits, n_weights)), np.arange(n_limits)[:, None] == limit_indices]
     )
     prices = price_of_limit @ weights_and_prices
+    # A limit has a price only where it has no slack.
+    complementarity = prices[: -2 * n_free] * trial.constraint_slacks / slack_scales
     max_imbalance = np.max(np.abs(imbalance)) + tolerance
     price_ranges = np.zeros((n_limits, 2))
     for limit_index in np.unique(limit_indices):
@@ -508,7 +511,7 @@ def compute_optimality_conditions(
     price_units = gradient_norm / np.r_[slack_scales, np.ones(2 * n_free)]
     return OptimalityConditions(
         price_ranges * price_units[:, None],
-        float(np.linalg.norm(imbalance)),
+        float(np.linalg.norm(np.r_[imbalance, complementarity])),
         np.array([len(pieces) > 1 for pieces in (objective_pieces, *limit_pieces[: -2 * n_free])]),
     )
 
