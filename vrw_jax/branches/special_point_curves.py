@@ -249,9 +249,11 @@ def continue_special_point(
     starts from the gait and varies the first parameter, then the second parameter. The curve is
     continued through turning points, within `bounds` of the two parameters. The default bounds are
     `branches.special_point_curves.DEFAULT_PARAMETER_BOUNDS`. The curve ends when it closes or
-    leaves the bounds, or when the gaits end. Each point is accurate to 1e-9. `codim2_points` are
-    the points at which other special points occur. On the curve of an indicator, the other special
-    points are indicators and bifurcations. On all other curves, they also include margins.
+    leaves the bounds, or when the gaits end. Each point is accurate to 1e-9. The equations are
+    singular at a fold, so that a curve of folds is that of gaits with det(1 - J) = 1e-6, where J is
+    the Jacobian of the return map. `codim2_points` are the points at which other special points
+    occur. On the curve of an indicator, the other special points are indicators and bifurcations.
+    On all other curves, they also include margins.
 
     For a walker of yours, give `model`, its `params`, and `bounds` of both parameters. `name` is
     that of a bifurcation or of one of the `margins`. A margin must be defined on both sides of the
