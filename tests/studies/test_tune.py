@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.files import assert_netcdf_round_trip
 from support.slow_variants import mark_slow
-from support.walkers import JuggledBall
+from support.walkers import BALL_PARAMS, JuggledBall
 
 import vrw_jax as vrw
 from vrw_jax import tune
@@ -367,6 +367,13 @@ def test_many_starts_reach_the_same_optimum(max_dls_result):
     assert walkers.sum() >= 4
     near = many.exploration.max_violations[walkers] < 0.05
     assert np.median(many.exploration.objective[walkers][near]) > 0.7  # of 0.786 after 25 steps
+
+
+def test_with_many_starts_the_start_value_is_still_that_of_the_given_parameters():
+    tuned = vrw.tune(
+        BALL_PARAMS, "velocity", ["kick"], {"kick": (0.5, 1.5)}, model=JuggledBall(), n_starts=3
+    )
+    np.testing.assert_allclose([tuned.start_value, tuned.value], [2.0, 3.0], rtol=1e-9)
 
 
 def test_a_start_without_a_gait_is_refused():

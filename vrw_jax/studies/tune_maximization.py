@@ -566,6 +566,7 @@ class ExplorationResult(NamedTuple):
     """Results of the exploration. Each array has a leading axis over starts."""
 
     normalized_starts: np.ndarray  # (n_starts, n_free_parameters): starts in widths of the bounds
+    start_objective: np.ndarray  # objective at the start; NaN if no gait was found
     normalized_parameters: np.ndarray
     objective: np.ndarray  # objective at the end; NaN if no gait was found
     max_violations: np.ndarray  # largest violation of a constraint, in widths of the bounds
@@ -601,6 +602,7 @@ def explore_starts(
             f"none of {n_starts} starts within the bounds has a gait with a finite objective: "
             "narrow the bounds around wheels that walk, such as WheelParams()."
         )
+    start_objectives = np.where(has_active_gait, current_trials.objective, np.nan)
     slack_scales = np.median(
         compute_slack_scales(current_trials.constraint_slacks, current_trials.slack_jacobian)[
             has_active_gait
@@ -660,6 +662,7 @@ def explore_starts(
     n_evaluations = n_starts * (N_FIRST_ORDER_STEPS + 1)
     return ExplorationResult(
         normalized_starts,
+        start_objectives,
         current_trials.normalized_parameters,
         end_objectives,
         max_violations,

@@ -115,7 +115,7 @@ class TuneResult:
     - `params`: the tuned wheel;
     - `status`: reason why the maximization ended;
     - `objective`, `value`, `start_value`: name of the objective, and its value at the tuned gait
-      and at the start;
+      and at the start, which is NaN if only other starts have a gait;
     - `active`: constraints and bounds that are active, each with its price;
     - `validation`: validation by a walk of ten steps of the tuned wheel;
     - `cycle`: the gait as a LimitCycle, or as a ReturnMapCycle with unilateral contact;
@@ -275,7 +275,9 @@ def make_tune_result(
         status=result.status,
         objective=problem.objective_label,
         value=float(trial.objective),
-        start_value=float(result.evaluated_trials[0].objective),
+        start_value=float(
+            exploration.start_objective[0] if exploration else result.evaluated_trials[0].objective
+        ),
         cycle=gait.cycle,
         step=gait.step,
         active=tuple(active_constraints),
