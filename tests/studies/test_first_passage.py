@@ -61,6 +61,16 @@ def test_rigid_wheels_have_the_published_mean_steps(degrees):
     assert float(passage.error) < 1e-8 * float(passage.mean_steps)
 
 
+def test_passages_of_a_batch_have_the_means_and_sentences_of_their_elements():
+    deviations = np.array([2.0, 4.0])
+    find = lambda sd: vrw.first_passage(BYL, sd * DEGREE, model=RIGID)
+    batch = jax.vmap(find)(deviations)
+    expected = [MEAN_STEPS[sd] for sd in deviations]
+    np.testing.assert_allclose(batch.mean_steps, expected, rtol=1e-6)
+    assert batch.ending.tolist() == ["The error estimate is within the tolerance."] * 2
+    assert "wheels: 2 in shape (2,): 2 CONVERGED" in repr(batch)
+
+
 def test_long_lives_keep_their_digits():
     # 95,369,578 was published, from numbers of 64 bits: 1.8e-6 away from 80 bits.
     passage = vrw.first_passage(BYL, 1.25 * DEGREE, model=RIGID)

@@ -143,6 +143,16 @@ def test_norms_of_an_own_walker_are_those_of_a_geometric_series(ground):
     assert ("s per rad" if ground == "slope" else "s per m") in repr(result)
 
 
+def test_norms_of_a_batch_have_a_printed_line_and_a_sentence_for_each_gait():
+    walker = type("Ball", (JuggledBall,), {"ground": {"slope": "kick"}})()
+    find = lambda kick: vrw.gait_sensitivity(BALL_PARAMS | {"kick": kick}, "period", model=walker)
+    batch = jax.vmap(find)(jnp.array([1.0, -1.0]))
+    np.testing.assert_allclose(batch.norm, [find(1.0).norm, [0.0]], rtol=1e-12)
+    assert batch.ending[0] == "The gait is stable, and the norms are finite."
+    assert "fall back" in batch.ending[1]
+    assert "gaits: 2 in shape (2,): 1 STEPPED, 1 FELL_BACK" in repr(batch)
+
+
 def test_norms_along_a_branch_of_an_own_walker_are_those_of_a_geometric_series():
     """Changes of the period by 2 / g times 1, e, e^2, ... have the norm 2 / g / sqrt(1 - e^2)."""
     walker = type("Ball", (JuggledBall,), {"ground": {"slope": "kick"}})()

@@ -20,7 +20,13 @@ from vrw_jax.base.checks import (
 )
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import NoGaitError, Outcome
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText, StatusCode, describe_step_ending
+from vrw_jax.base.printing import (
+    AbstractPrintable,
+    LabelAndText,
+    StatusCode,
+    describe_step_ending,
+    format_outcome_counts,
+)
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import AbstractWalker, check_one_walker, is_own_walker
@@ -300,12 +306,14 @@ class FirstPassage(AbstractPrintable):
         return 1.0 - self.failure_probability
 
     @property
-    def ending(self) -> str:
+    def ending(self) -> Any:
         """Return a sentence on whether the error is within the tolerance."""
         return describe_step_ending(self.status, PassageStatus)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for means, failure probability, outcomes and status."""
+        if np.ndim(self.status):
+            return [("wheels", format_outcome_counts(self.status, PassageStatus))]
         end_texts = [
             f"{outcome_name} {100 * outcome_fraction:.3g} %"
             for outcome_name, outcome_fraction in zip(

@@ -25,7 +25,13 @@ from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.outcomes import NoGaitError, Outcome
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText, describe_step_ending
+from vrw_jax.base.printing import (
+    AbstractPrintable,
+    LabelAndText,
+    describe_step_ending,
+    format_each_batch_element,
+    format_outcome_counts,
+)
 from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import is_own_walker
@@ -94,18 +100,16 @@ class GaitSensitivity(AbstractPrintable):
         return tuple(measure.name for measure in self.described_measures)
 
     @property
-    def ending(self) -> str:
+    def ending(self) -> Any:
         """Return a sentence on whether the norms are finite, with the reason if they are not."""
-        if self.outcome != Outcome.STEPPED:
-            return describe_step_ending(self.outcome, Outcome)
-        if self.spectral_radius < 1.0:
-            return "The gait is stable, and the norms are finite."
-        return "The gait is not stable: deviations grow from step to step, and no norm is finite."
+        return format_each_batch_element(_describe_norms, self.outcome, self.spectral_radius)
 
     def summary_rows(self) -> list[LabelAndText]:
         """Return pairs of label and text for the norm of each measure and the responses that it
         sums.
         """
+        if np.ndim(self.outcome):
+            return [("gaits", format_outcome_counts(self.outcome, Outcome))]
         if self.outcome != Outcome.STEPPED:
             return [("outcome", self.ending)]
         share_text_rows = []
@@ -129,6 +133,15 @@ class GaitSensitivity(AbstractPrintable):
             *share_text_rows,
             ("spectral radius of the gait", f"{float(self.spectral_radius):.5f}"),
         ]
+
+
+def _describe_norms(outcome: int, spectral_radius: float) -> str:
+    """Return a sentence on whether the norms of one gait are finite."""
+    if outcome != Outcome.STEPPED:
+        return describe_step_ending(outcome, Outcome)
+    if spectral_radius < 1.0:
+        return "The gait is stable, and the norms are finite."
+    return "The gait is not stable: deviations grow from step to step, and no norm is finite."
 
 
 @announce_wait("the gait and its response to slopes", "15 s")
