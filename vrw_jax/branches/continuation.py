@@ -236,7 +236,8 @@ def continue_branch(
         name: name of the continued parameter.
         bounds: lower and upper bound of the parameter.
         cycle: the gait at `params`, if it is known.
-        period_n: number of gait steps after which the gaits repeat.
+        period_n: number of gait steps after which the gaits repeat; with `switch_at`, that of the
+            point determines it.
         model: the model; the paper's, `ViscoelasticWheel()`, by default.
         options: `ArclengthOptions` of the branch.
         cycle_options: options of the gaits.

@@ -268,7 +268,7 @@ def trace_fixed_points(
     p = float(check_real("p", p))
     if not lower_bound <= p <= upper_bound:
         raise ValueError(
-            f"{name} is {p:g}, but the branch must start within its bounds: give one in "
+            f"{name} starts at {p:g}, but the branch must start within its bounds: give one in "
             f"[{lower_bound:g}, {upper_bound:g}]."
         )
     options = check_arclength_options(options)

@@ -347,7 +347,14 @@ def _simulate_one_event(
         (True,) * n_margins,
         is_zero_at_start=(guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise,
     )
-    phase_end = integrate_phase(mode.field, guards_and_margins, state, violated_guard < 0, options)
+    phase_end = integrate_phase(
+        mode.field,
+        guards_and_margins,
+        state,
+        violated_guard < 0,
+        options,
+        controls_tangents=True,
+    )
     guard_index = jnp.maximum(phase_end.end_guard_index, 0)
     next_state = lax.switch(guard_index, [g.reset for g in mode.guards], phase_end.state)
     next_modes = [

@@ -355,7 +355,7 @@ class HybridSystem(AbstractWalker):
         starts = jnp.concatenate([start[None], states[:-1]])
         samplers = [
             lambda state, duration, field=mode.field: sample_phase(
-                field, state, duration, n_samples, options
+                field, state, duration, n_samples, options, controls_tangents=True
             )
             for mode in self._bind_modes(params)
         ]

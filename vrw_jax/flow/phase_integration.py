@@ -118,7 +118,7 @@ def integrate_phase(
     options: StepOptions,
     state_units: StateArray | None = None,
     kinks: PhaseKinks | None = None,
-    controls_tangents: bool = True,
+    controls_tangents: bool = False,
 ) -> PhaseEnd:
     """Return the end of the phase that begins at `start_state`, where a guard first falls to zero.
 
@@ -131,7 +131,7 @@ def integrate_phase(
     are zero at the same time, the first in the list ends the phase. If `is_active` is False,
     nothing is integrated. Errors are those of the solver for the tolerances of `options`. The
     absolute tolerance is multiplied by `state_units`, whose default is 1. With `controls_tangents`,
-    the solver steps of a Jacobian also suit its tangents.
+    the steps of an explicit solver in a Jacobian also limit the errors of its tangents.
     """
     options = lax.stop_gradient(options)
     evaluate, n_guards = guards_and_margins.evaluate_guards_and_margins, guards_and_margins.n_guards
@@ -304,6 +304,8 @@ def _make_phase(
     evaluate_field = lanes.mark_noinline(field)
     evaluate_rates = lambda _, v: StageAccelerations((), (), (evaluate_field(v[0]),))
     tableau: Any = load_explicit_tableau(options.solver)
+    # Implicit methods are stable at any length, and would resolve tangents that decay at once.
+    controls_tangents = controls_tangents and tableau is not None
     if has_explicit_steps(options):
 
         def take_step(state: StageState, h: Scalar) -> tuple[list[StageState], Array]:
@@ -343,16 +345,17 @@ def _make_phase(
 
 
 def _compute_tolerance(stage_states: list[StageState], atol: Any, rtol: Scalar) -> StateArray:
-    """Return the largest error of each component in a solver step."""
+    """Return the largest allowed error of each component in a solver step."""
     start, end = jnp.abs(stage_states[0].v[0]), jnp.abs(stage_states[-1].v[0])
     return atol + rtol * jnp.maximum(start, end)
 
 
 MAX_TANGENT_ERROR = 100.0
-"""Largest error of a tangent in a solver step, relative to its size, in relative tolerances.
+"""Largest error of a tangent in a solver step, relative to the largest tangent of all directions,
+as a multiple of the relative tolerance.
 
-The value is chosen because tangents of a motion that excites all its frequencies have smaller
-errors, so that their solver steps are those of the motion.
+The value is chosen because errors are smaller where the motion excites all its frequencies, so that
+a Jacobian then has the solver steps of the motion.
 """
 
 
@@ -361,8 +364,9 @@ def _take_step_with_tangent_error(
 ) -> tuple[list[StageState], Array, Scalar]:
     """Return stages and error of a solver step, and the error of the tangents in a Jacobian.
 
-    The latter is the mean square of the errors divided by their tolerance, for the least accurate
-    tangent. If a part of the state rests, only tangents show how fast its equations are.
+    The tangent error is the mean square of the errors of a tangent, divided by their limit, in the
+    direction where it is largest, see `MAX_TANGENT_ERROR`. If a part of the state rests, only
+    tangents show how fast its equations are.
 
     - `take_step`: function of `state` and `h` that returns stages and errors;
     - `tolerances`: absolute and relative tolerance.
@@ -382,12 +386,13 @@ def _take_step_with_tangent_error(
         )
         atol, rtol = primals[0]
         weights = 1.0 / _compute_tolerance(stage_states, atol, rtol)
-        compute_size = lambda x: jnp.mean(jnp.square(x * weights))
-        size = jnp.maximum(*[compute_size(stage_tangents[i].v[0]) for i in (0, -1)])
-        tangent_error = compute_size(error_tangent) / (size * (MAX_TANGENT_ERROR * rtol) ** 2)
-        tangent_error = find_maximum_over_directions(
-            lax.stop_gradient(jnp.where(jnp.isfinite(tangent_error), tangent_error, 0.0))
+        compute_size = lambda *tangents: find_maximum_over_directions(
+            jnp.max(lax.stop_gradient(jnp.stack([jnp.mean((x * weights) ** 2) for x in tangents])))
         )
+        size = compute_size(stage_tangents[0].v[0], stage_tangents[-1].v[0])
+        tangent_error = compute_size(error_tangent) / (size * (MAX_TANGENT_ERROR * rtol) ** 2)
+        # The result is NaN without tangents or with one that is not finite.
+        tangent_error = jnp.where(jnp.isnan(tangent_error), 0.0, tangent_error)
         return (
             (stage_states, error, tangent_error),
             (stage_tangents, error_tangent, jnp.zeros_like(tangent_error)),
@@ -459,12 +464,13 @@ def sample_phase(
     n_samples: int,
     options: StepOptions,
     state_units: StateArray | None = None,
+    controls_tangents: bool = False,
 ) -> Float[Array, "n_samples dim"]:
     """Return the states at `n_samples` equally spaced times of a phase, as accurate as the solver.
 
     The first sample is `start_state` and the last is the state after `duration`, s. The absolute
-    tolerance is multiplied by `state_units`.
+    tolerance is multiplied by `state_units`. For `controls_tangents`, see `integrate_phase`.
     """
-    phase, tableau = _make_phase(vector_field, options, state_units, controls_tangents=True)
+    phase, tableau = _make_phase(vector_field, options, state_units, controls_tangents)
     lengths = divide_equally(duration, n_samples)
     return sample_batch_phase(phase, tableau, (), (start_state,), lengths, options)[:, 0]

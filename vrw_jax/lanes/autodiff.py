@@ -246,13 +246,14 @@ def _apply_columns(columns: PyTree, tangents: Sequence[Array]) -> PyTree:
     )
 
 
-_DIRECTIONS_AXIS = "directions"
+_DIRECTIONS_AXIS = "directions of vrw_jax"  # no name that a user has for an axis
 
 
 def find_maximum_over_directions(x: Array) -> Array:
     """Return the maximum over all directions that `compute_jacobian_columns` computes together.
 
-    A JVP rule may use it for a value. Elsewhere, directions are unknown, and the result is zero.
+    JVP rules call it for values that all directions share. Outside of that function, directions are
+    unknown, and the result is zero.
     """
     try:
         return jnp.max(lax.all_gather(x, _DIRECTIONS_AXIS), axis=0)

@@ -47,6 +47,7 @@ def compile_exported_function(
     All runs therefore compile the same program.
     """
     exported_trace = _load_or_export_trace(traced_function, example_arguments)
+    assert exported_trace is not None
     device_sharding = SingleDeviceSharding(target_device)
     argument_shapes = [
         jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device_sharding)
@@ -65,18 +66,18 @@ def wrap_with_saved_trace(
 ) -> Callable:
     """Return a function that calls `traced_function` through its saved trace.
 
-    If no trace exists yet, it is exported and saved. Without a cache folder, `traced_function` is
-    called directly. The returned function is called while a program is traced, and it must not be
-    mapped or differentiated. As with `compile_exported_function`, first and later runs use the
-    exported trace. `find_key` returns the key of the function and of further values.
+    If no trace exists yet, it is exported and saved. `traced_function` is called directly without a
+    cache folder, or if JAX cannot export its trace. The returned function is called while a program
+    is traced, and it must not be mapped or differentiated. As with `compile_exported_function`,
+    first and later runs use the exported trace. `find_key` returns the key of the function and of
+    further values.
     """
 
     def evaluate_saved_trace(*arguments: Any) -> Any:
         if _is_exporting_trace.get() or not store.find_cache_folder():
             return traced_function(*arguments)
-        try:
-            trace = _load_or_export_trace(traced_function, arguments, find_key)
-        except NotImplementedError:  # JAX cannot export a function that calls back into Python.
+        trace = _load_or_export_trace(traced_function, arguments, find_key)
+        if trace is None:
             return traced_function(*arguments)
         return trace.call(*jax.tree.leaves(arguments))
 
@@ -87,11 +88,11 @@ def _load_or_export_trace(
     traced_function: Callable,
     example_arguments: tuple,
     find_key: Callable[..., str | None] | None = None,
-) -> export.Exported:
+) -> export.Exported | None:
     """Return the exported trace of a function, as a function of the flattened arguments.
 
     The trace is loaded from disk if a record exists. Otherwise the function is traced for the
-    shapes of `example_arguments`.
+    shapes of `example_arguments`. The result is None if JAX cannot export the trace.
     """
     argument_leaves, argument_structure = jax.tree.flatten(example_arguments)
     argument_shapes = [
@@ -135,9 +136,11 @@ def _load_or_export_trace(
             _find_ffi_target_names(flattened_function.trace(*argument_shapes).jaxpr)
         )
         disabled_checks = list(map(export.DisabledSafetyCheck.custom_call, ffi_target_names))
-        exported_trace = export.export(flattened_function, disabled_checks=disabled_checks)(
-            *argument_shapes
-        )
+        exporter = export.export(flattened_function, disabled_checks=disabled_checks)
+        try:
+            exported_trace = exporter(*argument_shapes)
+        except NotImplementedError:  # The function calls back into Python.
+            return None
     finally:
         _is_exporting_trace.reset(export_flag_token)
     if function_key:

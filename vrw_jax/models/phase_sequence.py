@@ -662,7 +662,6 @@ def make_element_phase_runner(options: StepOptions, records_margins: bool) -> Ph
             compute_wheel_units(phase.s).scale_times_to_seconds(options),
             jnp.stack(phase.coordinate_units),
             element_phase.kinks,
-            controls_tangents=False,  # A step of the wheel excites all its frequencies.
         )
         y = tuple(phase_end.state)
         return phase_end._replace(

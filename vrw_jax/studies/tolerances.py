@@ -604,7 +604,7 @@ def _plan_sampling(
     gait_fraction = float(np.mean(has_gait))
     pilot_mean = np.mean(pilot_values) / gait_fraction
     centered_values = pilot_values - pilot_mean * has_gait
-    # With the mean subtracted, a wheel without a gait in either model needs no weight of the second
+    # With the mean subtracted, a wheel with a gait in neither model needs no weight of the second
     # column, which a pilot sample without such wheels cannot determine.
     subtract_mean = np.array([[1.0, 0.0], [-pilot_mean, 1.0]])
     regressors = regressors @ subtract_mean
@@ -652,9 +652,9 @@ def _estimate_mean(
 
 
 def _have_all_gaits(has_gait: np.ndarray, regressors: np.ndarray) -> bool:
-    """Return whether all wheels have a gait in both models, as far as computed.
+    """Return whether no wheel is known to lack a gait in one of the models.
 
     Otherwise some wheels may have a gait in one model only, so that their control variate is wrong.
-    A small sample may contain no such wheel. The variance of one is therefore added.
+    A small sample may contain no such wheel. Callers therefore add the variance of one such wheel.
     """
     return bool(np.all(has_gait) and np.all(regressors[:, 1] == regressors[0, 1]))

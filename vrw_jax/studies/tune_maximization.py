@@ -437,8 +437,8 @@ class OptimalityConditions(NamedTuple):
     """
 
     price_ranges: np.ndarray  # (n_limits, 2): smallest and largest price that satisfy the condition
-    # residual of the first-order condition, with the slacks of limits that have a price, relative
-    # to the objective's largest gradient
+    # residual of the first-order condition, with the slacks of constraints that have a price,
+    # relative to the objective's largest gradient
     kkt_residual: float
     has_kink: np.ndarray  # whether the gradient jumps: first the objective, then the constraints
 

@@ -120,8 +120,8 @@ class TuneResult:
     - `validation`: validation by a walk of ten steps of the tuned wheel;
     - `cycle`: the gait as a LimitCycle, or as a ReturnMapCycle with unilateral contact;
     - `step`: step of the gait, as a StepResult or a UnilateralStep;
-    - `kkt_residual`: residual of the first-order condition, with the slacks of limits that have a
-      price, relative to the largest gradient of the objective on the path;
+    - `kkt_residual`: residual of the first-order condition, with the slacks of constraints that
+      have a price, relative to the largest gradient of the objective on the path;
     - `kinks`: names of the objective and of active constraints that have a kink at the gait. A
       margin has a kink where its minimum occurs at several instants, or on several legs, at once.
       The multiplier of such a constraint is the sum over the instants;
