@@ -690,14 +690,14 @@ def map_figure(
                 label=label,
                 path_effects=[Stroke(linewidth=line_width + 1.0, foreground="white"), Normal()],
             )
-    meetings = [
+    double_points = [
         dict(zip(curve.parameters, point.values, strict=True))
         for curve in curves
         for point in curve.codim2_points
     ]
-    if meetings:
+    if double_points:
         axes.plot(
-            *([meeting[name] for meeting in meetings] for name in (x, y)),
+            *([point[name] for point in double_points] for name in (x, y)),
             "o",
             color="black",
             markersize=2.5,

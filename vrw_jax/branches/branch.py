@@ -225,7 +225,8 @@ class SpecialPoint:
     def cycle(self) -> Any:
         """Return the `LimitCycle` at the special point.
 
-        If the special point has no `find_cycle`, return the `FixedPoint` next to it.
+        A search near a fold may find no gait, because Newton's method is singular there. If the
+        special point has no `find_cycle`, return the `FixedPoint` next to it.
         """
         return self.point if self.find_cycle is None else self.find_cycle()
 

@@ -358,8 +358,8 @@ def continue_branches(
         "measures_force_peaks": force_peaks,
         "own_measures": select_measures(measures, ()),
     }
-    known = cycle if switch_at is None else switch_at
-    n_wheels = _check_branches(params, known, cycle_options, **problem_fields)
+    given_start = cycle if switch_at is None else switch_at
+    n_wheels = _check_branches(params, given_start, cycle_options, **problem_fields)
     limits, options = np.array(check_range("bounds", bounds)), check_arclength_options(options)
     if n_wheels == 0:
         return ()

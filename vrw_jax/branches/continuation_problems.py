@@ -140,7 +140,7 @@ class BranchWheel(NamedTuple):
 
 @dataclass(frozen=True)
 class GaitSearch:
-    """Search for the gait at a point of a branch, near `guess`, which can be pickled."""
+    """Picklable search for the gait at a point of a branch, near `guess`."""
 
     finder: Any
     values: np.ndarray  # values of the parameters of the model

@@ -22,7 +22,12 @@ from vrw_jax.branches.branch import BIFURCATIONS, BRANCH_POINT, FOLD, Codim2Poin
 from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation import MAX_BRANCH_MESH_REFINEMENTS, continue_branches
-from vrw_jax.branches.continuation_problems import PHASE_DURATIONS, BranchWheel, CollocationProblem
+from vrw_jax.branches.continuation_problems import (
+    PHASE_DURATIONS,
+    BranchWheel,
+    CollocationProblem,
+    GaitSearch,
+)
 from vrw_jax.branches.curve_problems import (
     CONTINUED_QUANTITIES,
     DISCONTINUOUS_QUANTITIES,
@@ -148,7 +153,8 @@ class CurveTracer(NamedTuple):
             if not can_continue_special_point(special_point.name):
                 continue
             # Newton's method at a fixed parameter may miss the gait, such as at a fold.
-            search: Any = special_point.find_cycle
+            search = special_point.find_cycle
+            assert isinstance(search, GaitSearch)
             parameters, z = search.values, search.guess.solution
             wheel = BranchWheel(parameters, search.guess.is_phase_active)
             name = choose_continued_special_point_name(special_point.name, wheel, z)
