@@ -590,3 +590,18 @@ def test_functions_may_contain_traced_integers_and_flags_in_jit():
     differentiate = jax.jit(jax.jacfwd(position_after, argnums=1), static_argnums=0)
     # The frequency is 6 rad/s. The tolerance is a hundred times that of a solver step.
     assert float(differentiate(1.0, 1.0, 9, True)) == pytest.approx(np.cos(6.0), abs=1e-8)
+
+
+@pytest.mark.parametrize("height", [1e-5, 1e-7, 1e-10, -1e-10])
+def test_an_event_counts_even_if_its_guard_is_disarmed_soon_after(height):
+    """A ball has its apex `height` above a table, below which its apexes do not count."""
+    g, table = 9.81, 0.02
+    fly = lambda y: jnp.stack([y[1], -g + 0.0 * y[0]])
+    apex = Guard(lambda y: y[1], armed=lambda y: y[0] - table)
+    floor = Guard(lambda y: y[0] + 0.01)
+    speed = np.sqrt(2.0 * g * (table + height))
+    ball = simulate_hybrid((Mode(fly, (apex, floor)),), jnp.array([0.0, speed]), events=1)
+    fall = speed + np.sqrt(speed**2 + 2.0 * g * 0.01)
+    assert int(ball.guards[0]) == (0 if height > 0.0 else 1)
+    # Events are located to round-off.
+    assert float(ball.times[0]) == pytest.approx((speed if height > 0.0 else fall) / g, abs=1e-13)

@@ -341,11 +341,17 @@ def _simulate_one_event(
         will_guard_rise, least_value + jnp.maximum(-guard_values, 0.0), guard_offset
     )
     n_margins = jax.eval_shape(evaluate_margins, state).size
+    armed_guards = [guard for guard in mode.guards if guard.armed is not None]
+    evaluate_armed_guards: Any = lambda y: tuple(
+        jnp.stack([function(y) for function in functions])
+        for functions in zip(*[(guard.value, guard.armed) for guard in armed_guards], strict=True)
+    )
     guards_and_margins = GuardsAndMargins(
         lambda y: jnp.append(mode.guard_values(y) + guard_offset, evaluate_margins(y)),
         len(mode.guards),
         (True,) * n_margins,
         is_zero_at_start=(guard_values <= 0.0) & is_guard_near_zero & ~will_guard_rise,
+        evaluate_armed_guards=evaluate_armed_guards if armed_guards else None,
     )
     phase_end = integrate_phase(
         mode.field,

@@ -48,6 +48,7 @@ from vrw_jax.flow.solver_steps import (
     SolverStepFunction,
     StageState,
     compute_step_size_factor,
+    find_disarmed_crossing_fraction,
     find_earliest_guard_minimum_fraction,
     make_solver_step_function,
 )
@@ -537,6 +538,13 @@ def _try_solver_step(
     guard_minimum_fraction = find_earliest_guard_minimum_fraction(
         tableau, [*inner_guard_values, end_guard_values], may_have_minimum
     )
+    if phase.evaluate_armed_guards is not None:
+        stages = (stage_states[i] for i in (0, *tableau.guard_stage_indices, -1))
+        armed_guards = lax.stop_gradient([phase.evaluate_armed_guards(stage) for stage in stages])
+        values, arming = map(list, zip(*armed_guards, strict=True))
+        guard_minimum_fraction = jnp.minimum(
+            guard_minimum_fraction, find_disarmed_crossing_fraction(tableau, values, arming)
+        )
     is_within_tolerance = mean_squared_error <= 1.0
     # A step inside which a guard may be negative is repeated up to the guard's minimum.
     may_cross_inside = (

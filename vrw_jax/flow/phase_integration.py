@@ -73,7 +73,8 @@ class GuardsAndMargins(NamedTuple):
       microseconds has no better root;
     - `is_zero_at_start`: whether each guard is treated as zero at the start in spite of round-off.
       If the field is None, a guard is treated as zero if its value is 0 or within round-off of its
-      scale.
+      scale;
+    - `evaluate_armed_guards`: see `solver_steps.BatchPhase`.
     """
 
     evaluate_guards_and_margins: EvaluateGuardsAndMargins
@@ -81,6 +82,7 @@ class GuardsAndMargins(NamedTuple):
     includes_phase_start: tuple[bool, ...] = ()
     guard_scales: Array | None = None
     is_zero_at_start: Bool[Array, " n_guards"] | None = None
+    evaluate_armed_guards: Callable[[StateArray], tuple[Array, Array]] | None = None
 
     def find_guards_met_at_start(
         self, guard_values: Float[Array, " n_guards"], guard_rates: Float[Array, " n_guards"]
@@ -139,6 +141,7 @@ def integrate_phase(
     is_guard_met, is_guard_falling = guards_and_margins.find_guards_met_at_start(
         *lax.stop_gradient((start_values[:n_guards], start_rates[:n_guards]))
     )
+    evaluate_armed_guards = guards_and_margins.evaluate_armed_guards
     includes_start = guards_and_margins.includes_phase_start
     n_margins = len(start_values) - n_guards
     if len(includes_start) != n_margins:
@@ -160,6 +163,10 @@ def integrate_phase(
             guards_met_at_start=is_guard_met,
             sides=sides,
         )
+        if evaluate_armed_guards is not None:
+            phase = phase._replace(
+                evaluate_armed_guards=lambda state: evaluate_armed_guards(state.v[0])
+            )
         if kinks is not None:
             phase = phase._replace(
                 evaluate_kinks=lambda state: kinks.evaluate_kinks(state.v[0]),

@@ -198,6 +198,41 @@ def find_earliest_guard_minimum_fraction(
     )
 
 
+def find_disarmed_crossing_fraction(
+    tableau: ButcherTableau, values: list[Array], arming: list[Array]
+) -> Array:
+    """Return where a guard falls through zero that may have been armed earlier in the solver step.
+
+    At the end of the step the guard is no longer armed, so that its sign there shows no event. The
+    location is a fraction of the step, or 1 if there is none. It is exact in the limit of short
+    steps. The times of `values` and `arming`, (guards, batch), are those of
+    `find_earliest_guard_minimum_fraction`.
+    """
+    lowest_coefficients = functools.reduce(
+        jnp.minimum, _compute_bernstein_coefficients(tableau, [-x for x in arming])
+    )
+    may_cross = (arming[-1] <= 0.0) & (lowest_coefficients <= 0.0)
+    fraction = jnp.ones_like(values[0])
+    nodes = [0.0, *map(float, tableau.stage_nodes[list(tableau.guard_stage_indices)]), 1.0]
+    for (left_node, left), (right_node, right) in itertools.pairwise(
+        zip(nodes, values, strict=True)
+    ):
+        is_bracket = may_cross & (left > 0.0) & (right <= 0.0)
+        share = left / jnp.where(is_bracket, left - right, 1.0)
+        zero = left_node + (right_node - left_node) * share
+        fraction = jnp.where(is_bracket, jnp.minimum(fraction, zero), fraction)
+    overshoot = CROSSING_OVERSHOOT * jnp.maximum(fraction, CROSSING_OVERSHOOT)
+    return jnp.minimum(jnp.min(fraction + overshoot, axis=0), 1.0)
+
+
+CROSSING_OVERSHOOT = 1e-6
+"""Share of a solver step by which it ends beyond the estimated zero of a guard.
+
+The value is chosen because the guard is then negative beyond round-off. An event within this share
+before its guard is disarmed may be missed.
+"""
+
+
 # Factor by which the estimated step length for the tolerance is multiplied. This value and the two
 # following ones are chosen because they are usual for explicit methods (Hairer, Norsett and Wanner,
 # Solving Ordinary Differential Equations I, Section II.4).
@@ -430,6 +465,8 @@ class BatchPhase(NamedTuple):
     """
     guard_scales: Array | None = None
     """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
+    evaluate_armed_guards: Callable[[StageState], tuple[Array, Array]] | None = None
+    """Function that returns values and arming of the guards that count only while armed."""
     guards_met_at_start: Array | None = None
     """Whether each guard ends the phase at its start; by default, its value and rate decide."""
     evaluate_kinks: Callable[[StageState], Vector] | None = None
