@@ -397,7 +397,7 @@ HELD_OSCILLATOR = HybridSystem(
     [
         (vrw.StepOptions(), 0.2, 1e-6),
         (vrw.StepOptions(engine="diffrax"), 0.2, 1e-6),
-        (vrw.StepOptions(solver="Kvaerno5"), 0.7, 1e-6),
+        pytest.param(vrw.StepOptions(solver="Kvaerno5"), 0.7, 1e-6, marks=pytest.mark.slow),
     ],
     ids=["at rest", "at rest, by diffrax", "implicit"],
 )

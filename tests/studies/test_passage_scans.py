@@ -44,13 +44,13 @@ def test_an_interrupted_scan_of_lives_continues_with_the_same_numbers(tmp_path: 
 
 
 def test_walks_have_the_options_of_the_scan() -> None:
-    """Some steps take longer than the largest duration, which ends the walk."""
+    """Some steps take longer than the largest duration, which ends walks of 781 steps after 40."""
     params, options = vrw.WheelParams(damping=150.0), vrw.StepOptions(max_phase_time=0.45)
     data = vrw.scan(
-        vrw.grid(slope=[0.3]), ["mean_steps"], base=params, slope_sd=SLOPE_SD, options=options
+        vrw.grid(slope=[0.3]), ["mean_steps"], base=params, slope_sd=0.015, options=options
     )
-    passage = vrw.first_passage(params, SLOPE_SD, options=options)
-    assert float(data.mean_steps[0]) == float(passage.mean_steps)
+    passage = vrw.first_passage(params, 0.015, options=options)
+    assert float(data.mean_steps[0]) == float(passage.mean_steps) < 50.0
 
 
 @pytest.mark.parametrize(

@@ -318,19 +318,19 @@ class MapProblem(AbstractStateProblem):
     def function(self) -> Callable[[Any, Array, Array], Array]:
         if self.period_n == 1:
             return self.iterated_map
-
-        def iterate(args: Any, x: Array, p: Array) -> Array:
-            for _ in range(self.period_n):
-                x = self.iterated_map(args, x, p)
-            return x
-
-        return iterate
+        return jax.tree_util.Partial(_iterate_map, self.iterated_map, self.period_n)
 
     def measure(self, args: Any, points: ContinuationPoint) -> QuantitiesByName:
         return {"x": self.section_units * points.z}
 
     def label(self, quantities: QuantitiesByName) -> tuple[dict, dict]:
         return {"x": (("point", "component"), quantities["x"])}, {}
+
+
+def _iterate_map(function: Callable, n: int, args: Any, x: Array, p: Array) -> Array:
+    for _ in range(n):
+        x = function(args, x, p)
+    return x
 
 
 class Track(NamedTuple):
