@@ -393,11 +393,12 @@ def _take_step_with_tangent_error(
         )
         atol, rtol = primals[0]
         weights = 1.0 / _compute_tolerance(stage_states, atol, rtol)
-        compute_size = lambda *tangents: find_maximum_over_directions(
-            jnp.max(lax.stop_gradient(jnp.stack([jnp.mean((x * weights) ** 2) for x in tangents])))
+        start_size, end_size, error_size = (
+            find_maximum_over_directions(lax.stop_gradient(jnp.mean(jnp.square(x * weights))))
+            for x in (stage_tangents[0].v[0], stage_tangents[-1].v[0], error_tangent)
         )
-        size = compute_size(stage_tangents[0].v[0], stage_tangents[-1].v[0])
-        tangent_error = compute_size(error_tangent) / (size * (MAX_TANGENT_ERROR * rtol) ** 2)
+        size_limit = jnp.maximum(start_size, end_size) * (MAX_TANGENT_ERROR * rtol) ** 2
+        tangent_error = error_size / size_limit
         # The result is NaN without tangents or with one that is not finite.
         tangent_error = jnp.where(jnp.isnan(tangent_error), 0.0, tangent_error)
         return (

@@ -447,8 +447,8 @@ class BatchPhase(NamedTuple):
     take_solver_step: SolverStepFunction | None = None
     """Solver step of the phase; by default, a step of the tableau."""
     take_last_step: Callable[[StageState, Array], list[StageState]] | None = None
-    """Function that returns the stages of the same solver step by shorter and slower code, for the
-    search for events."""
+    """Function that returns the stages of the same solver step, for the search for events. Its code
+    may be shorter and slower, and it has no error that depends on tangents."""
     has_exact_events: bool = False
     """Whether an event is located to round-off, and not to the tolerances."""
     max_event_correction: Array | None = None

@@ -634,7 +634,7 @@ def _estimate_mean(
 
     - `control_values`: weighted control variates of all wheels outside the pilot sample. The drawn
       wheels come first;
-    - `have_gaits`: whether all wheels have a gait in both models, as far as computed.
+    - `have_gaits`: see `_have_all_gaits`.
     """
     n_remaining, n_drawn = len(control_values), len(drawn_values)
     n_gaits = np.sum(pilot_has_gait) + n_remaining * np.mean(drawn_has_gait)
