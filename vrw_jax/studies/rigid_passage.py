@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.scipy.linalg import lu_factor, lu_solve
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
@@ -59,8 +60,11 @@ def _analyze_survival_operator(
     K_change, kappa_1 = survival_matrix - K, q @ K @ u
     kappa_change = q @ K_change @ u
     regular_matrix = kappa_1 * jnp.eye(len(q)) - K + jnp.outer(u, q)
-    q_change = jnp.linalg.solve(regular_matrix.T, q @ K_change - kappa_change * q)
-    u_change = jnp.linalg.solve(regular_matrix, K_change @ u - kappa_change * u)
+    factors = lu_factor(regular_matrix)
+    u_change = lu_solve(factors, K_change @ u - kappa_change * u)
+    # Two solves of a batch that run at once may wait for each other forever on CPUs (JAX 0.10).
+    q_residual, u_change = lax.optimization_barrier((q @ K_change - kappa_change * q, u_change))
+    q_change = lu_solve(factors, q_residual, trans=1)
     scale_change = jnp.sum(q_change)
     return (
         failure_probability,
