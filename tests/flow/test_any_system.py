@@ -605,3 +605,53 @@ def test_an_event_counts_even_if_its_guard_is_disarmed_soon_after(height):
     assert int(ball.guards[0]) == (0 if height > 0.0 else 1)
     # Events are located to round-off.
     assert float(ball.times[0]) == pytest.approx((speed if height > 0.0 else fall) / g, abs=1e-13)
+
+
+def test_an_armed_guard_that_is_negative_for_a_short_time_ends_its_mode():
+    """Of two points on circles, the first is the guard, and the second arms it.
+
+    Both fall below their levels for a short time, so that each may be the first to fall, and the
+    first to rise again.
+    """
+    n, end_time = 2000, 3.0
+    rng = np.random.default_rng(5)
+    rates, levels = rng.uniform(1.0, 6.0, (n, 2)), 1.0 - 10.0 ** rng.uniform(-6.5, 0.0, (n, 2))
+    half = np.arccos(levels) / rates  # of the duration below the level
+    meeting = rng.uniform(0.5, 2.5, (n, 1)) + 1.05 * half * rng.uniform(-1.0, 1.0, (n, 2))
+    phases = np.pi - rates * meeting
+    is_start_clear = np.all(np.cos(phases) > 0.01 - levels, axis=1)
+
+    @jax.vmap
+    def simulate(rates, levels, state):
+        guard = Guard(lambda y: y[0] + levels[0], armed=lambda y: -y[1] - levels[1])
+        clock = Guard(lambda y: end_time - y[4])
+        a, b = rates
+        field = lambda y: jnp.stack([a * y[2], b * y[3], -a * y[0], -b * y[1], 1.0 + 0.0 * y[4]])
+        mode = Mode(field, (guard, clock))
+        return simulate_hybrid((mode,), state, events=1, options=TIGHT_OPTIONS)
+
+    states = np.hstack([np.cos(phases), -np.sin(phases), np.zeros((n, 1))])
+    times = np.asarray(simulate(rates, levels, states).times[:, 0])
+    middles = meeting[..., None] + 2.0 * np.pi * np.arange(-4, 5) / rates[..., None]
+    starts, stops = middles - half[..., None], middles + half[..., None]
+    start = np.maximum(starts[:, 0, :, None], starts[:, 1, None, :])
+    stop = np.minimum(stops[:, 0, :, None], stops[:, 1, None, :])
+    counts = (start < stop) & (start > 0.0)
+    first = np.min(np.where(counts, start, end_time), axis=(1, 2), initial=end_time)
+    # Errors of the state of 1e-13 move a zero whose rate is 1e-3 by 1e-10.
+    np.testing.assert_allclose(times[is_start_clear], first[is_start_clear], atol=1e-9)
+
+
+def test_an_event_is_located_where_two_roots_attract_the_search_in_turn():
+    """Newton's method for the guard and that for its arming lead to each other's start."""
+    a, b, level, armed_level = 3.0659, 5.347, 0.444, -0.5595
+    field = lambda y: jnp.stack([y[1], -(a**2) * y[0], y[3], -(b**2) * y[2]])
+    guard = Guard(lambda y: y[0] + level, armed=lambda y: y[3] - armed_level)
+    size, phase = np.array([0.5119, 0.9203]), np.array([4.428, 1.3231])
+    position, velocity = size * np.cos(phase), -size * [a, b] * np.sin(phase)
+    start = jnp.array([position[0], velocity[0], position[1], velocity[1]])
+    end = simulate_hybrid((Mode(field, (guard,)),), start, events=1)
+    expected = (3.0 * np.pi + np.arcsin(armed_level / (size[1] * b)) - phase[1]) / b
+    assert position[0] + level > 0.0 > size[0] * np.cos(a * expected + phase[0]) + level
+    # The tolerance is ten times that of the default options.
+    assert float(end.times[0]) == pytest.approx(expected, abs=1e-7)

@@ -341,10 +341,14 @@ def _simulate_one_event(
         will_guard_rise, least_value + jnp.maximum(-guard_values, 0.0), guard_offset
     )
     n_margins = jax.eval_shape(evaluate_margins, state).size
-    armed_guards = [guard for guard in mode.guards if guard.armed is not None]
-    evaluate_armed_guards: Any = lambda y: tuple(
-        jnp.stack([function(y) for function in functions])
-        for functions in zip(*[(guard.value, guard.armed) for guard in armed_guards], strict=True)
+    armed_guards = [
+        (guard.value, offset, guard.armed)
+        for guard, offset in zip(mode.guards, guard_offset, strict=True)
+        if guard.armed is not None
+    ]
+    evaluate_armed_guards: Any = lambda y: (
+        jnp.stack([value(y) + offset for value, offset, _ in armed_guards]),
+        -jnp.stack([armed(y) for _, _, armed in armed_guards]),
     )
     guards_and_margins = GuardsAndMargins(
         lambda y: jnp.append(mode.guard_values(y) + guard_offset, evaluate_margins(y)),

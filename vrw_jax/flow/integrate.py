@@ -7,6 +7,7 @@ depends on the other elements.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -48,8 +49,8 @@ from vrw_jax.flow.solver_steps import (
     SolverStepFunction,
     StageState,
     compute_step_size_factor,
-    find_disarmed_crossing_fraction,
     find_earliest_guard_minimum_fraction,
+    find_hidden_event_fraction,
     make_solver_step_function,
 )
 from vrw_jax.flow.tangents import PhaseTangents, propagate_to_event, stack_directions
@@ -541,10 +542,10 @@ def _try_solver_step(
     if phase.evaluate_armed_guards is not None:
         stages = (stage_states[i] for i in (0, *tableau.guard_stage_indices, -1))
         armed_guards = lax.stop_gradient([phase.evaluate_armed_guards(stage) for stage in stages])
-        values, arming = map(list, zip(*armed_guards, strict=True))
-        guard_minimum_fraction = jnp.minimum(
-            guard_minimum_fraction, find_disarmed_crossing_fraction(tableau, values, arming)
-        )
+        for values, others in itertools.permutations(map(list, zip(*armed_guards, strict=True))):
+            guard_minimum_fraction = jnp.minimum(
+                guard_minimum_fraction, find_hidden_event_fraction(tableau, values, others)
+            )
     is_within_tolerance = mean_squared_error <= 1.0
     # A step inside which a guard may be negative is repeated up to the guard's minimum.
     may_cross_inside = (

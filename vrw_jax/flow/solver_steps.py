@@ -198,31 +198,32 @@ def find_earliest_guard_minimum_fraction(
     )
 
 
-def find_disarmed_crossing_fraction(
-    tableau: ButcherTableau, values: list[Array], arming: list[Array]
+def find_hidden_event_fraction(
+    tableau: ButcherTableau, values: list[Array], others: list[Array]
 ) -> Array:
-    """Return where a guard falls through zero that may have been armed earlier in the solver step.
+    """Return where values that the maximum with others may hide fall through zero, or are minimal.
 
-    At the end of the step the guard is no longer armed, so that its sign there shows no event. The
-    location is a fraction of the step, or 1 if there is none. It is exact in the limit of short
-    steps. The times of `values` and `arming`, (guards, batch), are those of
-    `find_earliest_guard_minimum_fraction`.
+    A guard with `armed` is such a maximum, of its value and minus `armed`. Within a solver step it
+    may be negative for a short time, which neither its sign at the end nor a polynomial through it
+    shows, because it has a kink. The location is a fraction of the step, or 1 if there is none. A
+    zero is exact in the limit of short steps. The times of `values` and `others`, (guards, batch),
+    are those of `find_earliest_guard_minimum_fraction`.
     """
-    lowest_coefficients = functools.reduce(
-        jnp.minimum, _compute_bernstein_coefficients(tableau, [-x for x in arming])
-    )
-    may_cross = (arming[-1] <= 0.0) & (lowest_coefficients <= 0.0)
+    coefficients = [*_compute_bernstein_coefficients(tableau, others), others[-1]]
+    may_count = functools.reduce(jnp.minimum, coefficients) < 0.0
+    may_hide = may_count & (functools.reduce(jnp.maximum, coefficients) >= 0.0)
     fraction = jnp.ones_like(values[0])
     nodes = [0.0, *map(float, tableau.stage_nodes[list(tableau.guard_stage_indices)]), 1.0]
     for (left_node, left), (right_node, right) in itertools.pairwise(
         zip(nodes, values, strict=True)
     ):
-        is_bracket = may_cross & (left > 0.0) & (right <= 0.0)
+        is_bracket = may_hide & (left > 0.0) & (right <= 0.0)
         share = left / jnp.where(is_bracket, left - right, 1.0)
         zero = left_node + (right_node - left_node) * share
         fraction = jnp.where(is_bracket, jnp.minimum(fraction, zero), fraction)
     overshoot = CROSSING_OVERSHOOT * jnp.maximum(fraction, CROSSING_OVERSHOOT)
-    return jnp.minimum(jnp.min(fraction + overshoot, axis=0), 1.0)
+    minimum_fraction = find_earliest_guard_minimum_fraction(tableau, values, may_count)
+    return jnp.minimum(jnp.min(fraction + overshoot, axis=0), minimum_fraction)
 
 
 CROSSING_OVERSHOOT = 1e-6
@@ -466,7 +467,7 @@ class BatchPhase(NamedTuple):
     guard_scales: Array | None = None
     """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
     evaluate_armed_guards: Callable[[StageState], tuple[Array, Array]] | None = None
-    """Function that returns values and arming of the guards that count only while armed."""
+    """Function that returns values and minus `armed` of the guards that have it."""
     guards_met_at_start: Array | None = None
     """Whether each guard ends the phase at its start; by default, its value and rate decide."""
     evaluate_kinks: Callable[[StageState], Vector] | None = None
