@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from vrw_jax.app.explorer import explore
 from vrw_jax.base.checks import format_name_suggestion
-from vrw_jax.base.measures import measure
 from vrw_jax.base.options import StepOptions, parameter
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import start_jax
+from vrw_jax.base.results import Outcome, measure
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import Branch, SpecialPoint, SpecialPointCurve
@@ -17,12 +16,12 @@ from vrw_jax.branches.continuation import continue_branch, continue_branches
 from vrw_jax.branches.map_branch import continue_map
 from vrw_jax.branches.special_point_curves import continue_special_point
 from vrw_jax.flow.hybrid_system import HybridSystem
+from vrw_jax.gaits.cycle import CycleOptions, default_margins
 from vrw_jax.gaits.fixed_points import FixedPointResult, solve_fixed_point
 from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, sensitivities
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
-from vrw_jax.gaits.options import CycleOptions, default_margins
-from vrw_jax.gaits.return_map_finder import ReturnMapCycle
 from vrw_jax.gaits.walker_finder import HybridGait
+from vrw_jax.gaits.wheel_finders import ReturnMapCycle
 from vrw_jax.models.contact_record import UnilateralStep
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import LadderStep, LadderWheel, ModelChoice

@@ -1,6 +1,6 @@
 """Simulation of any hybrid system: modes, guards, resets, events."""
 
-from vrw_jax.flow.complementarity import LCPStatus, enumerate_lcp_solutions
+from vrw_jax.base.small_matrices import LCPStatus, enumerate_lcp_solutions
 from vrw_jax.flow.hybrid_simulation import (
     Guard,
     HybridSolution,

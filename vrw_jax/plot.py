@@ -1,19 +1,17 @@
 """Figures of labeled results. Only the package `app` imports matplotlib."""
 
 from vrw_jax.app import figure_style as style
-from vrw_jax.app._fit_figures import fit_figure
-from vrw_jax.app._gait_figures import basin_figure, branch_figure, tornado_figure, tuning_figure
-from vrw_jax.app._scan_figures import map_figure, scan_figures
-from vrw_jax.app._walk_figures import (
+from vrw_jax.app._gait_figures import (
+    branch_figure,
     foot_height,
     gait_panels,
     ground_forces,
     indicators,
     rear_force,
-    save_animation,
-    sticks,
-    walk_frames,
 )
+from vrw_jax.app._scan_figures import map_figure, scan_figures
+from vrw_jax.app._study_figures import basin_figure, fit_figure, tornado_figure, tuning_figure
+from vrw_jax.app._walk_figures import save_animation, sticks, walk_frames
 from vrw_jax.app.figure_style import (
     DARK_GRAY_COLOR,
     LEG_1_COLOR,

@@ -23,7 +23,7 @@ from tests.reference_code import multiprecision
 from tests.reference_code.hub_form import HubForm
 from tests.reference_code.multiprecision import Flow, Number, Vector
 from vrw_jax import Outcome
-from vrw_jax.gaits import floquet
+from vrw_jax.base import small_matrices
 from vrw_jax.wheel import transitions
 
 
@@ -325,8 +325,8 @@ def meeting() -> Rows:
     as_array = lambda matrix: jnp.asarray(np.array(matrix.tolist(), float))
     interpolate_matrix = lambda s: as_array(base) + s * as_array(change)
     measures = {
-        "radius": lambda s: floquet.compute_spectral_radius(interpolate_matrix(s)),
-        "jury": lambda s: floquet.compute_jury_margins(interpolate_matrix(s)),
+        "radius": lambda s: small_matrices.compute_spectral_radius(interpolate_matrix(s)),
+        "jury": lambda s: small_matrices.compute_jury_margins(interpolate_matrix(s)),
     }
     derive = {name: jax.jit(jax.jacfwd(measure)) for name, measure in measures.items()}
     for kind, sign in (("real", 1), ("complex", -1)):

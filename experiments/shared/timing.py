@@ -13,7 +13,7 @@ import jax
 from jax.experimental.compilation_cache import compilation_cache
 
 import vrw_jax as vrw
-from vrw_jax.lanes import code_cache as code
+from vrw_jax.lanes import machine_code as code
 
 
 @contextlib.contextmanager

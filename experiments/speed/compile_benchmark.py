@@ -21,7 +21,7 @@ from experiments.shared.tables import (
     write_named_rows,
 )
 from experiments.shared.timing import start_without_cache, use_one_core
-from vrw_jax.lanes.settings import make_fusion_emitter_options
+from vrw_jax.lanes.environment import make_fusion_emitter_options
 
 LANES, REPEATS = 256, 10
 Program = tuple[Callable, tuple]

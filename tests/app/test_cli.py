@@ -28,9 +28,8 @@ from vrw_jax.app import commands as cli
 from vrw_jax.app import scanning
 from vrw_jax.app.commands import app
 from vrw_jax.app.config import parse_config
-from vrw_jax.app.console import make_scan_progress_reporter, replace_unencodable_characters
+from vrw_jax.app.output import make_scan_progress_reporter, replace_unencodable_characters
 from vrw_jax.studies import ScanPlan, ScanProgress, SpecialPointMap
-from vrw_jax.studies import scan_execution as forecast
 
 SCAN_CONFIG = """
 [grid]
@@ -84,7 +83,7 @@ def test_explain_measures_some_samples_and_writes_nothing(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = iter([0.0, 10.0, 12.0])
-    monkeypatch.setattr(forecast, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(scanning, "perf_counter", lambda: next(clock))
     result = run_command("scan", config, "--explain")
     assert result.exit_code == 0, result.output
     message = " ".join(result.stdout.split())
@@ -148,11 +147,11 @@ def test_characters_that_a_terminal_lacks_are_spelled(
     encoding: str, words: list[str], sentence: str
 ) -> None:
     code = (
-        "from vrw_jax.app import console\n"
-        "console.replace_unencodable_output()\n"
+        "from vrw_jax.app import output\n"
+        "output.replace_unencodable_output()\n"
         'headings = ("quantity", "symbol", "unit")\n'
-        'console.print_text_table("λ", [("θ̇⁻", "λ4⁺", "N·s²")], headings)\n'
-        'console.print_error_sentence("φ ≥ 0 … Ω")'
+        'output.print_text_table("λ", [("θ̇⁻", "λ4⁺", "N·s²")], headings)\n'
+        'output.print_error_sentence("φ ≥ 0 … Ω")'
     )
     environment = {**os.environ, "PYTHONIOENCODING": encoding, "COLUMNS": "80"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)

@@ -16,7 +16,7 @@ from experiments.shared.color_vision import simulate_color_vision
 from vrw_jax import Outcome
 from vrw_jax.app import _gait_figures as branch
 from vrw_jax.app.config import load_config, parse_config
-from vrw_jax.app.reports import write_tuning_report
+from vrw_jax.app.output import write_tuning_report
 from vrw_jax.plot import basin_figure, indicators, save_animation, style, tuning_figure
 from vrw_jax.studies import TrialKind
 from vrw_jax.studies.tune_maximization import TuneStatus

@@ -19,7 +19,7 @@ from PIL import Image
 import vrw_jax as vrw
 import vrw_jax.continuation
 import vrw_jax.hybrid
-from vrw_jax.app import _contact_figures as _contact
+from vrw_jax.app import _walk_figures as _contact
 from vrw_jax.branches import Branch, SpecialPoint
 from vrw_jax.branches.branch import FixedPoint
 from vrw_jax.plot import ground_forces, style

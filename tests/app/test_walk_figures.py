@@ -7,7 +7,7 @@ import xarray as xr
 from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
-from vrw_jax.app import _contact_figures as contact
+from vrw_jax.app import _walk_figures as contact
 from vrw_jax.plot import tornado_figure
 from vrw_jax.wheel import ContactMode
 

@@ -412,7 +412,7 @@ legs = vrw.AlternatingLegs(vrw.SpringDamper(damping=150.0), vrw.SpringDamper(dam
 def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A place with a letter, and with what is no store; a second is enough for a scheduler."""
     monkeypatch.setattr(ScanPlan, "build_scan_engine", lambda _: evaluate_arithmetically)
-    monkeypatch.setattr("vrw_jax.studies.scan_dask.DASK_SCHEDULER_TIMEOUT", "1s")
+    monkeypatch.setattr("vrw_jax.studies.scan_execution.DASK_SCHEDULER_TIMEOUT", "1s")
     monkeypatch.chdir(tmp_path)
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", cache)

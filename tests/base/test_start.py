@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import vrw_jax as vrw
-from vrw_jax.lanes import saved_traces
-from vrw_jax.lanes.settings import make_fusion_emitter_options
+from vrw_jax.lanes import program
+from vrw_jax.lanes.environment import make_fusion_emitter_options
 
 
 def read_output_lines(code, **environment):
@@ -35,9 +35,9 @@ def cache_folder(tmp_path):
 @pytest.fixture
 def exports(monkeypatch):
     """Return a list to which each export of a trace appends."""
-    exported, original_export = [], saved_traces.export.export
+    exported, original_export = [], program.export.export
     spy = lambda *a, **k: exported.append(1) or original_export(*a, **k)
-    monkeypatch.setattr(saved_traces.export, "export", spy)
+    monkeypatch.setattr(program.export, "export", spy)
     return exported
 
 
@@ -86,7 +86,7 @@ def test_a_flag_set_by_the_user_is_kept():
 def evaluate_by_saved_trace(shift, x, y):
     """Evaluate as another process would: nothing is remembered but on disk."""
     function = functools.partial(add_sine, shift)
-    return jax.jit(lambda x, y: saved_traces.wrap_with_saved_trace(function)(x, y)["sum"])(x, y)
+    return jax.jit(lambda x, y: program.wrap_with_saved_trace(function)(x, y)["sum"])(x, y)
 
 
 def test_a_cached_trace_is_reused_and_gives_the_same_values(cache_folder, exports):

@@ -13,7 +13,7 @@ import vrw_jax as vrw
 from vrw_jax import lanes
 from vrw_jax.app._gait_figures import branch_figure
 from vrw_jax.app.config import FigureConfig
-from vrw_jax.app.reports import write_branch_report
+from vrw_jax.app.output import write_branch_report
 from vrw_jax.branches.arclength import ArclengthDriver, MapProblem, run_together
 from vrw_jax.branches.branch_location import locate_function_roots
 from vrw_jax.flow.phase_integration import GuardsAndMargins, integrate_phase

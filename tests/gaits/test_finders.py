@@ -14,7 +14,7 @@ from vrw_jax.gaits import (
     confirm_outcome_by_step,
     make_finder,
 )
-from vrw_jax.gaits.return_map_finder import ReturnMapFinder
+from vrw_jax.gaits.wheel_finders import ReturnMapFinder
 from vrw_jax.models import MEASURES, AbstractWheel
 from vrw_jax.wheel import FRICTION_NAME, PARAMETER_NAMES
 

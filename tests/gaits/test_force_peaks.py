@@ -10,7 +10,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 from reference_code import five_coordinates
 
 import vrw_jax as vrw
-from vrw_jax.flow.kinks import NODE_FRACTIONS, find_extrema
+from vrw_jax.flow.extrema import NODE_FRACTIONS, find_extrema
 from vrw_jax.models import FORCE_PEAK_MEASURES
 
 TABLE_1 = vrw.WheelParams()

@@ -13,10 +13,10 @@ from support.machine_code import disable_machine_code
 from support.slow_variants import ENGINES, mark_slow
 
 import vrw_jax as vrw
+from vrw_jax.base.small_matrices import compute_jury_margins
 from vrw_jax.branches.branch import evaluate_bifurcations
 from vrw_jax.continuation import floquet_multipliers
 from vrw_jax.gaits import unilateral_finder as on_ground
-from vrw_jax.gaits.floquet import compute_jury_margins
 from vrw_jax.models import contact_walks as ground_lanes
 from vrw_jax.models import embed_section_states, step_batch_with_jacobian
 from vrw_jax.wheel import PARAMETER_NAMES

@@ -19,7 +19,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, lanes
-from vrw_jax.gaits import floquet
+from vrw_jax.base import small_matrices
 from vrw_jax.wheel import PARAMETER_NAMES, make_wheel_from_parameters
 
 TIGHT_OPTIONS = vrw.CycleOptions.tight()
@@ -450,7 +450,7 @@ def test_gait_without_double_support_is_found_though_unstable():
     assert int(cycle.outcome[0]) == Outcome.STEPPED
     assert float(cycle.durations[0, 0]) == 0.0
     assert float(cycle.indicators.lambda_4[0]) < 0.0
-    assert float(floquet.compute_spectral_radius(cycle.monodromy_value[0])) > 1.6
+    assert float(small_matrices.compute_spectral_radius(cycle.monodromy_value[0])) > 1.6
     options = vrw.StepOptions.tight()
     back = vrw.return_map(reference_values.make_wheel(row), cycle.section_state[0], options=options)
     np.testing.assert_allclose(back, cycle.section_state[0], atol=1e-8)
@@ -610,7 +610,7 @@ def test_section_newton_finds_the_simplest_walkers_published_cycles(x, time, mul
     cycle = jax.jit(lambda start: vrw.solve_fixed_point(lambda y: step(y, time), start))(start)
     assert bool(cycle.converged)
     np.testing.assert_allclose(cycle.x, x, atol=1e-9)
-    solution = np.sort_complex(np.asarray(floquet.floquet_multipliers(cycle.jacobian)))
+    solution = np.sort_complex(np.asarray(small_matrices.floquet_multipliers(cycle.jacobian)))
     np.testing.assert_allclose(solution, np.sort_complex(np.asarray(multipliers)), atol=3e-9)
 
 
@@ -730,7 +730,7 @@ def test_section_newton_agrees_with_the_collocation():
     start = exact.section_state * 1.01
     cycle = jax.jit(lambda start: vrw.solve_fixed_point(step, start))(start)
     np.testing.assert_allclose(cycle.x, exact.section_state, rtol=3e-12)
-    solution = floquet.floquet_multipliers(cycle.jacobian)
+    solution = small_matrices.floquet_multipliers(cycle.jacobian)
     np.testing.assert_allclose(np.abs(solution[:2]), np.abs(exact.multipliers), rtol=1e-9)
     assert abs(solution[2]) < 1e-9  # the section before touchdown adds a multiplier of zero
 

@@ -1,13 +1,12 @@
 """LLVM makes arm64 code from the same text, and an emulator computes the same digits."""
 
 import jax.numpy as jnp
-import llvmlite.binding as llvm
+import llvmlite.binding
 import numpy as np
 import pytest
 from support.arm import run_compiled_lanes
 
-from vrw_jax.lanes import code_cache as code
-from vrw_jax.lanes import kernel, machine
+from vrw_jax.lanes import llvm, machine_code
 
 ARM_TARGET = ("aarch64-unknown-linux-gnu", "generic", "+neon")
 LANES_PER_REGISTER = 2
@@ -16,9 +15,9 @@ LANES_PER_REGISTER = 2
 @pytest.fixture
 def arm_machine(monkeypatch):
     """Make machine code for arm64 in the test."""
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    monkeypatch.setattr(machine, "describe_processor", lambda: ARM_TARGET)
+    llvmlite.binding.initialize_all_targets()
+    llvmlite.binding.initialize_all_asmprinters()
+    monkeypatch.setattr(llvm, "describe_processor", lambda: ARM_TARGET)
 
 
 def compute_roots(a, b):
@@ -31,9 +30,9 @@ def compute_waves(a, b):
 
 
 def compile_for_arm(function, *lanes):
-    return machine.compile_llvm_for_processor(
-        kernel.write_llvm_kernel(
-            code.trace_for_machine_code(function, *lanes)[0], LANES_PER_REGISTER
+    return llvm.compile_llvm_for_processor(
+        machine_code.write_llvm_kernel(
+            machine_code.trace_for_machine_code(function, *lanes)[0], LANES_PER_REGISTER
         )
     )
 

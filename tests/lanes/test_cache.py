@@ -16,7 +16,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import lanes
-from vrw_jax.lanes import disk_cache as store
+from vrw_jax.lanes import environment as store
 
 X = np.arange(4.0)
 FACTORS = (2.0, 3.0)

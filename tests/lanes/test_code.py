@@ -13,8 +13,7 @@ from jax import lax
 from support.machine_code import CodeRegistrySpy, use_cache_folder
 
 from vrw_jax import lanes
-from vrw_jax.lanes import code_cache as code
-from vrw_jax.lanes import kernel
+from vrw_jax.lanes import machine_code
 
 X = np.arange(4.0)
 
@@ -39,7 +38,7 @@ def multiply(factor):
 
 def test_a_later_start_neither_traces_nor_compiles(monkeypatch, process):
     assert multiply(2.0) == [0.0, 2.0, 4.0, 6.0]
-    monkeypatch.setattr(code, "compile_llvm_for_processor", None)  # would fail
+    monkeypatch.setattr(machine_code, "compile_llvm_for_processor", None)  # would fail
     assert multiply(2.0) == [0.0, 2.0, 4.0, 6.0]
     process.reset_registry()
     assert multiply(2.0) == [0.0, 2.0, 4.0, 6.0]
@@ -51,7 +50,7 @@ def test_the_same_trace_of_another_function_is_not_compiled(monkeypatch, process
     multiply("2.0")
     if elsewhere:
         process.reset_registry()
-    monkeypatch.setattr(code, "compile_llvm_for_processor", None)  # would fail
+    monkeypatch.setattr(machine_code, "compile_llvm_for_processor", None)  # would fail
     assert multiply("abs(-2.0)") == multiply("float(2)") == [0.0, 2.0, 4.0, 6.0]
     assert process.n_traces == 3
 
@@ -63,7 +62,7 @@ def add_two_programs(x, *functions):
 def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch, process, folder):
     assert multiply(2.0)[3] == 6.0
     assert multiply(3.0)[3] == 9.0
-    monkeypatch.setattr(code, "describe_compiler_settings", lambda: "by another processor")
+    monkeypatch.setattr(machine_code, "describe_compiler_settings", lambda: "by another processor")
     assert multiply(2.0)[3] == 6.0
     assert process.n_traces == 3
     for kind in ("code", "index"):
@@ -71,9 +70,9 @@ def test_other_traces_and_compiler_settings_have_separate_code(monkeypatch, proc
 
 
 def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatch):
-    may, compiled = threading.Event(), code.compile_llvm_for_processor
+    may, compiled = threading.Event(), machine_code.compile_llvm_for_processor
     monkeypatch.setattr(
-        code, "compile_llvm_for_processor", lambda text: may.wait(60) and compiled(text)
+        machine_code, "compile_llvm_for_processor", lambda text: may.wait(60) and compiled(text)
     )
     evaluate_both = lambda x: add_two_programs(x, lambda x: 2.5 * x, lambda x: 3.5 * x)
     traced = jax.jit(evaluate_both).trace(X)
@@ -83,7 +82,7 @@ def test_tracing_continues_during_compilation_and_receives_its_errors(monkeypatc
     def refuse(text):
         raise RuntimeError("no such instruction")
 
-    monkeypatch.setattr(code, "compile_llvm_for_processor", refuse)
+    monkeypatch.setattr(machine_code, "compile_llvm_for_processor", refuse)
     traced = jax.jit(lambda x: add_two_programs(x, lambda x: 4.5 * x, lambda x: x / 7.0)).trace(X)
     with pytest.raises(RuntimeError, match="no such instruction"):
         traced.lower()
@@ -136,7 +135,7 @@ def test_code_is_loaded_by_its_name(process):
 def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
     result = """
         import jax, jax.numpy as jnp
-        from vrw_jax.lanes import code_cache, kernel
+        from vrw_jax.lanes import machine_code
         def step(x, table):
             f = lambda k: {name: jnp.sin(k * x[0]) for name in ("beta", "alpha", "gamma")}
             sums = jax.tree.map(lambda y: y + jnp.sum(x * table[:, None], 0), f(2.0) | f(0.5))
@@ -144,8 +143,8 @@ def test_the_text_that_llvm_compiles_is_the_same_in_every_process():
             return {"loop": jax.lax.fori_loop(0, 9, turn, x[1]), **sums}
         table = jnp.arange(9.0, dtype=jnp.float32)
         shape = jax.ShapeDtypeStruct((9, 1021), jnp.float32)
-        closed, _ = code_cache.trace_for_machine_code(lambda x: step(x, table), shape)
-        print(kernel.write_llvm_kernel(closed, 8))
+        closed, _ = machine_code.trace_for_machine_code(lambda x: step(x, table), shape)
+        print(machine_code.write_llvm_kernel(closed, 8))
     """
     lines = "\n".join(line[8:] for line in result.splitlines())
     method_names = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
@@ -166,7 +165,7 @@ def test_repeated_operations_along_an_axis_are_emitted_once():
 
     def length(n):
         shape = jax.ShapeDtypeStruct((1021,), jnp.float64)
-        closed, _ = code.trace_for_machine_code(lambda x: sampled(n, x), shape)
-        return len(kernel.write_llvm_kernel(closed, 8))
+        closed, _ = machine_code.trace_for_machine_code(lambda x: sampled(n, x), shape)
+        return len(machine_code.write_llvm_kernel(closed, 8))
 
     assert length(900) < 1.1 * length(100)

@@ -10,9 +10,8 @@ from jax import lax
 
 from vrw_jax.lanes import lowering
 from vrw_jax.lanes.array_emitter import LANE_AXIS_SENTINEL, ArrayEmitter
-from vrw_jax.lanes.code_cache import trace_for_machine_code
-from vrw_jax.lanes.kernel import write_llvm_kernel
 from vrw_jax.lanes.lane_function import CompiledBatchFunction
+from vrw_jax.lanes.machine_code import trace_for_machine_code, write_llvm_kernel
 
 N_ARRAYS = 3
 N_ROWS = 5

@@ -12,7 +12,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import lanes
-from vrw_jax.lanes import kernel, program
+from vrw_jax.lanes import machine_code, program
 
 PROGRAM = """
 import json, sys, warnings
@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from vrw_jax.lanes import program, kernel, lowering
+from vrw_jax.lanes import program, machine_code, lowering
 program.LATEST_TESTED_JAX_RELEASE = (0, 1)
 {change}
 import vrw_jax as vrw
@@ -42,7 +42,7 @@ print(json.dumps([in_jit, of_arrays, messages, lanes.is_machine_code_available()
 
 CHANGES = {
     "a primitive is new": 'del lowering.PRIMITIVE_RULES["while"]',
-    "the call interface differs": "kernel.read_ffi_api_version = lambda: (7, 0)",
+    "the call interface differs": "machine_code.read_ffi_api_version = lambda: (7, 0)",
     "nothing differs": "",
 }
 
@@ -74,9 +74,9 @@ def test_xla_computes_where_an_untested_jax_differs(change, tmp_path):
 WHEEL_PROGRAM = """
 import json, sys, warnings
 import numpy as np
-from vrw_jax.lanes import program, kernel
+from vrw_jax.lanes import program, machine_code
 program.LATEST_TESTED_JAX_RELEASE = (0, 1)
-kernel.read_ffi_api_version = lambda: (7, 0)
+machine_code.read_ffi_api_version = lambda: (7, 0)
 import vrw_jax as vrw
 vrw.start_jax(sys.argv[1])
 warnings.simplefilter("ignore")
@@ -102,13 +102,13 @@ def test_the_handler_reports_its_version_to_a_request_for_metadata_only():
     np.testing.assert_array_equal(run(jnp.arange(8.0)), np.arange(8.0) + 1.0)
     code = list(program.LOADED_CODE_BY_FFI_TARGET.values())[-1]
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(
-        code.find_function_address(kernel.FFI_HANDLER_NAME)
+        code.find_function_address(machine_code.FFI_HANDLER_NAME)
     )
     metadata = (ctypes.c_int64 * 8)()
-    extension = (ctypes.c_int64 * 4)(32, kernel.FFI_METADATA_EXTENSION_TYPE, 0)
+    extension = (ctypes.c_int64 * 4)(32, machine_code.FFI_METADATA_EXTENSION_TYPE, 0)
     extension[3] = ctypes.addressof(metadata)
     frame = (ctypes.c_int64 * 32)(0, ctypes.addressof(extension))
     assert not handler(ctypes.addressof(frame))
-    version = kernel.read_ffi_api_version()
+    version = machine_code.read_ffi_api_version()
     assert tuple((ctypes.c_int32 * 2).from_buffer(metadata, 24)) == version
     assert version != (0, 0)

@@ -9,7 +9,7 @@ from jax import lax
 from support.machine_code import CodeRegistrySpy, disable_machine_code, use_cache_folder
 
 from vrw_jax import lanes
-from vrw_jax.lanes import code_cache
+from vrw_jax.lanes import machine_code
 
 N = 21  # no multiple of the lanes in a group
 GENERATOR = np.random.default_rng(0)
@@ -178,9 +178,9 @@ def test_derivatives_of_every_mode_agree_with_an_unrolled_loop(transform):
 
 
 def test_a_separate_function_is_compiled_once_for_all_calls_and_columns(monkeypatch, tmp_path):
-    matrix, texts, write = GENERATOR.normal(size=(9, 9)), [], code_cache.write_llvm_kernel
+    matrix, texts, write = GENERATOR.normal(size=(9, 9)), [], machine_code.write_llvm_kernel
     monkeypatch.setattr(
-        code_cache, "write_llvm_kernel", lambda *a: texts.append(write(*a)) or texts[-1]
+        machine_code, "write_llvm_kernel", lambda *a: texts.append(write(*a)) or texts[-1]
     )
     multiply = lanes.mark_noinline(lambda x: matrix @ x)
     multiply_thrice = lanes.jit(lambda x: multiply(multiply(multiply(x))))

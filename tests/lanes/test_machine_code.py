@@ -7,9 +7,9 @@ import pytest
 from support.machine_code import CodeRegistrySpy, use_cache_folder
 
 from vrw_jax import lanes
-from vrw_jax.lanes import code_cache as code
-from vrw_jax.lanes import disk_cache as store
-from vrw_jax.lanes import saved_traces
+from vrw_jax.lanes import environment as store
+from vrw_jax.lanes import machine_code as code
+from vrw_jax.lanes import program
 
 X = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9)))
 
@@ -69,13 +69,13 @@ def test_an_edit_that_changes_no_trace_compiles_nothing(cache_folder, fresh_proc
 def test_a_program_cached_by_another_processor_is_traced_again(cache_folder, monkeypatch):
     """It calls machine code that may not run here."""
     exports = []
-    original_export = saved_traces.export.export
+    original_export = program.export.export
     spy = lambda *a, **k: exports.append(1) or original_export(*a, **k)
-    monkeypatch.setattr(saved_traces.export, "export", spy)
+    monkeypatch.setattr(program.export, "export", spy)
     run = lambda: lanes.compile_exported_function(lambda x: 2.0 * x, (X,), jax.devices()[0])(X)
     run(), run()
     assert len(exports) == 1
-    monkeypatch.setattr(saved_traces, "describe_processor", lambda: ("x86_64", "another", ""))
+    monkeypatch.setattr(program, "describe_processor", lambda: ("x86_64", "another", ""))
     run()
     assert len(exports) == 2
 

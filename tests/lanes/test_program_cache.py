@@ -20,7 +20,7 @@ from vrw_jax.hybrid import (
     simulate_hybrid,
     time_errors,
 )
-from vrw_jax.lanes.saved_traces import (
+from vrw_jax.lanes.program import (
     MAX_CACHED_PROGRAMS,
     _program_by_key,
     call_compiled_program,

@@ -11,7 +11,7 @@ from support.slow_variants import make_params_with_slow_marks
 import vrw_jax as vrw
 from vrw_jax.hybrid import Guard, Mode, simulate_hybrid
 from vrw_jax.lanes import count_available_cores, with_default_jax_settings
-from vrw_jax.lanes.settings import call_python, can_programs_call_jax
+from vrw_jax.lanes.environment import call_python, can_programs_call_jax
 
 STRICT_SETTINGS = (
     ("jax_disable_jit", True),

@@ -8,7 +8,7 @@ from jax import lax
 from support.machine_code import CodeRegistrySpy, use_cache_folder
 from support.slow_variants import mark_slow
 
-from vrw_jax.lanes import code_cache, compile_batch_function, mark_noinline, program
+from vrw_jax.lanes import compile_batch_function, machine_code, mark_noinline, program
 from vrw_jax.lanes.lowering import PRIMITIVE_RULES
 from vrw_jax.lanes.value_emitter import ELEMENTWISE_RULES
 
@@ -133,7 +133,7 @@ def test_few_lanes_have_smaller_code_with_the_same_bits_unless_more_ran_before(
         run = make_program(evaluate_arithmetic, lanes)
         counts = (3, 20, 4) if few_first else (20, 3, 4)
         results = [run([np.float64(0.7)], [x[:n] for x in lanes]) for n in counts]
-        assert len(code_cache._lane_program_by_index_name) == 1 + few_first
+        assert len(machine_code._lane_program_by_index_name) == 1 + few_first
     for others in results[1:]:
         for first, other in zip(results[0], others, strict=True):
             n = min(len(first), len(other))

@@ -38,7 +38,7 @@ def test_the_library_is_imported_without_llvmlite_and_names_it():
     hide = "import sys; sys.modules.update(dict.fromkeys(('llvmlite', 'llvmlite.ir', "
     check = hide + "'llvmlite.binding'))); import vrw_jax.lanes as lanes; "
     check += "import jax; assert not lanes.is_machine_code_available(); "
-    check += "lanes.kernel.write_llvm_kernel(jax.make_jaxpr(lambda x: x)(1.0), 4)"
+    check += "lanes.machine_code.write_llvm_kernel(jax.make_jaxpr(lambda x: x)(1.0), 4)"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.run(
         [sys.executable, "-c", check], env=environment, capture_output=True, text=True

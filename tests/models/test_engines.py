@@ -9,7 +9,7 @@ import pytest
 
 import vrw_jax as vrw
 from vrw_jax import lanes
-from vrw_jax.base import batch_sizes
+from vrw_jax.models import step_batch
 from vrw_jax.wheel import PARAMETER_DOMAINS, PARAMETER_NAMES, make_wheel_from_parameters
 
 N = 40
@@ -50,7 +50,7 @@ def flatten_derivatives(by_input):
 def results_of_both_engines():
     params, states = draw_box(N, 0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch_sizes, "DIFFRAX_BATCH_SIZE", N)  # without padding
+        patch.setattr(step_batch, "DIFFRAX_BATCH_SIZE", N)  # without padding
         lanes, diffrax = (
             vrw.step_batch(
                 params, states, options=TIGHT_OPTIONS, engine=engine, derivatives=ALL_INPUT_NAMES
@@ -63,7 +63,7 @@ def results_of_both_engines():
 def test_a_batch_by_diffrax_without_elements_has_results_of_the_usual_shapes(
     results_of_both_engines, monkeypatch
 ):
-    monkeypatch.setattr(batch_sizes, "DIFFRAX_BATCH_SIZE", N)
+    monkeypatch.setattr(step_batch, "DIFFRAX_BATCH_SIZE", N)
     _, full = results_of_both_engines
     for names, expected in (ALL_INPUT_NAMES, full), ((), dataclasses.replace(full, derivatives={})):
         empty = vrw.step_batch(

@@ -17,7 +17,7 @@ from support.slow_variants import mark_slow
 
 import vrw_jax as vrw
 from vrw_jax import Outcome, lanes
-from vrw_jax.base import batch_sizes, compute_sine_cosine
+from vrw_jax.base import compute_sine_cosine
 from vrw_jax.flow import integrate_batch_phase
 from vrw_jax.flow.solver_steps import (
     BatchPhase,
@@ -29,6 +29,7 @@ from vrw_jax.flow.solver_steps import (
 )
 from vrw_jax.lanes import lane_function
 from vrw_jax.lanes.batching import choose_batch_size
+from vrw_jax.models import step_batch
 from vrw_jax.models import step_batch as lane_batch
 from vrw_jax.models.step_batch import select_cheapest_solver
 
@@ -186,7 +187,7 @@ def test_xla_blocks_agree_with_machine_code(monkeypatch):
     parameter_rows, states = draw_hard_starts(300)
     solution, codes = compute_values(parameter_rows, states, COARSE_OPTIONS)
     disable_machine_code(monkeypatch)
-    monkeypatch.setattr(batch_sizes, "XLA_LANE_BATCH_SIZE", 64)
+    monkeypatch.setattr(step_batch, "XLA_LANE_BATCH_SIZE", 64)
     monkeypatch.setattr(lane_function, "STRAGGLER_COUNT_DIVISOR", 10**9)  # no block stops early
     patient, code = compute_values(parameter_rows, states, COARSE_OPTIONS)
     np.testing.assert_array_equal(code, codes)

@@ -30,15 +30,14 @@ from support.scanning import (
 import vrw_jax as vrw
 from vrw_jax import Outcome, WheelParams
 from vrw_jax.app.config import parse_config
-from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
 from vrw_jax.gaits import finder
 from vrw_jax.lanes.keys import make_key
 from vrw_jax.models import MARGIN_MEASURES
 from vrw_jax.studies import ScanPlan, ScanProgress, plan_scan, scan_engines, scan_store
-from vrw_jax.studies import scan_dask as dask
 from vrw_jax.studies import scan_design as designs
+from vrw_jax.studies import scan_execution as dask
 from vrw_jax.studies import scan_planning as planning
-from vrw_jax.studies.scan_engines import CollocationScanEngine
+from vrw_jax.studies.scan_engines import SCAN_BATCH_SIZE, CollocationScanEngine
 from vrw_jax.studies.scan_planning import describe_settings_difference
 from vrw_jax.wheel import PARAMETER_NAMES
 
@@ -569,7 +568,7 @@ import os, sys
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " {flag}"
 import jax, numpy as np
 import vrw_jax
-from vrw_jax.base.batch_sizes import SCAN_BATCH_SIZE
+from vrw_jax.studies.scan_engines import SCAN_BATCH_SIZE
 from vrw_jax.studies.scan_engines import CollocationScanEngine
 vrw_jax.start_jax(os.environ["JAX_COMPILATION_CACHE_DIR"])
 sys.path.insert(0, {tests!r})
@@ -691,12 +690,11 @@ def test_workers_with_another_environment_are_refused(
     from distributed import LocalCluster
 
     cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
-    scan_dask = dask
     environments = iter([{"code": "ours"}])
     monkeypatch.setattr(
-        scan_dask, "describe_computing_environment", lambda: next(environments, {"code": "theirs"})
+        dask, "describe_computing_environment", lambda: next(environments, {"code": "theirs"})
     )
-    monkeypatch.setattr(scan_dask, "make_worker_engine", lambda _: evaluate_arithmetically)
+    monkeypatch.setattr(dask, "make_worker_engine", lambda _: evaluate_arithmetically)
     with (
         LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster,
         pytest.raises(ValueError, match="the library's code differs"),

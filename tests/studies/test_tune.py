@@ -12,7 +12,7 @@ from support.walkers import BALL_PARAMS, JuggledBall
 
 import vrw_jax as vrw
 from vrw_jax import tune
-from vrw_jax.app.reports import format_tuning_summary
+from vrw_jax.app.output import format_tuning_summary
 from vrw_jax.gaits import make_finder
 from vrw_jax.models import MARGIN_MEASURES
 from vrw_jax.studies import TrialKind

@@ -80,7 +80,7 @@ def relocate(memory: bytearray, address: int, kind: int, target: int) -> None:
 def run_compiled_lanes(
     code: bytes, inputs: list[np.ndarray], output_shapes: list[np.ndarray], width: int
 ) -> None:
-    """Run the kernel of `lanes.kernel` on `inputs`; write its results into `output_shapes`."""
+    """Run a kernel of `lanes.machine_code` on `inputs`; write its results into `output_shapes`."""
     from unicorn import UC_ARCH_ARM64, UC_MODE_ARM, Uc
     from unicorn import arm64_const as arm
 

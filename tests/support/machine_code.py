@@ -6,7 +6,7 @@ from collections import OrderedDict
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from vrw_jax.lanes import code_cache as code
+from vrw_jax.lanes import machine_code as code
 from vrw_jax.lanes import program
 
 _REGISTERED = (

@@ -16,11 +16,11 @@ SHARED_LIBRARIES = {"equinox", "jax", "jaxtyping", "numpy", "scipy", "xarray"}
 """Libraries that every package may import."""
 
 ALLOWED_IMPORTERS = {
-    "PIL": "app", "anywidget": "app", "cycler": "app", "dask": "studies.scan_dask",
-    "diffrax": "flow.phase_integration", "distributed": "studies.scan_dask", "llvmlite": "lanes",
-    "matplotlib": "app", "optax": "studies", "optimistix": "studies", "pydantic": "app.config",
-    "pydantic_core": "app.config", "rich": "app", "traitlets": "app", "typer": "app",
-    "zarr": "studies",
+    "PIL": "app", "anywidget": "app", "cycler": "app", "dask": "studies.scan_execution",
+    "diffrax": "flow.phase_integration", "distributed": "studies.scan_execution",
+    "llvmlite": "lanes", "matplotlib": "app", "optax": "studies", "optimistix": "studies",
+    "pydantic": "app.config", "pydantic_core": "app.config", "rich": "app", "traitlets": "app",
+    "typer": "app", "zarr": "studies",
 }  # fmt: skip
 """The one package or module that may import a library."""
 

@@ -1,59 +1,404 @@
-"""Figures of branches with special points, of basins, of tuning runs, and tornado plots."""
+"""Figures of gaits: phases and forces of one gait, comparisons of several, and branches."""
 
 import itertools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
 
+from vrw_jax.app._walk_figures import (
+    GROUND_FORCE_NAMES,
+    LEG_LINE_STYLES,
+    find_constant_spans,
+    insert_landing_gaps,
+    make_contact_panels,
+    make_coordinate_panels,
+    make_time_panels,
+    require_nonempty_walk,
+)
 from vrw_jax.app.figure_style import (
+    COLUMN_FIGURE_WIDTH_INCHES,
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
     LIGHT_GRAY_COLOR,
     OKABE_ITO_AMBER,
-    OKABE_ITO_BLUE,
     OKABE_ITO_GREEN,
-    OKABE_ITO_ORANGE,
     OKABE_ITO_PINK,
     OKABE_ITO_SKY_BLUE,
-    OKABE_ITO_YELLOW,
     PAGE_FIGURE_WIDTH_INCHES,
     FigureWidth,
     StyledFigure,
     add_figure_legend,
     add_side_legend,
-    add_wrapped_legend,
     count_panel_columns,
-    declare_own_quantities,
-    describe_quantity,
     draw_markers,
-    draw_outcome_cells,
     draw_panel_letter,
     figure_style,
     find_width_inches,
     format_axis_label,
     format_value_label,
     label_lowest_panels,
-    make_bar_panels,
-    make_outcome_patches,
     make_panel_grid,
     require_dataset_variables,
     require_variables_of_datasets,
     typeset_greek_symbols,
 )
-from vrw_jax.base.checks import check_names, check_positive, check_type, require_known_name
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.checks import (
+    check_type,
+    require_known_name,
+)
 from vrw_jax.branches.branch import Branch, SpecialPoint
-from vrw_jax.models.measures import MEASURES, describe_violation
-from vrw_jax.studies.tune_maximization import ACTIVE_BOUND_TOLERANCE, TrialKind
-from vrw_jax.studies.tune_problem import UPPER_BOUND_PREFIX, restore_sign_of_bound
-from vrw_jax.studies.tuning import TuneResult
-from vrw_jax.wheel.params import check_parameter_name
+from vrw_jax.models.measures import MEASURES, PHASE_NAMES, describe_violation
+
+
+@figure_style()
+def gait_panels(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
+    """Return a figure of the motion and the ground forces of a gait (Fig. 6 of the paper).
+
+    The panels show angle, leg lengths, load share, foot height and ground forces. Gray bands mark
+    double support, and dotted lines mark collision II. For walks with unilateral contact, the
+    panels show angle, leg lengths, contact modes, foot heights, and normal and tangential forces.
+    For a `HybridSystem`, each panel shows a coordinate of the state, on a background that marks the
+    modes, with dotted lines at the section.
+
+    Args:
+        gait: dataset that `vrw.simulate` returns for any model, or for a `HybridSystem`.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        Figure: panels over time (s), in SI units.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.gait_panels(gait)
+    """
+    if isinstance(gait, xr.Dataset) and "section" in gait.attrs and gait.sizes.get("time"):
+        return make_coordinate_panels(gait, width)
+    return _make_gait_panels(gait, width, forces_only=False)
+
+
+@figure_style()
+def ground_forces(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
+    """Return a figure of the ground forces of a gait, which is the last part of `gait_panels`.
+
+    Args:
+        gait: dataset that `vrw.simulate` returns for any model.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        Figure: forces (N) over time (s). With unilateral contact, one panel shows the normal
+        forces, and another panel shows the tangential forces.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.ground_forces(gait, width="column")
+    """
+    return _make_gait_panels(gait, width, forces_only=True)
+
+
+def _make_gait_panels(gait: xr.Dataset, width: FigureWidth, forces_only: bool) -> Figure:
+    require_nonempty_walk("gait", gait)
+    width_inches = find_width_inches(width, 0.8 * PAGE_FIGURE_WIDTH_INCHES)
+    if "contact" in gait:
+        return make_contact_panels(gait, width_inches, forces_only)
+    times, theta, L1, L2, rear_foot_height, *forces = (
+        insert_landing_gaps(gait, gait[variable_name].values)
+        for variable_name in ("time", "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES)
+    )
+    height, ratios = (2.3, [1.5]) if forces_only else (7.4, [1, 1, 1, 1, 1.5])
+    figure, panel_axes = make_time_panels(width_inches, height, ratios, times)
+    leg_1_style, leg_2_style = (
+        {"color": line_color, "linestyle": line_style}
+        for line_color, line_style in LEG_LINE_STYLES.values()
+    )
+    if not forces_only:
+        angle_axes, length_axes, load_axes, height_axes, _ = panel_axes
+        angle_axes.plot(times, theta, color="black")
+        angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
+        length_axes.plot(times, L1, label="Leg 1, $L_1$", **leg_1_style)
+        length_axes.plot(times, L2, label="Leg 2, $L_2$", **leg_2_style)
+        length_axes.set_ylabel("$L_1,\\ L_2$ [m]")
+        rear_load_percent = 100.0 * forces[3] / (forces[1] + forces[3])
+        load_axes.plot(times, 100.0 - rear_load_percent, label="foot 1", **leg_1_style)
+        load_axes.plot(times, rear_load_percent, label="foot 2", **leg_2_style)
+        load_axes.set_ylabel("share of the\nnormal force [%]")
+        height_axes.plot(times, rear_foot_height, **leg_2_style)
+        height_axes.set_ylabel("$z_2$ [m]")
+    force_axes = panel_axes[-1]
+    for i, force_name in enumerate(GROUND_FORCE_NAMES):
+        force_axes.plot(
+            times,
+            forces[i],
+            linewidth=(0.7, 1.4)[i % 2],
+            label=f"${MEASURES[force_name].mathtext}$",
+            **(leg_1_style if i < 2 else leg_2_style),
+        )
+    force_axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4)
+    force_axes.set_ylabel("ground reaction\nforce [N]")
+    if forces_only and count_panel_columns(width_inches, 2) == 1:  # The names of phases are above.
+        add_figure_legend(figure, force_axes.get_legend_handles_labels()[0], 4)
+    else:
+        for axes in (force_axes,) if forces_only else (length_axes, load_axes, force_axes):
+            add_side_legend(axes)
+    figure.align_ylabels(panel_axes)
+    _mark_phases(panel_axes, find_constant_spans(gait, gait.phase.values))
+    return figure
+
+
+def _mark_phases(panel_axes: np.ndarray, phase_spans: list[tuple[float, float, int]]) -> None:
+    """Mark double support and collision II, and name the phases of the first step on top.
+
+    A name is upright where its phase is shorter than the name, and is omitted where it would cover
+    another one.
+    """
+    for axes in panel_axes:
+        for start_time, end_time, phase_code in phase_spans:
+            if phase_code == 0:
+                axes.axvspan(start_time, end_time, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
+            if phase_code == 2:
+                dotted = (0, (1, 2))
+                axes.axvline(
+                    start_time, color=DARK_GRAY_COLOR, linewidth=0.5, linestyle=dotted, zorder=0
+                )
+    axes = panel_axes[0]
+    names = [
+        axes.annotate(
+            PHASE_NAMES[phase_code],
+            (0.5 * (start_time + end_time), 1.0),
+            xycoords=("data", "axes fraction"),
+            ha="center",
+            va="bottom",
+            fontsize=7.5,
+        )
+        for start_time, end_time, phase_code in phase_spans[:3]
+    ]
+    axes.figure.draw_without_rendering()  # The layout defines the widths of the phases.
+    pixels_per_second = axes.bbox.width / np.ptp(axes.get_xlim())
+    last_right_edge = -np.inf
+    for name, (start_time, end_time, _) in zip(names, phase_spans, strict=False):
+        if name.get_window_extent().width > (end_time - start_time) * pixels_per_second:
+            name.set_rotation(90)
+        extent = name.get_window_extent()
+        if extent.x0 < last_right_edge:
+            name.remove()
+        else:
+            last_right_edge = extent.x1
+
+
+NO_PAPER_WALK_REMEDY = (
+    "give vrw.simulate(params) of the paper's wheel; vrw.plot.gait_panels, sticks and walk_frames "
+    "draw walks of any model"
+)
+"""Remedy in the error message for a walk without the phases of the paper."""
+
+
+GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
+"""Line styles of the gaits in one figure, which more gaits repeat in other colors."""
+
+
+def _format_gait_lines(
+    gaits: Sequence[xr.Dataset], vary: str
+) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
+    """Yield each gait with the style and the label of its line, for matplotlib."""
+    for gait, line_style in zip(gaits, itertools.cycle(GAIT_LINE_STYLES), strict=False):
+        names = [x.removeprefix("parameter_") for x in gait.attrs if x.startswith("parameter_")]
+        require_known_name(vary, names, "parameter of these gaits")
+        label = format_value_label(vary, gait.attrs[f"parameter_{vary}"])
+        yield gait, {"linestyle": line_style, "label": label}
+
+
+@figure_style()
+def foot_height(
+    gaits: Sequence[xr.Dataset], vary: str = "damping", *, width: FigureWidth = None
+) -> Figure:
+    """Return a figure of the height of foot 2 during one step of each gait (Fig. 8 of the paper).
+
+    A second panel shows the height around take-off, in mm.
+
+    Args:
+        gaits: datasets that `vrw.simulate` returns for one step, one per curve.
+        vary: name of the parameter in which the gaits differ, used in the legend.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        Figure: two panels over the time since the landing, in s.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.foot_height([gait])
+    """
+    require_variables_of_datasets("gaits", gaits, ("phase", "foot_2_z"), NO_PAPER_WALK_REMEDY)
+    figure, (step_axes, takeoff_axes) = make_panel_grid(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES), 2, 2.6, 0.0, 2
+    )
+    for gait, line_format in _format_gait_lines(gaits, vary):
+        foot_height_mm = 1e3 * gait.foot_2_z
+        lowest_mm = float(foot_height_mm.min())
+        clearance_text = f"lowest −{-lowest_mm:.1f} mm" if lowest_mm < -1e-6 else "clear"
+        step_axes.plot(gait.time, gait.foot_2_z, **line_format)
+        takeoff_axes.plot(gait.time, foot_height_mm, **line_format | {"label": clearance_text})
+    for panel_letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
+        draw_panel_letter(axes, panel_letter)
+        axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
+        axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
+        axes.set_xlabel("time since landing [s]")
+    step_axes.legend(loc="upper left")
+    heights = np.concatenate([gait.foot_2_z for gait in gaits])
+    min_height, max_height = heights.min(), heights.max()
+    takeoff_times = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
+    step_axes.set(
+        xlim=(0.0, max(float(gait.time.max()) for gait in gaits)),
+        ylim=(2.0 * min_height - 0.004, 1.05 * max_height),
+        ylabel="height of foot 2, $z_2$ [m]",
+    )
+    takeoff_axes.set(
+        xlim=(min(takeoff_times) - 0.03, max(takeoff_times) + 0.12),
+        ylim=(1.3e3 * min_height - 0.5, -1.8e3 * min_height + 0.5),
+        ylabel="$z_2$ [mm]",
+    )
+    takeoff_axes.legend(loc="best")
+    takeoff_axes.text(
+        0.98,
+        0.03,
+        "below the ground",
+        transform=takeoff_axes.transAxes,
+        ha="right",
+        color=DARK_GRAY_COLOR,
+    )
+    return figure
+
+
+@figure_style()
+def rear_force(
+    gaits: Sequence[xr.Dataset], vary: str = "damping", *, width: FigureWidth = None
+) -> Figure:
+    """Return a figure of the normal force on foot 2 in double support of each gait (Fig. 9 of the
+    paper).
+
+    Args:
+        gaits: datasets that `vrw.simulate` returns for one step, one per curve.
+        vary: name of the parameter in which the gaits differ, used in the legend.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        Figure: one panel over the time since the landing, in s.
+
+    Examples:
+        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
+        >>> figure = vrw.plot.rear_force([gait])
+    """
+    require_variables_of_datasets("gaits", gaits, ("phase", "lambda_4"), NO_PAPER_WALK_REMEDY)
+    figure = StyledFigure(figsize=(find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES), 2.5))
+    axes = figure.subplots()
+    for gait, line_format in _format_gait_lines(gaits, vary):
+        double_support = gait.isel(time=gait.phase.values == 0)
+        (force_line,) = axes.plot(double_support.time, double_support.lambda_4, **line_format)
+        axes.plot(
+            0.0,
+            double_support.lambda_4[0],
+            "o",
+            color=force_line.get_color(),
+            markersize=3.5,
+            clip_on=False,
+        )
+    axes.set(
+        xlim=(0.0, None),
+        ylim=(0.0, None),
+        xlabel="time since landing [s]",
+        ylabel="normal force on foot 2, $\\lambda_4$ [N]",
+    )
+    axes.legend(loc="upper right")
+    return figure
+
+
+@figure_style()
+def indicators(gaits: xr.Dataset, every: int = 4, *, width: FigureWidth = None) -> Figure:
+    """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10 of the paper).
+
+    Symbols are filled if foot 2 stays above the ground, and open if foot 2 scuffs.
+
+    Args:
+        gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
+            `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
+            `parameter_slope` is the slope in rad.
+        every: spacing of the symbols: they are drawn at parameter values that are multiples of this
+            number, and at the first and the last value.
+        width: "column", "page" or a number of mm; None for the usual width.
+
+    Returns:
+        Figure: the impulse and the two forces over the parameter.
+
+    Examples:
+        >>> columns = {"lambda_I4": [5.0, 4.0], "lambda_2_plus": [90.0, 80.0]}
+        >>> columns |= {"lambda_4_plus": [50.0, 60.0], "settled": [True, True]}
+        >>> columns |= {"clearance_sls1": [0.01, 0.02], "clearance_sls2": [0.01, 0.02]}
+        >>> over = {name: ("damping", values) for name, values in columns.items()}
+        >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
+        >>> figure = vrw.plot.indicators(gaits)
+    """
+    require_dataset_variables(
+        "gaits",
+        gaits,
+        ("settled", "lambda_I4"),
+        "give gaits over one parameter, as in the example of vrw.plot.indicators",
+    )
+    varied_parameter = str(gaits.settled.dims[0])
+    valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
+    is_scuffing = np.minimum(valid_gaits.clearance_sls1, valid_gaits.clearance_sls2).values < 0.0
+    parameter_values = valid_gaits[varied_parameter].values
+    value_range = (parameter_values.min(), parameter_values.max())
+    is_marker_drawn_at_value = (parameter_values % every == 0) | np.isin(
+        parameter_values, value_range
+    )
+    panel_rows = (
+        ((("lambda_I4", LEG_1_COLOR, "o"),), "impulse [N·s]"),
+        ((("lambda_2_plus", LEG_1_COLOR, "s"), ("lambda_4_plus", LEG_2_COLOR, "o")), "force [N]"),
+    )
+    figure, panel_axes = make_panel_grid(
+        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES), 2, 2.7, 0.0, 2
+    )
+    for axes, panel_letter, (panel_indicators, axis_label) in zip(
+        panel_axes, "ab", panel_rows, strict=True
+    ):
+        draw_panel_letter(axes, panel_letter)
+        for indicator_name, line_color, marker_symbol in panel_indicators:
+            indicator_values = valid_gaits[indicator_name].values
+            axes.plot(parameter_values, indicator_values, color=line_color, linewidth=0.7)
+            for is_drawn, fill_color, legend_suffix in (
+                (is_marker_drawn_at_value & ~is_scuffing, line_color, ""),
+                (is_marker_drawn_at_value & is_scuffing, "white", ", scuffing"),
+            ):
+                draw_markers(
+                    axes,
+                    parameter_values[is_drawn],
+                    indicator_values[is_drawn],
+                    marker_symbol,
+                    line_color,
+                    fill_color,
+                    label=f"${MEASURES[indicator_name].mathtext}${legend_suffix}",
+                    clip_on=False,
+                )
+        max_indicator = max(valid_gaits[name].max() for name, *_ in panel_indicators)
+        axes.set(
+            xlim=(0.0, value_range[1] + 1.0),
+            ylim=(0.0, 1.18 * max_indicator),
+            xlabel=format_axis_label(varied_parameter, "{symbol}"),
+            ylabel=axis_label,
+        )
+        axes.legend(
+            loc="lower right" if panel_letter == "a" else "upper right", ncols=len(panel_indicators)
+        )
+    ground_slope = gaits.attrs["parameter_slope"]  # The slope in the paper's caption is a misprint.
+    panel_axes[0].text(
+        0.02, 0.05, format_value_label("slope", ground_slope), transform=panel_axes[0].transAxes
+    )
+    return figure
+
 
 BRANCH_END_COLOR = OKABE_ITO_PINK
 """Color that marks the end of a branch, chosen because no curve has this color."""
@@ -309,399 +654,3 @@ def _add_branch_legend(figure: Figure, special_points: list[SpecialPoint], branc
         Line2D([], [], color="black", linestyle="--", label="unstable"),
     ]
     add_figure_legend(figure, legend_handles, 2, fontsize=7.5)
-
-
-@figure_style()
-def basin_figure(
-    results: list[xr.Dataset], titles: list[str], *, width: FigureWidth = None
-) -> Figure:
-    """Return a figure of basins of attraction, one panel per result.
-
-    Crosses mark the section states of the gaits. Shades of gray show after how many steps a walk
-    reaches the gait, and colors show the outcomes of failed walks.
-
-    Args:
-        results: results of `vrw.basin`, each with two axes of starts.
-        titles: title of each panel.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: the panels side by side.
-
-    Examples:
-        >>> starts = {"theta_touchdown": 0.09, "dtheta_touchdown": [1.4, 1.6]}
-        >>> starts |= {"dL1_touchdown": [-0.1, 0.0]}
-        >>> basins = vrw.basin(vrw.WheelParams(), starts)
-        >>> figure = vrw.plot.basin_figure([basins], ["Table 1"])
-    """
-    require_variables_of_datasets(
-        "results", results, ("outcome", "attractor"), "give vrw.basin(params, grid)"
-    )
-    for index, result in enumerate(results):
-        if result.attractor.ndim != 2:
-            raise ValueError(
-                f"results[{index}] has {result.attractor.ndim} axes of starts, but a panel shows "
-                "two: give vrw.basin a grid in which two quantities have several values."
-            )
-    titles = list(check_names("titles", titles, '"Table 1"'))
-    if len(titles) != len(results):
-        raise ValueError(
-            f"titles has {len(titles)} entries, but results has {len(results)}: give one title for "
-            "each result."
-        )
-    results = [result.sortby(list(result.attractor.dims)) for result in results]
-    all_outcome_codes = np.concatenate(
-        [basin_dataset.outcome.values.ravel() for basin_dataset in results]
-    )
-    failure_outcome_codes = np.setdiff1d(all_outcome_codes, Outcome.STEPPED).tolist()
-    steps_to_gait_by_panel = [
-        basin_dataset.steps.where(basin_dataset.attractor >= 0) for basin_dataset in results
-    ]
-    max_n_steps_to_gait = max(
-        1.0, *(float(x.max()) for x in steps_to_gait_by_panel), key=np.nan_to_num
-    )
-    figure, panel_axes = make_panel_grid(
-        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
-        len(results),
-        2.8,
-        0.5,
-        len(results),
-        sharey=True,
-    )
-    for axes, basin_dataset, steps_to_gait, panel_title in zip(
-        panel_axes, results, steps_to_gait_by_panel, titles, strict=True
-    ):
-        vertical_axis_name, horizontal_axis_name = map(str, basin_dataset.attractor.dims)
-        x, y = basin_dataset[horizontal_axis_name].values, basin_dataset[vertical_axis_name].values
-        step_count_image = axes.pcolormesh(
-            x,
-            y,
-            steps_to_gait,
-            cmap="Greys_r",
-            vmin=0.0,
-            vmax=2.2 * max_n_steps_to_gait,
-            rasterized=True,
-        )
-        if failure_outcome_codes:
-            draw_outcome_cells(axes, x, y, basin_dataset.outcome.values, failure_outcome_codes)
-        axis_names = [horizontal_axis_name, vertical_axis_name]
-        if "component" in basin_dataset and {*axis_names} <= {*basin_dataset.component.values}:
-            axes.plot(
-                *basin_dataset.orbit_state.sel(component=axis_names).values.reshape(-1, 2).T,
-                "+",
-                color=OKABE_ITO_YELLOW,
-                markersize=7.0,
-                markeredgewidth=1.6,
-            )
-        xlabel, ylabel = (format_axis_label(x, "{symbol}", basin_dataset) for x in axis_names)
-        axes.set(title=panel_title, xlabel=xlabel)
-        if axes.get_subplotspec().is_first_col():
-            axes.set_ylabel(ylabel)
-    color_bar = figure.colorbar(step_count_image, ax=list(panel_axes), aspect=25, pad=0.01)
-    color_bar.set_label("steps until the gait is reached")
-    color_bar.ax.set_ylim(0.0, max_n_steps_to_gait)
-    add_figure_legend(figure, make_outcome_patches(failure_outcome_codes), 4, fontsize=7.5)
-    return figure
-
-
-@figure_style()
-def tuning_figure(tuned: TuneResult, *, width: FigureWidth = None) -> Figure:
-    """Return a figure of a tuning run: objective, parameters, and slacks of the constraints.
-
-    Filled symbols are gaits that satisfy every constraint; open symbols are gaits that violate a
-    constraint. Dotted lines mark trials without a usable gait, after which the optimizer step was
-    shortened.
-
-    Args:
-        tuned: result of `vrw.tune`.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: objective and parameters over the evaluated gaits, and the slacks at start and end.
-
-    Examples:
-        >>> bounds = {"damping": (100.0, 215.0)}
-        >>> tuned = vrw.tune(vrw.WheelParams(), "dls_fraction", ["damping"], bounds)
-        >>> figure = vrw.plot.tuning_figure(tuned)
-    """
-    check_type("tuned", tuned, TuneResult, "give vrw.tune(params, objective, free, bounds)")
-    path_dataset = tuned.path
-    n_constraints = path_dataset.sizes["constraint"]
-    # Each constraint has one line of text.
-    slack_height_inches = 0.19 * n_constraints + 1.0
-    width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
-    if has_two_columns := count_panel_columns(width_inches, 3) == 3:  # Names need one column.
-        figure = StyledFigure(figsize=(width_inches, max(3.2, slack_height_inches)))
-        panel_axes = figure.subplot_mosaic(
-            [["objective", "slack"], ["parameters", "slack"]], width_ratios=[1.0, 1.1]
-        )
-    else:
-        panel_heights = [1.8, 1.8, slack_height_inches]
-        figure = StyledFigure(figsize=(width_inches, sum(panel_heights)))
-        panel_axes = figure.subplot_mosaic(
-            [["objective"], ["parameters"], ["slack"]], height_ratios=panel_heights
-        )
-    panel_axes["objective"].sharex(panel_axes["parameters"])
-    own_units = None
-    if not tuned.model.is_wheel:
-        names = [str(x).removeprefix(UPPER_BOUND_PREFIX) for x in path_dataset.constraint.values]
-        objective_unit = path_dataset.objective.attrs.get("units", "1")
-        own_units = declare_own_quantities(
-            [*names, tuned.objective], [*path_dataset.constraint_unit.values, objective_unit]
-        )
-    legend_width_inches = (0.4 if has_two_columns else 0.65) * width_inches
-    _draw_objective_path(panel_axes["objective"], path_dataset, own_units, legend_width_inches)
-    parameter_axes = panel_axes["parameters"]
-    # The parameters are scaled so that their bounds are 0 and 1.
-    for parameter_name, lower_bound, upper_bound in zip(
-        path_dataset.free_parameter.values,
-        path_dataset.attrs["lower"],
-        path_dataset.attrs["upper"],
-        strict=True,
-    ):
-        parameter_axes.plot(
-            path_dataset.evaluation,
-            (path_dataset[parameter_name].values - lower_bound) / (upper_bound - lower_bound),
-            marker=".",
-            markersize=4.0,
-            label=f"${describe_quantity(parameter_name, path_dataset).mathtext}$",
-        )
-    parameter_axes.set_yticks([0.0, 1.0], ["lower\nbound", "upper\nbound"])
-    parameter_axes.set(xlabel="gaits evaluated", ylim=(-0.05, 1.05))
-    parameter_axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    add_side_legend(parameter_axes)
-    label_break = " " if has_two_columns else "\n"
-    slack_axes = panel_axes["slack"]
-    _draw_constraint_slacks(slack_axes, tuned, own_units, label_break, legend_width_inches)
-    return figure
-
-
-def _draw_objective_path(
-    axes: Axes, path_dataset: xr.Dataset, own_units: xr.Dataset | None, legend_width_inches: float
-) -> None:
-    evaluation_numbers = path_dataset.evaluation.values
-    objective_values = path_dataset.objective.values
-    is_gait_lost = np.isin(path_dataset.kind.values, (TrialKind.LOST, TrialKind.NOT_FINITE))
-    are_constraints_satisfied = path_dataset.breach.values <= ACTIVE_BOUND_TOLERANCE
-    axes.plot(
-        evaluation_numbers[~is_gait_lost],
-        objective_values[~is_gait_lost],
-        color=DARK_GRAY_COLOR,
-        linewidth=0.7,
-        zorder=1,
-    )
-    for draws_feasible_gaits, fill_color, marker_text in (
-        (True, OKABE_ITO_BLUE, "keeps the constraints"),
-        (False, "white", "breaks one"),
-    ):
-        is_marker_drawn = ~is_gait_lost & (are_constraints_satisfied == draws_feasible_gaits)
-        draw_markers(
-            axes,
-            evaluation_numbers[is_marker_drawn],
-            objective_values[is_marker_drawn],
-            "o",
-            OKABE_ITO_BLUE,
-            fill_color,
-            markersize=4.0,
-            label=marker_text,
-        )
-    legend_text: str | None = "gait or finite value lost, step shortened"
-    for evaluation_number in evaluation_numbers[is_gait_lost]:
-        axes.axvline(
-            evaluation_number,
-            color=OKABE_ITO_ORANGE,
-            linewidth=0.8,
-            linestyle=":",
-            label=legend_text,
-        )
-        legend_text = None  # One line is in the legend.
-    objective_name = path_dataset.objective.attrs["long_name"]
-    axes.set_ylabel(format_axis_label(objective_name, "{name}", own_units))
-    legend_settings = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "fontsize": 7.0}
-    add_wrapped_legend(axes, 3, legend_width_inches, **legend_settings)
-
-
-def _draw_constraint_slacks(
-    axes: Axes,
-    tune_result: TuneResult,
-    own_units: xr.Dataset | None,
-    label_break: str,
-    legend_width_inches: float,
-) -> None:
-    """Draw bars for the slack of each constraint at the start and at the tuned gait.
-
-    Active constraints, whose bars have no length, have a marker.
-
-    - `label_break`: space or line break in the label of the horizontal axis.
-    """
-    path_dataset = tune_result.path
-    constraint_names = list(map(str, path_dataset.constraint.values))
-    slacks = path_dataset.constraint_value.values - path_dataset.margin.values
-    relative_parameter_changes = [
-        path_dataset[parameter_name].values
-        / float(tune_result.model.get_parameter(tune_result.params, parameter_name))
-        - 1.0
-        for parameter_name in path_dataset.free_parameter.values
-    ]
-    tuned_evaluation_index = np.nanargmin(np.abs(relative_parameter_changes).sum(axis=0))
-    with np.errstate(invalid="ignore"):
-        slack_units = np.maximum(np.nanmax(np.abs(slacks), axis=0), 1e-12)
-    bar_positions = np.arange(len(constraint_names))[::-1]
-    # The result names the measure of an upper bound, without the prefix of the constraint.
-    active_limits = {(limit.name, limit.limit) for limit in tune_result.active}
-    is_active = np.array(
-        [
-            (name.removeprefix(UPPER_BOUND_PREFIX), restore_sign_of_bound(name, least_value))
-            in active_limits
-            for name, least_value in zip(constraint_names, path_dataset.margin.values, strict=True)
-        ],
-        bool,
-    )
-    for evaluation_index, vertical_offset, bar_color, legend_text in (
-        (0, 0.19, LIGHT_GRAY_COLOR, "at the start"),
-        (tuned_evaluation_index, -0.19, OKABE_ITO_BLUE, "tuned"),
-    ):
-        axes.barh(
-            bar_positions + vertical_offset,
-            slacks[evaluation_index] / slack_units,
-            0.36,
-            color=bar_color,
-            label=legend_text,
-            edgecolor=DARK_GRAY_COLOR,
-            linewidth=0.3,
-        )
-    axes.axvline(0.0, color="black", linewidth=0.6)
-    draw_markers(
-        axes,
-        (slacks[tuned_evaluation_index] / slack_units)[is_active],
-        bar_positions[is_active] - 0.19,
-        "D",
-        OKABE_ITO_BLUE,
-        OKABE_ITO_ORANGE,
-        markersize=4.5,
-        label="active" if is_active.any() else None,
-    )
-    constraint_labels = []
-    for constraint_name in constraint_names:
-        measure_name, _, leg_suffix = constraint_name.partition("[")
-        is_upper_bound = measure_name.startswith(UPPER_BOUND_PREFIX)
-        measure = describe_quantity(measure_name.removeprefix(UPPER_BOUND_PREFIX), own_units)
-        constraint_labels.append(
-            typeset_greek_symbols(measure.long_name)
-            + (f", {leg_suffix[:-1]}" if leg_suffix else "")
-            + (" (upper bound)" if is_upper_bound else "")
-        )
-    axes.set_yticks(bar_positions, constraint_labels, fontsize=7.0)
-    for tick_label, is_label_bold in zip(axes.get_yticklabels(), is_active, strict=True):
-        if is_label_bold:
-            tick_label.set_color(OKABE_ITO_ORANGE)
-            tick_label.set_fontweight("bold")
-    axes.set(
-        xlabel=f"slack, share of the{label_break}largest on the path\n(active in bold)",
-        xlim=(min(-0.05, axes.get_xlim()[0]), 1.05),
-    )
-    legend_settings = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
-    add_wrapped_legend(axes, 3, legend_width_inches, **legend_settings)
-
-
-MAX_DEFAULT_DRAWN_MEASURES = 6
-"""Largest number of measures that are drawn by default, chosen because two rows of panels fit a
-page.
-"""
-
-PARAMETER_ROW_HEIGHT_INCHES = 0.2
-"""Height of the bar of one parameter, inches, chosen because the parameter's symbol has that
-height.
-"""
-
-
-@figure_style()
-def tornado_figure(
-    table: xr.Dataset,
-    measures: str | Iterable[str] | None = None,
-    *,
-    spreads: Mapping[str, float] | None = None,
-    width: FigureWidth = None,
-) -> Figure:
-    """Return a figure of the change of each measure with each parameter, with largest changes on
-    top.
-
-    Changes are first-order estimates, computed from the derivatives of the gait. By default they
-    are in per cent of the measure, for a change of each parameter by 1 %. If `spreads` is given,
-    they are in the unit of the measure, for the changes of the parameters in `spreads`. Undefined
-    changes, such as for 1 % of a slope of 0 or of a measure that is 0, are omitted.
-
-    Args:
-        table: dataset that `vrw.sensitivities` returns.
-        measures: names of the measures; by default the first six of the table.
-        spreads: change of each parameter, by name, in the parameter's unit; other parameters are
-            omitted.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: one panel per measure, with one bar per parameter.
-
-    Raises:
-        TypeError, ValueError: if an argument is invalid.
-
-    Examples:
-        >>> table = vrw.sensitivities(vrw.WheelParams(), measures=["speed", "dls_fraction"])
-        >>> figure = vrw.plot.tornado_figure(table)
-        >>> figure = vrw.plot.tornado_figure(table, "speed", spreads={"damping": 10.0})
-    """
-    require_dataset_variables(
-        "table", table, ("derivative", "elasticity"), "give vrw.sensitivities(params)"
-    )
-    known_measure_names = tuple(map(str, table.measure.values))
-    measure_names = known_measure_names[:MAX_DEFAULT_DRAWN_MEASURES]
-    if measures is not None:
-        measure_names = check_names("measures", measures)
-    for measure_name in measure_names:
-        require_known_name(measure_name, known_measure_names, "measure of this table")
-    if not measure_names:
-        raise ValueError('measures is empty, but something is to be drawn: give "speed", say.')
-    # changes in per cent for 1 %
-    measure_changes = table.elasticity.where(table.parameter_value != 0.0)
-    if spreads is not None:
-        known_parameter_names = tuple(map(str, table.parameter.values))
-        for parameter_name in spreads:
-            check_parameter_name(parameter_name, known_parameter_names, "parameter of this table")
-        if not spreads:
-            raise ValueError('spreads is empty, but bars need one: give {"damping": 10.0}, say.')
-        changes = [check_positive(f"spreads[{name!r}]", x) for name, x in spreads.items()]
-        measure_changes = table.derivative.sel(parameter=list(spreads)) * np.array(changes)
-    panel_height = PARAMETER_ROW_HEIGHT_INCHES * measure_changes.sizes["parameter"] + 0.8
-    width_fraction = 0.6 if len(measure_names) == 1 else 1.0
-    width_inches = find_width_inches(width, width_fraction * PAGE_FIGURE_WIDTH_INCHES)
-    own_units = None
-    if "rung" not in table.attrs:  # The library's symbols are those of wheels.
-        own_units = declare_own_quantities(table.measure.values, table.measure_unit.values)
-    figure, panel_axes = make_bar_panels(width_inches, measure_names, panel_height, 0.3, own_units)
-    parameter_change_text = "1 %" if spreads is None else "by its spread"
-    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
-        bars = measure_changes.sel(measure=measure_name)
-        bars = bars[np.isfinite(bars.values)]
-        bars = bars[np.argsort(-np.abs(bars.values), kind="stable")]
-        for change_sign, direction, bar_color in (
-            (1.0, "up", OKABE_ITO_BLUE),
-            (-1.0, "down", OKABE_ITO_AMBER),
-        ):
-            axes.barh(
-                range(bars.size),
-                change_sign * bars.values,
-                0.7,
-                color=bar_color,
-                label=f"parameter {direction} {parameter_change_text}",
-            )
-        axes.axvline(0.0, color="black", linewidth=0.6)
-        labels = list(map(str, bars.parameter.values))
-        if own_units is None:
-            labels = [f"${MEASURES[name].mathtext}$" for name in labels]
-        axes.set_yticks(range(bars.size), labels)
-        axes.set_ylim(max(bars.size, 1) - 0.5, -0.5)
-        if not bars.size:
-            axes.text(0.5, 0.5, "undefined", ha="center", va="center", transform=axes.transAxes)
-        change_label = format_axis_label(measure_name, "change of {symbol}", own_units)
-        axes.set_xlabel("change [%]" if spreads is None else change_label)
-    add_figure_legend(figure, panel_axes[0].get_legend_handles_labels()[0], 2)
-    return figure

@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
+from vrw_jax.app._study_figures import draw_sobol_indices
 from vrw_jax.app.figure_style import (
     COLUMN_FIGURE_WIDTH_INCHES,
     LIGHT_GRAY_COLOR,
-    OKABE_ITO_AMBER,
     OKABE_ITO_BLUE,
     OUTCOME_LABELS_AND_COLORS,
     PAGE_FIGURE_WIDTH_INCHES,
@@ -29,15 +29,12 @@ from vrw_jax.app.figure_style import (
     StyledFigure,
     add_color_bar,
     add_figure_legend,
-    describe_quantity,
     draw_outcome_cells,
     figure_style,
     find_cell_edges,
     find_width_inches,
     format_axis_label,
     format_value_label,
-    label_lowest_panels,
-    make_bar_panels,
     make_outcome_patches,
     make_panel_grid,
     require_dataset_variables,
@@ -45,7 +42,7 @@ from vrw_jax.app.figure_style import (
     select_special_point_style,
     typeset_greek_symbols,
 )
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.models.measures import LAW_PREFIXES, MARGIN_MEASURES, describe_violation
 from vrw_jax.studies.measure_catalog import DIFFERENTIABLE_MEASURES
@@ -442,59 +439,6 @@ def _draw_outcome_samples(
 ) -> None:
     outcome_colors = [OUTCOME_LABELS_AND_COLORS[outcome_code][1] for outcome_code in outcome_codes]
     axes.scatter(x, y, s=marker_size, color=outcome_colors, linewidths=0.0, rasterized=True)
-
-
-def draw_sobol_indices(indices: xr.Dataset, scan: xr.Dataset, width: FigureWidth) -> Figure:
-    """Return a figure of the Sobol' indices of a scan, with their confidence intervals."""
-    measure_names = list(map(str, indices.measure.values))
-    bar_positions = np.arange(indices.sizes["parameter"])
-    figure, panel_axes = make_bar_panels(
-        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES),
-        measure_names,
-        0.26 * len(bar_positions) + 0.5,
-        0.6,
-        scan,
-        sharex=True,
-        sharey=True,
-    )
-    for axes, measure_name in zip(panel_axes, measure_names, strict=True):
-        sobol_indices_of_measure = indices.sel(measure=measure_name)
-        for sobol_index_name, legend_text, bar_offset, bar_color in (
-            ("first_order", "by itself (first order)", -0.19, OKABE_ITO_BLUE),
-            ("total", "with all it meets (total)", 0.19, OKABE_ITO_AMBER),
-        ):
-            sobol_index_values, lower_bounds, upper_bounds = (
-                sobol_indices_of_measure[sobol_index_name + name_suffix].values
-                for name_suffix in ("", "_lower", "_upper")
-            )
-            axes.barh(
-                bar_positions + bar_offset,
-                sobol_index_values,
-                0.36,
-                color=bar_color,
-                label=legend_text,
-                xerr=np.maximum(
-                    [sobol_index_values - lower_bounds, upper_bounds - sobol_index_values], 0.0
-                ),
-                error_kw={"elinewidth": 0.7},
-            )
-        if sobol_indices_of_measure.is_constant_measure:
-            axes.text(0.5, 0.5, "constant", ha="center", va="center", transform=axes.transAxes)
-        parameter_names = indices.parameter.values
-        axes.set_yticks(
-            bar_positions,
-            [f"${describe_quantity(name, scan).mathtext}$" for name in parameter_names],
-        )
-        axes.set_xlim(0.0, 1.05)
-    panel_axes[0].invert_yaxis()
-    label_lowest_panels(panel_axes, "share of the variance")
-    add_figure_legend(figure, panel_axes[0].get_legend_handles_labels()[0], 2)
-    omitted_samples_percent = 100.0 * indices.attrs["left_out"]
-    omitted_rows_note = (
-        f"{indices.attrs['rows']:,} rows; {omitted_samples_percent:.1f} % left out, without a gait"
-    )
-    figure.suptitle(omitted_rows_note, fontsize=8.0)
-    return figure
 
 
 def draw_measure_curves(scan: xr.Dataset, x: str, width: FigureWidth) -> Figure:

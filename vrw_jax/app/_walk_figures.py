@@ -1,9 +1,9 @@
-"""Figures of walks: Figs 6 to 10 of the paper, and an animation of a walk."""
+"""Motion of the feet for any model, and figures of walks: contact modes, sticks, animation."""
 
-import itertools
-from collections.abc import Callable, Iterator, Sequence
+import string
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -16,42 +16,25 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from vrw_jax.app._contact_figures import (
-    CONTACT_MODE_COLORS,
-    GROUND_FORCE_NAMES,
-    LEG_LINE_STYLES,
-    OTHER_LEG_COLOR,
-    HubAndFootMotion,
-    compute_foot_motion,
-    draw_feet,
-    draw_sticks,
-    find_constant_spans,
-    insert_landing_gaps,
-    make_contact_mode_handles,
-    make_contact_panels,
-    make_time_panels,
-)
 from vrw_jax.app.figure_style import (
-    COLUMN_FIGURE_WIDTH_INCHES,
     DARK_GRAY_COLOR,
     LEG_1_COLOR,
     LEG_2_COLOR,
     LIGHT_GRAY_COLOR,
+    OKABE_ITO_AMBER,
+    OKABE_ITO_GREEN,
+    OKABE_ITO_PINK,
+    OKABE_ITO_SKY_BLUE,
     PAGE_FIGURE_WIDTH_INCHES,
     FigureWidth,
     StyledFigure,
     add_figure_legend,
     add_side_legend,
-    count_panel_columns,
-    draw_markers,
     draw_panel_letter,
     figure_style,
     find_width_inches,
     format_axis_label,
-    format_value_label,
-    make_panel_grid,
     require_dataset_variables,
-    require_variables_of_datasets,
     typeset_greek_symbols,
 )
 from vrw_jax.base.checks import (
@@ -59,21 +42,307 @@ from vrw_jax.base.checks import (
     check_path,
     check_positive,
     check_type,
-    require_known_name,
 )
-from vrw_jax.models.measures import MEASURES, PHASE_NAMES
+from vrw_jax.models.measures import CONTACT_MODE_NAMES, PHASE_NAMES
+from vrw_jax.wheel.transitions import ContactMode
+
+CONTACT_MODE_COLORS = ("white", OKABE_ITO_GREEN, OKABE_ITO_AMBER, OKABE_ITO_PINK)
+"""Colors of the contact modes, by contact code."""
+
+CONTACT_MODE_MARKERS = ("o", "o", ">", "<")
+"""Markers of the contact modes, by contact code. They differ because some readers see the green and
+the pink as the same gray.
+"""
+
+GROUND_FORCE_NAMES = ("lambda_1", "lambda_2", "lambda_3", "lambda_4")
+"""Names of the ground forces (N) on the feet of Leg 1 and Leg 2."""
+
+OTHER_LEG_COLOR = "#999999"
+"""Color of every leg other than Legs 1 and 2."""
+
+LEG_LINE_STYLES = {1: (LEG_1_COLOR, "-"), 2: (LEG_2_COLOR, "--")}
+"""Color and line style of Legs 1 and 2 in plots over time."""
+
+STICK_LINE_STYLES: dict[int, Any] = {1: "-", 2: ":"}
+"""Line styles of Legs 1 and 2 in stick diagrams; other legs are dashed."""
+
+PHASE_STICK_COLORS = ("#A0A0A0", OKABE_ITO_SKY_BLUE, "#000000")
+"""Colors of the phases in stick diagrams, in the order of phases."""
+
+OTHER_LEG_LINE_STYLES = (
+    (OKABE_ITO_SKY_BLUE, "-."), (OKABE_ITO_PINK, ":"), (OKABE_ITO_AMBER, (0, (8, 3))),
+    (DARK_GRAY_COLOR, (0, (5, 1, 1, 1, 1, 1))),
+)  # fmt: skip
+"""Colors and line styles of the other legs that move or touch the ground, in the order of leg
+labels.
+"""
+
+
+class HubAndFootMotion(NamedTuple):
+    """Positions of hub and feet during a walk, with contact modes and forces, in the slope's frame.
+
+    Leg labels change with each step: Leg 1 is the front leg at the landing, and Leg 2 is the leg
+    behind Leg 1.
+    """
+
+    sample_times: np.ndarray  # (time,), s
+    hub_positions: np.ndarray  # (time, 2), x downhill and z normal to the slope, m
+    foot_positions: np.ndarray  # (time, leg, 2), in the same coordinates, m
+    foot_forces: np.ndarray  # (time, leg, 2), tangential and normal force, N
+    contact_modes: np.ndarray  # (time, leg), contact mode
+
+    def interpolate_at_time(self, t: float) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return the positions of hub and feet at the time `t` (s), and the index of the next
+        sample.
+
+        Contact modes and forces at this time are those of the next sample.
+        """
+        index_after = min(
+            int(np.searchsorted(self.sample_times, t, side="right")), self.sample_times.size - 1
+        )
+        index_before = max(index_after - 1, 0)
+        time_before, time_after = self.sample_times[[index_before, index_after]]
+        fraction = (
+            (t - time_before) / (time_after - time_before) if time_after > time_before else 1.0
+        )
+        interpolate = lambda sampled_values: (
+            (1.0 - fraction) * sampled_values[index_before] + fraction * sampled_values[index_after]
+        )
+        return interpolate(self.hub_positions), interpolate(self.foot_positions), index_after
+
+
+def compute_foot_motion(walk: xr.Dataset) -> HubAndFootMotion:
+    """Return the motion of hub and feet in a trajectory that was computed with any model.
+
+    In the paper's phases no foot slides: foot 1 is at rest, and foot 2 is at rest in double
+    support.
+    """
+    hub_positions = np.stack([walk.hub_x.values, walk.hub_z.values], -1)
+    if "contact" in walk:
+        foot_positions = np.stack([walk.foot_x.values, walk.foot_z.values], -1)
+        foot_forces = np.stack([walk.tangential.values, walk.normal.values], -1)
+        contact_modes = walk.contact.values
+    else:
+        n_legs = int(walk.attrs["parameter_n_legs"])
+        leg_angles = walk.theta.values[:, None] + 2.0 * np.pi / n_legs * np.arange(n_legs)
+        leg_lengths = np.full(leg_angles.shape, walk.attrs["parameter_locked_length"])
+        leg_lengths[:, 0] = walk.L1.values
+        leg_lengths[:, 1] = walk.L2.values
+        foot_positions = hub_positions[:, None] - leg_lengths[..., None] * np.stack(
+            [np.sin(leg_angles), np.cos(leg_angles)], -1
+        )
+        foot_forces = np.zeros_like(foot_positions)
+        ground_forces = [walk[force_name].values for force_name in GROUND_FORCE_NAMES]
+        foot_forces[:, :2] = np.stack(ground_forces, -1).reshape(-1, 2, 2)
+        contact_modes = np.full(leg_angles.shape, ContactMode.OFF)
+        contact_modes[:, 0] = ContactMode.STICK
+        contact_modes[walk.phase.values == 0, 1] = ContactMode.STICK
+    return HubAndFootMotion(
+        walk.time.values, hub_positions, foot_positions, foot_forces, contact_modes
+    )
+
+
+def insert_landing_gaps(walk: xr.Dataset, sampled_values: ArrayLike) -> np.ndarray:
+    """Return values of the samples of a trajectory, with NaN inserted at each landing.
+
+    The gaps separate steps in plots, because landings relabel the legs.
+    """
+    landing_indices = np.flatnonzero(np.diff(walk.step.values)) + 1
+    return np.insert(np.asarray(sampled_values, float), landing_indices, np.nan)
+
+
+def find_constant_spans(
+    walk: xr.Dataset, sampled_codes: np.ndarray
+) -> list[tuple[float, float, int]]:
+    """Return the start time (s), the end time (s) and the code of every span with one code.
+
+    A span ends where the code changes, and at each landing.
+
+    - `sampled_codes`: code for each sample of the trajectory.
+    """
+    is_span_end = np.any(np.diff([walk.step.values, sampled_codes]), axis=0)
+    spans = np.split(np.arange(len(sampled_codes)), np.flatnonzero(is_span_end) + 1)
+    times = walk.time.values
+    return [(times[span[0]], times[span[-1]], int(sampled_codes[span[0]])) for span in spans]
+
+
+def make_time_panels(
+    width_inches: float, height: float, height_ratios: Sequence[float], times: np.ndarray
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with panels over time, one below the other, and their axes."""
+    figure = StyledFigure(figsize=(width_inches, height))
+    panels = figure.subplots(
+        len(height_ratios), 1, sharex=True, squeeze=False, height_ratios=height_ratios
+    )[:, 0]
+    for axes, letter in zip(panels, string.ascii_lowercase, strict=False):
+        if len(panels) > 1:
+            draw_panel_letter(axes, letter)
+    panels[-1].set(xlabel="time [s]", xlim=(times[0], times[-1]))
+    return figure, panels
+
+
+def draw_feet(
+    axes: Axes, foot_positions: np.ndarray, contact_modes: np.ndarray, marker_size: float
+) -> None:
+    """Draw feet in the colors of their contact modes, at positions of shape (2, feet)."""
+    for contact_mode in np.unique(contact_modes):
+        axes.plot(
+            *foot_positions[:, contact_modes == contact_mode],
+            CONTACT_MODE_MARKERS[contact_mode],
+            color=CONTACT_MODE_COLORS[contact_mode],
+            zorder=8,
+            markersize=marker_size,
+            markeredgecolor=DARK_GRAY_COLOR,
+            markeredgewidth=0.1 * marker_size,
+        )
+
+
+def make_contact_mode_handles(contact_modes: np.ndarray) -> list[Line2D]:
+    """Return a legend entry for each contact mode that occurs in `contact_modes`."""
+    return [
+        Line2D([], [], linestyle="", marker=CONTACT_MODE_MARKERS[contact_mode],
+        color=CONTACT_MODE_COLORS[contact_mode],
+               markeredgecolor=DARK_GRAY_COLOR, markeredgewidth=0.5,
+               label=CONTACT_MODE_NAMES[contact_mode])
+        for contact_mode in np.unique(contact_modes)
+    ]  # fmt: skip
+
+
+def _select_marked_legs(is_leg_marked: np.ndarray) -> list[int]:
+    """Return the labels of Legs 1 and 2, and of all legs that are marked at any time.
+
+    - `is_leg_marked`: whether a panel marks the contact of a leg, shape (time, leg).
+    """
+    return [
+        leg_number
+        for leg_number, is_leg_ever_marked in enumerate(np.any(is_leg_marked, axis=0).tolist(), 1)
+        if is_leg_ever_marked or leg_number < 3
+    ]
+
+
+def make_contact_panels(walk: xr.Dataset, width_inches: float, forces_only: bool) -> Figure:
+    """Return a figure of angle, leg lengths, contact modes, foot heights and forces over time, or
+    of the forces only.
+
+    The walk is a trajectory with contact modes.
+    """
+    foot_motion = compute_foot_motion(walk)
+    is_foot_touching = foot_motion.contact_modes != ContactMode.OFF
+    touching_legs = _select_marked_legs(is_foot_touching)
+    moving_legs = _select_marked_legs(is_foot_touching | ~walk.on_stopper.values.astype(bool))
+    times_with_gaps = insert_landing_gaps(walk, foot_motion.sample_times)
+    other_leg_line_styles = iter(OTHER_LEG_LINE_STYLES * len(moving_legs))
+    line_style_by_leg = {
+        leg_number: LEG_LINE_STYLES.get(leg_number) or next(other_leg_line_styles)
+        for leg_number in moving_legs
+    }
+    panel_height_ratios = [1.0, 1.0, 0.35 + 0.11 * len(touching_legs), 1.0, 1.2, 1.2]
+    figure, panel_axes = make_time_panels(
+        width_inches,
+        3.4 if forces_only else 8.0,
+        panel_height_ratios[4 if forces_only else 0 :],
+        foot_motion.sample_times,
+    )
+    leg_panels = [
+        (panel_axes[-2], touching_legs, walk.normal, "normal\nforce [N]"),
+        (panel_axes[-1], touching_legs, walk.tangential, "tangential\nforce [N]"),
+    ]
+    if not forces_only:
+        angle_axes, length_axes, mode_axes, height_axes, *_ = panel_axes
+        angle_axes.plot(times_with_gaps, insert_landing_gaps(walk, walk.theta), color="black")
+        angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
+        modes = foot_motion.contact_modes
+        for row, leg_number in enumerate(touching_legs):
+            for start, end, mode in find_constant_spans(walk, modes[:, leg_number - 1]):
+                if mode != ContactMode.OFF:
+                    bar = (start, end - start)
+                    color = CONTACT_MODE_COLORS[mode]
+                    mode_axes.broken_barh([bar], (row - 0.35, 0.7), color=color)
+        mode_axes.set_yticks(range(len(touching_legs)), list(map(str, touching_legs)))
+        mode_axes.set(ylabel="foot on\nthe ground", ylim=(len(touching_legs) - 0.5, -0.5))
+        mode_handles = [
+            Patch(color=CONTACT_MODE_COLORS[mode], label=CONTACT_MODE_NAMES[mode])
+            for mode in np.unique(modes[is_foot_touching])
+        ]
+        add_side_legend(mode_axes, mode_handles)
+        leg_panels += [
+            (length_axes, moving_legs, walk.length, "$L$ [m]"),
+            (height_axes, touching_legs, walk.foot_z, "height of\nfoot [m]"),
+        ]
+    for axes, drawn_legs, quantity_by_leg, panel_label in leg_panels:
+        for leg_number in drawn_legs:
+            line_color, line_style = line_style_by_leg[leg_number]
+            axes.plot(
+                times_with_gaps,
+                insert_landing_gaps(walk, quantity_by_leg.values[:, leg_number - 1]),
+                color=line_color,
+                linestyle=line_style,
+                label=f"Leg {leg_number}",
+            )
+        axes.set_ylabel(panel_label)
+    for axes in panel_axes[-3:]:
+        axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4, zorder=0)
+    add_side_legend(panel_axes[0] if forces_only else length_axes)
+    figure.align_ylabels(panel_axes)
+    return figure
+
+
+def draw_sticks(axes: Axes, walk: xr.Dataset, stick_interval: float) -> None:
+    """Draw Legs 1 and 2 and every leg on the ground at equal time intervals.
+
+    The sticks have the colors of the phases. For walks with unilateral contact, the feet have the
+    colors of their contact modes instead. `stick_interval` is in s.
+    """
+    foot_motion = compute_foot_motion(walk)
+    stick_times = np.arange(0.0, foot_motion.sample_times[-1], stick_interval)
+    sample_indices = np.searchsorted(foot_motion.sample_times, stick_times)
+    is_leg_drawn = foot_motion.contact_modes != ContactMode.OFF
+    is_leg_drawn[:, :2] = True
+    has_contact_modes = "contact" in walk
+    line_width = 0.7 if has_contact_modes else 0.8
+    for sample_index in sample_indices:
+        drawn_legs = np.flatnonzero(is_leg_drawn[sample_index])
+        foot_positions = foot_motion.foot_positions[sample_index, drawn_legs]
+        for leg_number, foot_position in zip(
+            (drawn_legs + 1).tolist(), foot_positions, strict=True
+        ):
+            if has_contact_modes:
+                stick_color = "black" if leg_number < 3 else DARK_GRAY_COLOR
+            else:
+                stick_color = PHASE_STICK_COLORS[int(walk.phase[sample_index])]
+            axes.plot(
+                *np.stack([foot_position, foot_motion.hub_positions[sample_index]], -1),
+                color=stick_color,
+                linestyle=STICK_LINE_STYLES.get(leg_number, "--"),
+                linewidth=line_width,
+            )
+        if has_contact_modes:
+            contact_modes = foot_motion.contact_modes[sample_index, drawn_legs]
+            draw_feet(axes, foot_positions.T, contact_modes, 4.0)
+    legend_leg_labels = [(1, "Leg 1"), (2, "Leg 2")]
+    if is_leg_drawn[sample_indices, 2:].any():
+        legend_leg_labels.append((3, "another leg"))
+    for leg_number, legend_text in legend_leg_labels:
+        line_style = STICK_LINE_STYLES.get(leg_number, "--")
+        axes.plot(
+            [], [], color="black", linestyle=line_style, linewidth=line_width, label=legend_text
+        )
+    axes.plot([], [], color=LEG_2_COLOR, label="hub")
+    if not has_contact_modes:
+        for phase_name, phase_color in zip(PHASE_NAMES, PHASE_STICK_COLORS, strict=True):
+            axes.plot([], [], color=phase_color, linewidth=3.0, label=phase_name)
+        return
+    for legend_handle in make_contact_mode_handles(
+        foot_motion.contact_modes[sample_indices][is_leg_drawn[sample_indices]]
+    ):
+        axes.add_line(legend_handle)
+
 
 NO_WALK_REMEDY = "give vrw.simulate(params, model=...), of any model of the wheel"
 """Remedy in the error message for a dataset that is not a walk."""
 
-NO_PAPER_WALK_REMEDY = (
-    "give vrw.simulate(params) of the paper's wheel; vrw.plot.gait_panels, sticks and walk_frames "
-    "draw walks of any model"
-)
-"""Remedy in the error message for a walk without the phases of the paper."""
 
-
-def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
+def require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
     required_names = ("hub_x", "hub_z", "step", "parameter_n_legs")
     require_dataset_variables(argument_name, walk, required_names, NO_WALK_REMEDY)
     if not walk.sizes["time"]:
@@ -83,37 +352,11 @@ def _require_nonempty_walk(argument_name: str, walk: xr.Dataset) -> None:
         )
 
 
-@figure_style()
-def gait_panels(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
-    """Return a figure of the motion and the ground forces of a gait (Fig. 6 of the paper).
-
-    The panels show angle, leg lengths, load share, foot height and ground forces. Gray bands mark
-    double support, and dotted lines mark collision II. For walks with unilateral contact, the
-    panels show angle, leg lengths, contact modes, foot heights, and normal and tangential forces.
-    For a `HybridSystem`, each panel shows a coordinate of the state, on a background that marks the
-    modes, with dotted lines at the section.
-
-    Args:
-        gait: dataset that `vrw.simulate` returns for any model, or for a `HybridSystem`.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: panels over time (s), in SI units.
-
-    Examples:
-        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.gait_panels(gait)
-    """
-    if isinstance(gait, xr.Dataset) and "section" in gait.attrs and gait.sizes.get("time"):
-        return _make_coordinate_panels(gait, width)
-    return _make_gait_panels(gait, width, forces_only=False)
-
-
 MODE_TINTS = ("white", LIGHT_GRAY_COLOR, "#DCEBF5", "#FBE3D6", "#D9EFE7", "#F5E6EF", "#FCF9D5")
 """Backgrounds of the modes of a walker in turn, light tints of the colors of lines."""
 
 
-def _make_coordinate_panels(walk: xr.Dataset, width: FigureWidth) -> Figure:
+def make_coordinate_panels(walk: xr.Dataset, width: FigureWidth) -> Figure:
     """Return a figure of the state of a walker over time, with its modes and events."""
     times, spans = walk.time.values, find_constant_spans(walk, walk.phase.values)
     mode_names = walk.phase.attrs["flag_meanings"].split()
@@ -150,114 +393,6 @@ def _make_coordinate_panels(walk: xr.Dataset, width: FigureWidth) -> Figure:
 
 
 @figure_style()
-def ground_forces(gait: xr.Dataset, *, width: FigureWidth = None) -> Figure:
-    """Return a figure of the ground forces of a gait, which is the last part of `gait_panels`.
-
-    Args:
-        gait: dataset that `vrw.simulate` returns for any model.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: forces (N) over time (s). With unilateral contact, one panel shows the normal
-        forces, and another panel shows the tangential forces.
-
-    Examples:
-        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.ground_forces(gait, width="column")
-    """
-    return _make_gait_panels(gait, width, forces_only=True)
-
-
-def _make_gait_panels(gait: xr.Dataset, width: FigureWidth, forces_only: bool) -> Figure:
-    _require_nonempty_walk("gait", gait)
-    width_inches = find_width_inches(width, 0.8 * PAGE_FIGURE_WIDTH_INCHES)
-    if "contact" in gait:
-        return make_contact_panels(gait, width_inches, forces_only)
-    times, theta, L1, L2, rear_foot_height, *forces = (
-        insert_landing_gaps(gait, gait[variable_name].values)
-        for variable_name in ("time", "theta", "L1", "L2", "foot_2_z", *GROUND_FORCE_NAMES)
-    )
-    height, ratios = (2.3, [1.5]) if forces_only else (7.4, [1, 1, 1, 1, 1.5])
-    figure, panel_axes = make_time_panels(width_inches, height, ratios, times)
-    leg_1_style, leg_2_style = (
-        {"color": line_color, "linestyle": line_style}
-        for line_color, line_style in LEG_LINE_STYLES.values()
-    )
-    if not forces_only:
-        angle_axes, length_axes, load_axes, height_axes, _ = panel_axes
-        angle_axes.plot(times, theta, color="black")
-        angle_axes.set_ylabel(format_axis_label("theta", "{symbol}"))
-        length_axes.plot(times, L1, label="Leg 1, $L_1$", **leg_1_style)
-        length_axes.plot(times, L2, label="Leg 2, $L_2$", **leg_2_style)
-        length_axes.set_ylabel("$L_1,\\ L_2$ [m]")
-        rear_load_percent = 100.0 * forces[3] / (forces[1] + forces[3])
-        load_axes.plot(times, 100.0 - rear_load_percent, label="foot 1", **leg_1_style)
-        load_axes.plot(times, rear_load_percent, label="foot 2", **leg_2_style)
-        load_axes.set_ylabel("share of the\nnormal force [%]")
-        height_axes.plot(times, rear_foot_height, **leg_2_style)
-        height_axes.set_ylabel("$z_2$ [m]")
-    force_axes = panel_axes[-1]
-    for i, force_name in enumerate(GROUND_FORCE_NAMES):
-        force_axes.plot(
-            times,
-            forces[i],
-            linewidth=(0.7, 1.4)[i % 2],
-            label=f"${MEASURES[force_name].mathtext}$",
-            **(leg_1_style if i < 2 else leg_2_style),
-        )
-    force_axes.axhline(0.0, color=DARK_GRAY_COLOR, linewidth=0.4)
-    force_axes.set_ylabel("ground reaction\nforce [N]")
-    if forces_only and count_panel_columns(width_inches, 2) == 1:  # The names of phases are above.
-        add_figure_legend(figure, force_axes.get_legend_handles_labels()[0], 4)
-    else:
-        for axes in (force_axes,) if forces_only else (length_axes, load_axes, force_axes):
-            add_side_legend(axes)
-    figure.align_ylabels(panel_axes)
-    _mark_phases(panel_axes, find_constant_spans(gait, gait.phase.values))
-    return figure
-
-
-def _mark_phases(panel_axes: np.ndarray, phase_spans: list[tuple[float, float, int]]) -> None:
-    """Mark double support and collision II, and name the phases of the first step on top.
-
-    A name is upright where its phase is shorter than the name, and is omitted where it would cover
-    another one.
-    """
-    for axes in panel_axes:
-        for start_time, end_time, phase_code in phase_spans:
-            if phase_code == 0:
-                axes.axvspan(start_time, end_time, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
-            if phase_code == 2:
-                dotted = (0, (1, 2))
-                axes.axvline(
-                    start_time, color=DARK_GRAY_COLOR, linewidth=0.5, linestyle=dotted, zorder=0
-                )
-    axes = panel_axes[0]
-    names = [
-        axes.annotate(
-            PHASE_NAMES[phase_code],
-            (0.5 * (start_time + end_time), 1.0),
-            xycoords=("data", "axes fraction"),
-            ha="center",
-            va="bottom",
-            fontsize=7.5,
-        )
-        for start_time, end_time, phase_code in phase_spans[:3]
-    ]
-    axes.figure.draw_without_rendering()  # The layout defines the widths of the phases.
-    pixels_per_second = axes.bbox.width / np.ptp(axes.get_xlim())
-    last_right_edge = -np.inf
-    for name, (start_time, end_time, _) in zip(names, phase_spans, strict=False):
-        if name.get_window_extent().width > (end_time - start_time) * pixels_per_second:
-            name.set_rotation(90)
-        extent = name.get_window_extent()
-        if extent.x0 < last_right_edge:
-            name.remove()
-        else:
-            last_right_edge = extent.x1
-
-
-@figure_style()
 def sticks(gait: xr.Dataset, interval: float = 0.05, *, width: FigureWidth = None) -> Figure:
     """Return a stick diagram in the X-Z plane (Fig. 7 of the paper).
 
@@ -277,7 +412,7 @@ def sticks(gait: xr.Dataset, interval: float = 0.05, *, width: FigureWidth = Non
         >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
         >>> figure = vrw.plot.sticks(gait, interval=0.1)
     """
-    _require_nonempty_walk("gait", gait)
+    require_nonempty_walk("gait", gait)
     check_positive("interval", interval)
     width_inches = find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES)
     figure = StyledFigure(figsize=(width_inches, 2.8))
@@ -313,209 +448,6 @@ def sticks(gait: xr.Dataset, interval: float = 0.05, *, width: FigureWidth = Non
     return figure
 
 
-GAIT_LINE_STYLES = ("-", "--", (0, (4, 1, 1, 1)), ":")
-"""Line styles of the gaits in one figure, which more gaits repeat in other colors."""
-
-
-def _format_gait_lines(
-    gaits: Sequence[xr.Dataset], vary: str
-) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
-    """Yield each gait with the style and the label of its line, for matplotlib."""
-    for gait, line_style in zip(gaits, itertools.cycle(GAIT_LINE_STYLES), strict=False):
-        names = [x.removeprefix("parameter_") for x in gait.attrs if x.startswith("parameter_")]
-        require_known_name(vary, names, "parameter of these gaits")
-        label = format_value_label(vary, gait.attrs[f"parameter_{vary}"])
-        yield gait, {"linestyle": line_style, "label": label}
-
-
-@figure_style()
-def foot_height(
-    gaits: Sequence[xr.Dataset], vary: str = "damping", *, width: FigureWidth = None
-) -> Figure:
-    """Return a figure of the height of foot 2 during one step of each gait (Fig. 8 of the paper).
-
-    A second panel shows the height around take-off, in mm.
-
-    Args:
-        gaits: datasets that `vrw.simulate` returns for one step, one per curve.
-        vary: name of the parameter in which the gaits differ, used in the legend.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: two panels over the time since the landing, in s.
-
-    Examples:
-        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.foot_height([gait])
-    """
-    require_variables_of_datasets("gaits", gaits, ("phase", "foot_2_z"), NO_PAPER_WALK_REMEDY)
-    figure, (step_axes, takeoff_axes) = make_panel_grid(
-        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES), 2, 2.6, 0.0, 2
-    )
-    for gait, line_format in _format_gait_lines(gaits, vary):
-        foot_height_mm = 1e3 * gait.foot_2_z
-        lowest_mm = float(foot_height_mm.min())
-        clearance_text = f"lowest −{-lowest_mm:.1f} mm" if lowest_mm < -1e-6 else "clear"
-        step_axes.plot(gait.time, gait.foot_2_z, **line_format)
-        takeoff_axes.plot(gait.time, foot_height_mm, **line_format | {"label": clearance_text})
-    for panel_letter, axes in zip("ab", (step_axes, takeoff_axes), strict=True):
-        draw_panel_letter(axes, panel_letter)
-        axes.axhspan(-1e3, 0.0, color=LIGHT_GRAY_COLOR, linewidth=0.0, zorder=0)
-        axes.axhline(0.0, color="black", linewidth=0.5, zorder=1)
-        axes.set_xlabel("time since landing [s]")
-    step_axes.legend(loc="upper left")
-    heights = np.concatenate([gait.foot_2_z for gait in gaits])
-    min_height, max_height = heights.min(), heights.max()
-    takeoff_times = [float(gait.time[gait.phase == 1][0]) for gait in gaits]
-    step_axes.set(
-        xlim=(0.0, max(float(gait.time.max()) for gait in gaits)),
-        ylim=(2.0 * min_height - 0.004, 1.05 * max_height),
-        ylabel="height of foot 2, $z_2$ [m]",
-    )
-    takeoff_axes.set(
-        xlim=(min(takeoff_times) - 0.03, max(takeoff_times) + 0.12),
-        ylim=(1.3e3 * min_height - 0.5, -1.8e3 * min_height + 0.5),
-        ylabel="$z_2$ [mm]",
-    )
-    takeoff_axes.legend(loc="best")
-    takeoff_axes.text(
-        0.98,
-        0.03,
-        "below the ground",
-        transform=takeoff_axes.transAxes,
-        ha="right",
-        color=DARK_GRAY_COLOR,
-    )
-    return figure
-
-
-@figure_style()
-def rear_force(
-    gaits: Sequence[xr.Dataset], vary: str = "damping", *, width: FigureWidth = None
-) -> Figure:
-    """Return a figure of the normal force on foot 2 in double support of each gait (Fig. 9 of the
-    paper).
-
-    Args:
-        gaits: datasets that `vrw.simulate` returns for one step, one per curve.
-        vary: name of the parameter in which the gaits differ, used in the legend.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: one panel over the time since the landing, in s.
-
-    Examples:
-        >>> gait = vrw.simulate(vrw.WheelParams(), vrw.paper_start(), n_steps=1)
-        >>> figure = vrw.plot.rear_force([gait])
-    """
-    require_variables_of_datasets("gaits", gaits, ("phase", "lambda_4"), NO_PAPER_WALK_REMEDY)
-    figure = StyledFigure(figsize=(find_width_inches(width, COLUMN_FIGURE_WIDTH_INCHES), 2.5))
-    axes = figure.subplots()
-    for gait, line_format in _format_gait_lines(gaits, vary):
-        double_support = gait.isel(time=gait.phase.values == 0)
-        (force_line,) = axes.plot(double_support.time, double_support.lambda_4, **line_format)
-        axes.plot(
-            0.0,
-            double_support.lambda_4[0],
-            "o",
-            color=force_line.get_color(),
-            markersize=3.5,
-            clip_on=False,
-        )
-    axes.set(
-        xlim=(0.0, None),
-        ylim=(0.0, None),
-        xlabel="time since landing [s]",
-        ylabel="normal force on foot 2, $\\lambda_4$ [N]",
-    )
-    axes.legend(loc="upper right")
-    return figure
-
-
-@figure_style()
-def indicators(gaits: xr.Dataset, every: int = 4, *, width: FigureWidth = None) -> Figure:
-    """Return a figure of the DLS indicators of period-1 gaits with λ2⁺ >= 0 (Fig. 10 of the paper).
-
-    Symbols are filled if foot 2 stays above the ground, and open if foot 2 scuffs.
-
-    Args:
-        gaits: dataset over one parameter, with `settled`, `lambda_I4` (N s), `lambda_2_plus` and
-            `lambda_4_plus` (N), `clearance_sls1` and `clearance_sls2` (m). Its attribute
-            `parameter_slope` is the slope in rad.
-        every: spacing of the symbols: they are drawn at parameter values that are multiples of this
-            number, and at the first and the last value.
-        width: "column", "page" or a number of mm; None for the usual width.
-
-    Returns:
-        Figure: the impulse and the two forces over the parameter.
-
-    Examples:
-        >>> columns = {"lambda_I4": [5.0, 4.0], "lambda_2_plus": [90.0, 80.0]}
-        >>> columns |= {"lambda_4_plus": [50.0, 60.0], "settled": [True, True]}
-        >>> columns |= {"clearance_sls1": [0.01, 0.02], "clearance_sls2": [0.01, 0.02]}
-        >>> over = {name: ("damping", values) for name, values in columns.items()}
-        >>> gaits = xr.Dataset(over, {"damping": [80.0, 120.0]}, {"parameter_slope": 0.3})
-        >>> figure = vrw.plot.indicators(gaits)
-    """
-    require_dataset_variables(
-        "gaits",
-        gaits,
-        ("settled", "lambda_I4"),
-        "give gaits over one parameter, as in the example of vrw.plot.indicators",
-    )
-    varied_parameter = str(gaits.settled.dims[0])
-    valid_gaits = gaits.where(gaits.settled & (gaits.lambda_2_plus >= 0.0), drop=True)
-    is_scuffing = np.minimum(valid_gaits.clearance_sls1, valid_gaits.clearance_sls2).values < 0.0
-    parameter_values = valid_gaits[varied_parameter].values
-    value_range = (parameter_values.min(), parameter_values.max())
-    is_marker_drawn_at_value = (parameter_values % every == 0) | np.isin(
-        parameter_values, value_range
-    )
-    panel_rows = (
-        ((("lambda_I4", LEG_1_COLOR, "o"),), "impulse [N·s]"),
-        ((("lambda_2_plus", LEG_1_COLOR, "s"), ("lambda_4_plus", LEG_2_COLOR, "o")), "force [N]"),
-    )
-    figure, panel_axes = make_panel_grid(
-        find_width_inches(width, PAGE_FIGURE_WIDTH_INCHES), 2, 2.7, 0.0, 2
-    )
-    for axes, panel_letter, (panel_indicators, axis_label) in zip(
-        panel_axes, "ab", panel_rows, strict=True
-    ):
-        draw_panel_letter(axes, panel_letter)
-        for indicator_name, line_color, marker_symbol in panel_indicators:
-            indicator_values = valid_gaits[indicator_name].values
-            axes.plot(parameter_values, indicator_values, color=line_color, linewidth=0.7)
-            for is_drawn, fill_color, legend_suffix in (
-                (is_marker_drawn_at_value & ~is_scuffing, line_color, ""),
-                (is_marker_drawn_at_value & is_scuffing, "white", ", scuffing"),
-            ):
-                draw_markers(
-                    axes,
-                    parameter_values[is_drawn],
-                    indicator_values[is_drawn],
-                    marker_symbol,
-                    line_color,
-                    fill_color,
-                    label=f"${MEASURES[indicator_name].mathtext}${legend_suffix}",
-                    clip_on=False,
-                )
-        max_indicator = max(valid_gaits[name].max() for name, *_ in panel_indicators)
-        axes.set(
-            xlim=(0.0, value_range[1] + 1.0),
-            ylim=(0.0, 1.18 * max_indicator),
-            xlabel=format_axis_label(varied_parameter, "{symbol}"),
-            ylabel=axis_label,
-        )
-        axes.legend(
-            loc="lower right" if panel_letter == "a" else "upper right", ncols=len(panel_indicators)
-        )
-    ground_slope = gaits.attrs["parameter_slope"]  # The slope in the paper's caption is a misprint.
-    panel_axes[0].text(
-        0.02, 0.05, format_value_label("slope", ground_slope), transform=panel_axes[0].transAxes
-    )
-    return figure
-
-
 @figure_style()
 def walk_frames(
     step: xr.Dataset, n_frames: int = 36, slow: float = 2.0
@@ -539,7 +471,7 @@ def walk_frames(
         >>> len(frames)
         2
     """
-    _require_nonempty_walk("step", step)
+    require_nonempty_walk("step", step)
     n_frames, slow = check_int("n_frames", n_frames), check_positive("slow", slow)
     slope, foot_motion = step.attrs["parameter_slope"], compute_foot_motion(step)
 

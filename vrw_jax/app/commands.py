@@ -11,7 +11,6 @@ import keyword
 import os
 import signal
 import sys
-import tempfile
 import tokenize
 import webbrowser
 from dataclasses import replace
@@ -22,10 +21,18 @@ import jax
 import jax.numpy as jnp
 import typer
 
-from vrw_jax.app import console as printing
+from vrw_jax.app import output as printing
 from vrw_jax.app import scanning
-from vrw_jax.app.config import Config, is_figure_file, load_config, parse_assignments
-from vrw_jax.app.console import (
+from vrw_jax.app.config import (
+    Config,
+    is_figure_file,
+    load_config,
+    parse_assignments,
+    require_writable_folder,
+    require_writable_output,
+)
+from vrw_jax.app.explorer import make_page_address
+from vrw_jax.app.output import (
     ExitCode,
     print_error_sentence,
     replace_unencodable_output,
@@ -33,23 +40,27 @@ from vrw_jax.app.console import (
     show_computation_stages,
     show_warnings_as_sentences,
     stdout_console,
+    write_branch_report,
+    write_special_point_map,
+    write_tuning_report,
 )
-from vrw_jax.app.explorer import make_page_address
+from vrw_jax.app.scanning import forecast_scan
 from vrw_jax.base.checks import check_path
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import PROGRESS_VARIABLE, start_jax
+from vrw_jax.base.results import Outcome
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.continuation import continue_branch
 from vrw_jax.branches.special_point_curves import SPECIAL_POINT_MEASURES
 from vrw_jax.gaits.gait_search import limit_cycle, make_finder, resolve_model_with_reason
-from vrw_jax.lanes.disk_cache import find_library_version
+from vrw_jax.lanes.environment import find_library_version
 from vrw_jax.models.ladder import list_model_config_names
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES
 from vrw_jax.models.stepping import step
 from vrw_jax.studies.first_passage import first_passage
 from vrw_jax.studies.robustness import gait_sensitivity
-from vrw_jax.studies.scan_execution import follow_special_points, forecast_scan, require_map_grid
+from vrw_jax.studies.scan_design import require_map_grid
+from vrw_jax.studies.scan_execution import follow_special_points
 from vrw_jax.studies.tuning import tune
 from vrw_jax.wheel.params import WheelParams
 
@@ -275,7 +286,7 @@ def run_init_command(
                 raise ValueError(
                     f"{config_path} is there already and differs: give another folder."
                 )
-        _require_writable_folder(folder)
+        require_writable_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
         for config_path in missing_config_paths:
             config_path.write_text(example_config_texts[config_path.name], encoding="utf-8")
@@ -332,7 +343,7 @@ def run_new_command(
         for path in texts:
             if path.exists():
                 raise ValueError(f"{path} is there already: give another name or --out FOLDER.")
-        _require_writable_folder(folder)
+        require_writable_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
         for path, text in texts.items():
             path.write_text(text.replace(SKELETON_NAME, name), encoding="utf-8")
@@ -344,50 +355,6 @@ def find_example_config_folder() -> Path:
     package_folder = Path(__file__).parents[1]
     candidate_folders = (package_folder / "configs", package_folder.parent / "configs")
     return next(filter(Path.is_dir, candidate_folders))
-
-
-def _require_writable_folder(folder: Path, draws_figure: bool = False) -> None:
-    """Raise a ValueError if the folder is not writable, or if figures are to be drawn and the
-    requested matplotlib backend does not exist. No folder is created.
-    """
-    existing_parent_folder = folder
-    while not existing_parent_folder.exists():
-        existing_parent_folder = existing_parent_folder.parent
-    try:
-        with tempfile.TemporaryDirectory(dir=existing_parent_folder):
-            pass
-    except OSError as write_error:
-        raise ValueError(
-            f"nothing can be written to {folder} ({write_error.strerror}): give a place of your "
-            "own."
-        ) from write_error
-    if not draws_figure:
-        return
-    try:
-        importlib.import_module("vrw_jax.plot")
-    except ValueError as backend_error:
-        raise ValueError(
-            f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
-            "it, or set it to agg."
-        ) from backend_error
-
-
-def _require_writable_output(
-    command_config: Config, folder: Path, draws_figure: bool, tests_backend: bool = True
-) -> None:
-    _require_writable_folder(folder, draws_figure and tests_backend)
-    if (figure_file := command_config.figures.file) is not None:
-        if not draws_figure:
-            raise ValueError(
-                f"--no-picture is given, but the figure {figure_file} is asked for: drop one of "
-                "the two."
-            )
-        if figure_file.is_dir():
-            raise ValueError(
-                f"{figure_file} is a folder, but the figure is written to a file of this name: "
-                "give another name."
-            )
-        _require_writable_folder(figure_file.parent)
 
 
 @app.command("reproduce")
@@ -408,7 +375,7 @@ def run_reproduce_command(
             raise ValueError(
                 f"--out is {folder}, but this command writes several figures: give a folder."
             )
-        _require_writable_folder(folder, draws_figure=True)
+        require_writable_folder(folder, draws_figure=True)
     from vrw_jax.app.paper_reproduction import reproduce_paper
 
     with (
@@ -485,7 +452,7 @@ def run_scan_command(
             scanning.verify_scan_store(scan_plan, store_path)
             return
         has_figures = (folder / scanning.FIGURE_RECORD_NAME).exists()
-        _require_writable_output(scan_config, folder, picture, tests_backend=not has_figures)
+        require_writable_output(scan_config, folder, picture, tests_backend=not has_figures)
     scan_dataset = scanning.compute_scan_with_progress(scan_plan, store_path, dask)
     with report_command_errors(f"stopped; the data are in {store_path}."):
         printing.print_outcome_counts(scan_dataset)
@@ -545,13 +512,12 @@ def run_map_command(
     """Draw all special points of gaits over two parameters: `vrw map configs/map_c_k.toml`."""
     with report_command_errors():
         special_point_map_config, folder = _load_config_with_table(config, folder, "design", "map")
-        from vrw_jax.app.reports import write_special_point_map
 
         scan_plan = scanning.plan_config_scan(
             special_point_map_config, None, SPECIAL_POINT_MEASURES
         )
         require_map_grid(scan_plan.design)
-        _require_writable_output(special_point_map_config, folder, draws_figure=True)
+        require_writable_output(special_point_map_config, folder, draws_figure=True)
     scan_dataset = scanning.compute_scan_with_progress(scan_plan, folder / "map.zarr", None)
 
     with (
@@ -599,8 +565,7 @@ def run_tune_command(
         command_config, folder = _load_config_with_table(config, folder, "tune", "tune")
         tune_config = command_config.tune
         assert tune_config is not None
-        _require_writable_output(command_config, folder, picture)
-        from vrw_jax.app.reports import write_tuning_report
+        require_writable_output(command_config, folder, picture)
 
         tune_result = tune(
             command_config.make_wheel(),
@@ -645,8 +610,7 @@ def run_continue_command(
         command_config, folder = _load_config_with_table(config, folder, "branch", "branch")
         branch_config = command_config.branch
         assert branch_config is not None
-        _require_writable_output(command_config, folder, picture)
-        from vrw_jax.app.reports import write_branch_report
+        require_writable_output(command_config, folder, picture)
 
         arclength_options = ArclengthOptions()
         if branch_config.max_ds is not None:

@@ -7,7 +7,9 @@ value, the allowed values and the remedy.
 import dataclasses
 import importlib.util
 import math
+import os
 import sys
+import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -34,7 +36,7 @@ from vrw_jax.base.checks import (
     require_known_name,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.gaits.options import CycleOptions
+from vrw_jax.gaits.cycle import CycleOptions
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import MODEL_CLASSES, list_model_config_names
 from vrw_jax.studies import scan_design as designs
@@ -654,3 +656,47 @@ def _make_value_error(setting_name: str, config_value: object, requirement_text:
     elif isinstance(config_value, str):
         value_text = value_text.replace("'", '"')
     return ValueError(f"{setting_name} is {value_text}, but it must be {requirement_text}.")
+
+
+def require_writable_folder(folder: Path, draws_figure: bool = False) -> None:
+    """Raise a ValueError if the folder is not writable, or if figures are to be drawn and the
+    requested matplotlib backend does not exist. No folder is created.
+    """
+    existing_parent_folder = folder
+    while not existing_parent_folder.exists():
+        existing_parent_folder = existing_parent_folder.parent
+    try:
+        with tempfile.TemporaryDirectory(dir=existing_parent_folder):
+            pass
+    except OSError as write_error:
+        raise ValueError(
+            f"nothing can be written to {folder} ({write_error.strerror}): give a place of your "
+            "own."
+        ) from write_error
+    if not draws_figure:
+        return
+    try:
+        importlib.import_module("vrw_jax.plot")
+    except ValueError as backend_error:
+        raise ValueError(
+            f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
+            "it, or set it to agg."
+        ) from backend_error
+
+
+def require_writable_output(
+    command_config: Config, folder: Path, draws_figure: bool, tests_backend: bool = True
+) -> None:
+    require_writable_folder(folder, draws_figure and tests_backend)
+    if (figure_file := command_config.figures.file) is not None:
+        if not draws_figure:
+            raise ValueError(
+                f"--no-picture is given, but the figure {figure_file} is asked for: drop one of "
+                "the two."
+            )
+        if figure_file.is_dir():
+            raise ValueError(
+                f"{figure_file} is a folder, but the figure is written to a file of this name: "
+                "give another name."
+            )
+        require_writable_folder(figure_file.parent)

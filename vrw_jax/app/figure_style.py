@@ -25,9 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from vrw_jax.base.checks import check_path, check_real, check_type
-from vrw_jax.base.measures import Measure
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import format_mathtext
+from vrw_jax.base.results import Measure, Outcome, format_mathtext
 from vrw_jax.models.measures import MEASURES
 
 OKABE_ITO_BLUE = "#0072B2"

@@ -24,8 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.models.ladder import collect_provenance_attributes
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,

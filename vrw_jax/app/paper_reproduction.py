@@ -38,8 +38,7 @@ from vrw_jax.app.paper_evidence import (
     walk_into_gait,
 )
 from vrw_jax.base.checks import check_path
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import format_markdown_table
+from vrw_jax.base.results import Outcome, format_markdown_table
 from vrw_jax.models.measures import PHASE_NAMES
 from vrw_jax.models.stepping import paper_start
 from vrw_jax.models.trajectory import simulate

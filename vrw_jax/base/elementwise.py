@@ -12,17 +12,34 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Inexact, PyTree
 
 from vrw_jax import lanes
-from vrw_jax.base.types import Elementwise, Vector
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.environment import with_default_jax_settings
+
+Scalar = Float[Array, ""]
+if TYPE_CHECKING:
+    Elementwise = Array
+else:
+    Elementwise = Inexact[Array, "..."] | Inexact[np.ndarray, "..."] | float
+"""Quantity with any leading axes, because formulas in lower layers than `studies` act element by
+element.
+
+Complex numbers are also allowed, because complex-step derivatives need them.
+"""
+
+Vector = tuple[Elementwise, ...]
+"""Tuple with one array per component."""
+
+
+RealInput = float | Array | np.ndarray
+"""Real number in any form that users may pass, or an array of numbers."""
 
 
 def select_entry_by_mask(entry_index: Array, stacked_entries: Array, axis: int = 0) -> Array:

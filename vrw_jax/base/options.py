@@ -19,8 +19,8 @@ from vrw_jax.base.checks import (
     check_reals,
     require_known_name,
 )
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
-from vrw_jax.base.types import RealInput, Scalar
+from vrw_jax.base.elementwise import RealInput, Scalar
+from vrw_jax.base.results import AbstractPrintable, LabelAndText, format_quantity
 
 
 class ParameterDomain(NamedTuple):

@@ -20,8 +20,8 @@ from typing import Any, TypeVar
 import jax
 
 from vrw_jax.base.checks import check_bool, check_path
-from vrw_jax.lanes import disk_cache as store
-from vrw_jax.lanes.settings import (
+from vrw_jax.lanes import environment as store
+from vrw_jax.lanes.environment import (
     FUSION_EMITTERS_FLAG,
     accepts_fusion_emitters_flag,
     dispatch_cpu_programs_synchronously,

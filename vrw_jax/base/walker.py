@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_reals, check_type, has_traced_leaf
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import (
     StepOptions,
     find_tree_parameter,
@@ -24,7 +23,7 @@ from vrw_jax.base.options import (
     list_tree_parameters,
     replace_tree_parameter,
 )
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Measure, Outcome
 
 
 class AdvanceResult(eqx.Module):

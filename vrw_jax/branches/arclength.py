@@ -18,15 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_positive
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
+from vrw_jax.base.results import Outcome, StatusCode
 from vrw_jax.branches.branch import BIFURCATIONS, TestFunction, is_multiplier_change_explained
 from vrw_jax.gaits.finder import STATE_AGREEMENT_TOLERANCE
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
+
+LOCATION_BATCH_SIZES = (1, 8)
+"""Numbers of special points that one call locates. Only one size is compiled if compilation is
+expensive.
+"""
 
 Unknowns = Float[np.ndarray, " unknowns"]
 
@@ -236,7 +239,7 @@ class ContinuationPoint(NamedTuple):
         )
 
 
-POINT_BATCH_SIZES = (batch_sizes.LOCATION_BATCH_SIZES[-1],)
+POINT_BATCH_SIZES = (LOCATION_BATCH_SIZES[-1],)
 """Number of points that one call of an XLA program computes, one size so that it compiles once."""
 
 

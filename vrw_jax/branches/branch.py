@@ -15,11 +15,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import format_html_table
-from vrw_jax.gaits import floquet
-from vrw_jax.gaits.floquet import (
+from vrw_jax.base import small_matrices
+from vrw_jax.base.results import Outcome, format_html_table
+from vrw_jax.base.results import xarray as xr
+from vrw_jax.base.small_matrices import (
     LOCATED_PAIR_CIRCLE_DISTANCE,
     MAX_CLOSED_FORM_SIZE,
     MIN_IMAGINARY_PART,
@@ -178,7 +177,7 @@ class FixedPoint(NamedTuple):
     @property
     def multipliers(self) -> np.ndarray:
         """Return the Floquet multipliers in the order of decreasing modulus."""
-        return np.asarray(floquet.floquet_multipliers(jnp.asarray(self.jacobian)))
+        return np.asarray(small_matrices.floquet_multipliers(jnp.asarray(self.jacobian)))
 
     @property
     def spectral_radius(self) -> float:

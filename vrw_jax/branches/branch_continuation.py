@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
+from vrw_jax.base.small_matrices import compute_multipliers
 from vrw_jax.branches.arclength import (
     ArclengthDriver,
     ContinuationPoint,
@@ -24,7 +25,6 @@ from vrw_jax.branches.branch import (
     TestFunction,
     evaluate_bifurcations,
 )
-from vrw_jax.gaits.floquet import compute_multipliers
 from vrw_jax.lanes.batching import select_tree_rows
 
 COARSE_MESH_END_NAME = Outcome.MESH_TOO_COARSE.name.lower()

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vrw_jax.base.small_matrices import EQUAL_MODULI_DISTANCE, UNIT_CIRCLE_DISTANCE
 from vrw_jax.branches.arclength import ContinuationPoint, ContinuationStatus, QuantitiesByName
 from vrw_jax.branches.branch import (
     BIFURCATIONS,
@@ -31,7 +32,6 @@ from vrw_jax.branches.branch_continuation import (
     PointTable,
     stack_points,
 )
-from vrw_jax.gaits.floquet import EQUAL_MODULI_DISTANCE, UNIT_CIRCLE_DISTANCE
 from vrw_jax.lanes.batching import concatenate_tree_rows, replace_rows, select_tree_rows
 
 # Largest ratio of the quantity next to its root to the quantity at an end of the bracket; at a jump

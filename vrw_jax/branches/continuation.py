@@ -24,10 +24,9 @@ from vrw_jax.base.checks import (
     check_type,
     require_untraced_arguments,
 )
-from vrw_jax.base.measures import Measure, find_own_measures, select_measures
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import Measure, Outcome, find_own_measures, select_measures
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import Branch, SpecialPoint
@@ -46,12 +45,11 @@ from vrw_jax.branches.map_branch import (
     make_branch,
     parse_switch_point,
 )
-from vrw_jax.gaits.cycle import AbstractCycle
+from vrw_jax.gaits.cycle import AbstractCycle, CycleOptions
 from vrw_jax.gaits.gait_search import limit_cycles, make_finder, resolve_model
 from vrw_jax.gaits.gauss import CollocationSolution
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
-from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.gaits.return_map_finder import ReturnMapCycle
+from vrw_jax.gaits.wheel_finders import ReturnMapCycle
 from vrw_jax.lanes.batching import select_rows_on_device
 from vrw_jax.models.ladder import collect_provenance_attributes
 from vrw_jax.models.measures import FORCE_PEAK_MEASURES, MEASURES

@@ -19,13 +19,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base import batch_sizes
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Measure, Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import make_return_map
 from vrw_jax.branches.arclength import (
+    LOCATION_BATCH_SIZES,
     POINT_BATCH_SIZES,
     AbstractContinuationProblem,
     AbstractStateProblem,
@@ -40,8 +39,8 @@ from vrw_jax.gaits.gait_search import make_finder
 from vrw_jax.gaits.gauss import CollocationSolution
 from vrw_jax.gaits.limit_cycle_result import evaluate_own_measure, land_foot
 from vrw_jax.gaits.phase_sequence import CollocationState, CollocationSystem
-from vrw_jax.gaits.return_map_finder import measure_return_map_cycle, measure_return_map_force_peaks
 from vrw_jax.gaits.unilateral_finder import PeriodMap, solve_linear_systems
+from vrw_jax.gaits.wheel_finders import measure_return_map_cycle, measure_return_map_force_peaks
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows
 from vrw_jax.lanes.lane_function import compile_batch_function
 from vrw_jax.models.measures import (
@@ -604,7 +603,7 @@ class ContactGaitProblem(ReturnMapProblem):
 
     def take_steps(self, values: np.ndarray, states: np.ndarray) -> Any:
         evaluate = lambda *rows: self._evaluate_period(*rows, False, False).gait_steps
-        return map_in_numpy_batches(evaluate, batch_sizes.LOCATION_BATCH_SIZES, values, states)
+        return map_in_numpy_batches(evaluate, LOCATION_BATCH_SIZES, values, states)
 
     def measure_steps(
         self, values: np.ndarray, states: np.ndarray, steps: AbstractStep

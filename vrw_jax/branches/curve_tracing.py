@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.base import batch_sizes
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import BIFURCATIONS, BRANCH_POINT, FOLD, Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_continuation import Continuation
@@ -49,6 +48,11 @@ from vrw_jax.models.ladder import collect_provenance_attributes
 from vrw_jax.models.measures import MARGIN_MEASURES, make_labeled_variables
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.params import WheelParams
+
+CURVE_BATCH_SIZE = 8
+"""Number of curves of special points that are traced together, fixed so that one shape is
+compiled.
+"""
 
 
 class CurveSeed(NamedTuple):
@@ -186,7 +190,7 @@ class CurveTracer(NamedTuple):
                 # A batch has one seed per name, because seeds of one name may lie on one curve.
                 first_by_name = {seed.special_point_name: seed for seed in reversed(remaining)}
                 names = dict.fromkeys(seed.special_point_name for seed in remaining)
-                batch = [first_by_name[name] for name in names][: batch_sizes.CURVE_BATCH_SIZE]
+                batch = [first_by_name[name] for name in names][:CURVE_BATCH_SIZE]
                 for curve in self._trace_curves_of_batch(group, batch):
                     if not curve.is_on_any(curves):
                         curves.append(curve)
@@ -230,7 +234,7 @@ class CurveTracer(NamedTuple):
         self, quantity_group: tuple[str, ...], curve_seeds: list[CurveSeed], is_finest_mesh: bool
     ) -> list[BranchData | None]:
         """Continue the curve through each seed, and return its data; further entries are None."""
-        n_padding = -len(curve_seeds) % batch_sizes.CURVE_BATCH_SIZE
+        n_padding = -len(curve_seeds) % CURVE_BATCH_SIZE
         padded_seeds = [*curve_seeds, *curve_seeds[-1:] * n_padding]
         names = tuple(seed.special_point_name for seed in padded_seeds)
         problem = self.make_problem(curve_seeds[0], quantity_group, names)

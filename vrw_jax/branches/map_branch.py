@@ -27,11 +27,11 @@ from vrw_jax.base.checks import (
     require_no_masked_entries,
     require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure, measure, select_measures
 from vrw_jax.base.options import StepOptions, find_tree_parameter
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import Measure, Outcome, measure, select_measures
+from vrw_jax.base.results import xarray as xr
+from vrw_jax.base.small_matrices import compute_multipliers
 from vrw_jax.base.walker import (
     AbstractWalker,
     check_one_walker,
@@ -70,7 +70,6 @@ from vrw_jax.gaits.fixed_points import (
     count_unit_multipliers,
     estimate_state_units,
 )
-from vrw_jax.gaits.floquet import compute_multipliers
 from vrw_jax.gaits.gait_search import limit_cycle
 from vrw_jax.gaits.walker_finder import HybridGait, find_walker_gaits, parameterize_walker
 from vrw_jax.lanes.batching import map_in_numpy_batches, select_tree_rows

@@ -22,10 +22,10 @@ from vrw_jax.base.checks import (
     require_known_name,
     require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions, find_tree_parameter
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
 from vrw_jax.branches.arclength import ArclengthOptions
 from vrw_jax.branches.branch import BIFURCATIONS, Codim2Point, SpecialPointCurve
@@ -61,7 +61,7 @@ from vrw_jax.gaits.fixed_points import estimate_state_units
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
 from vrw_jax.gaits.walker_finder import HybridGait
 from vrw_jax.lanes.batching import select_tree_rows
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.environment import with_default_jax_settings
 from vrw_jax.models.measures import MARGIN_MEASURES
 from vrw_jax.models.viscoelastic import ViscoelasticWheel
 from vrw_jax.wheel.params import PARAMETER_NAMES, WheelParams, check_parameter_name

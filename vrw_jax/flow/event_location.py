@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from vrw_jax.base.elementwise import select_trees_by_condition
 from vrw_jax.base.options import StepOptions
-from vrw_jax.flow.minima import MarginMinimaState
+from vrw_jax.flow.extrema import MarginMinimaState
 from vrw_jax.flow.solver_steps import (
     BatchPhase,
     ButcherTableau,
@@ -64,6 +64,27 @@ class IntegratorState(NamedTuple):
     def has_guard_crossed(self) -> Array:
         """Return whether the last tried step of each batch element crosses a guard."""
         return self.integration_status == IntegrationStatus.CROSSED
+
+
+def make_idle_state(
+    start_state: StageState, guard_values: Array, initial_dt: Array
+) -> IntegratorState:
+    """Return the state of the loop before the first solver step, in which no element runs."""
+    counts, count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
+    return IntegratorState(
+        state=start_state,
+        guard_values=guard_values,
+        next_step_length=initial_dt,
+        elapsed_time=jnp.zeros_like(initial_dt),
+        integration_status=counts + IntegrationStatus.IDLE,
+        middle_guard_values=guard_values,
+        end_guard_values=guard_values,
+        n_tried_steps=counts,
+        n_iterations_until_half_ended=count,
+        n_iterations=count,
+        margin_minima_state=None,
+        state_tangents=None,
+    )
 
 
 class EventSearch(NamedTuple):

@@ -21,10 +21,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_callable, check_int, check_reals, check_type
-from vrw_jax.base.elementwise import make_opaque_loop_condition, select_entry_by_mask
+from vrw_jax.base.elementwise import Scalar, make_opaque_loop_condition, select_entry_by_mask
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import (
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
+    Outcome,
     StatusCode,
     describe_step_ending,
     format_each_batch_element,
@@ -33,18 +34,17 @@ from vrw_jax.base.printing import (
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.types import Scalar
 from vrw_jax.flow.integrate import PhaseEnd
 from vrw_jax.flow.phase_integration import (
     GuardsAndMargins,
     StateArray,
     VectorField,
+    evaluate_rise_from_rest,
     integrate_phase,
     is_machine_code_better,
 )
 from vrw_jax.lanes.autodiff import forbid_reverse_mode
-from vrw_jax.lanes.saved_traces import call_compiled_program
+from vrw_jax.lanes.program import call_compiled_program
 
 MAX_STORED_NUMBERS = 100_000_000
 """Largest product of the number of events and the dimension of the state.
@@ -321,8 +321,12 @@ def _simulate_one_event(
     guard_values, guard_rates, second_guard_rates = lax.stop_gradient(
         (guard_values, guard_rates, second_guard_rates)
     )
-    growth = _evaluate_rise_from_rest(
-        mode, guard_values, guard_rates, *lax.stop_gradient((state, options.dt0))
+    growth = evaluate_rise_from_rest(
+        mode.field,
+        mode.guard_values,
+        guard_values,
+        guard_rates,
+        *lax.stop_gradient((state, options.dt0)),
     )
     # For a guard exactly at rest the second derivative decides, also if the growth is round-off.
     will_guard_rise = (guard_values == 0.0) & (guard_rates == 0.0) & (second_guard_rates > 0.0)
@@ -375,47 +379,10 @@ def _simulate_one_event(
     return phase_end, violated_guard.astype(jnp.int32), next_state, next_mode.astype(jnp.int32)
 
 
-PROBE_TIME_RATIO = 1e-2
-"""Time after which a guard at rest is evaluated again, as a fraction of the first solver step.
-
-The value is chosen because the cube of the time, with which the height of a foot begins to grow, is
-then above round-off.
-"""
-
-MAX_SHARE_AT_REST = 1e-3
-"""Largest change of a guard by its initial rate, as a fraction of its growth over the probe, for
-which the guard begins at rest. A guard that falls so slowly would be negative by round-off only.
-"""
-
-MAX_SHARE_OF_ROUNDOFF = 1e-6
-"""Largest negative value of a guard, as a fraction of its growth, that is treated as zero."""
-
-
 GROWTH_SHARE_AT_START = 1e-9
 """Initial value of a guard that rises from rest, as a fraction of its growth over the probe. The
 value is chosen above round-off at the start, and below round-off at the next event.
 """
-
-
-def _evaluate_rise_from_rest(
-    mode: Mode, guard_values: Array, guard_rates: Array, state: StateArray, dt0: Array
-) -> Float[Array, " n_guards"]:
-    """Return the value after the probe of each guard that starts at zero and at rest, else 0.
-
-    A guard that grows does not end the mode. A foot that lifts off smoothly has no height, no rate
-    and no acceleration at first. Only the values after a short time, by Heun's method of third
-    order, determine its direction.
-    """
-    h, field = PROBE_TIME_RATIO * dt0, mode.field
-    start_rates = field(state)
-    middle_rates = field(state + (h / 3.0) * start_rates)
-    last_rates = field(state + (2.0 * h / 3.0) * middle_rates)
-    growth = lax.stop_gradient(
-        mode.guard_values(state + (0.25 * h) * (start_rates + 3.0 * last_rates))
-    )
-    is_at_rest = h * jnp.abs(guard_rates) <= MAX_SHARE_AT_REST * growth
-    is_zero = (guard_values <= 0.0) & (-guard_values <= MAX_SHARE_OF_ROUNDOFF * growth)
-    return jnp.where(is_zero & is_at_rest & (growth > 0.0), growth, 0.0)
 
 
 def _find_rising_ties(mode: Mode, state: StateArray) -> Bool[Array, " n_guards"]:

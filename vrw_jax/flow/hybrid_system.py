@@ -25,11 +25,10 @@ from vrw_jax.base.checks import (
     check_type,
     require_known_name,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure
+from vrw_jax.base.elementwise import Scalar
 from vrw_jax.base.options import StepOptions, is_tree_in_domain
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.types import Scalar
+from vrw_jax.base.results import Measure, Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import (
     AbstractWalker,
     AdvanceResult,

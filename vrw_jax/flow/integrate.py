@@ -18,11 +18,11 @@ from jaxtyping import Array
 
 from vrw_jax import lanes
 from vrw_jax.base.elementwise import (
+    Vector,
     run_if_any_element_active,
     select_trees_by_condition,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Vector
 from vrw_jax.flow.event_location import (
     EventSearch,
     IntegrationStatus,
@@ -32,9 +32,9 @@ from vrw_jax.flow.event_location import (
     find_first_guard,
     has_guard_crossed,
     locate_event,
+    make_idle_state,
 )
-from vrw_jax.flow.kinks import find_sides, integrate_over_kinks
-from vrw_jax.flow.minima import (
+from vrw_jax.flow.extrema import (
     EnterSides,
     MarginMinimaResult,
     compute_margin_minima_jvp,
@@ -53,7 +53,13 @@ from vrw_jax.flow.solver_steps import (
     find_hidden_event_fraction,
     make_solver_step_function,
 )
-from vrw_jax.flow.tangents import PhaseTangents, propagate_to_event, stack_directions
+from vrw_jax.flow.tangents import (
+    PhaseTangents,
+    find_sides,
+    integrate_over_kinks,
+    propagate_to_event,
+    stack_directions,
+)
 from vrw_jax.lanes.autodiff import apply_batched_jvp_rule
 
 
@@ -69,7 +75,7 @@ class PhaseEnd(NamedTuple):
     solver_steps: Array  # number of tried solver steps, accepted or not
     next_solver_dt: Array  # next step length that the controller proposes, s
     margin_minima: Any  # minima of the margins, (margins, batch) or (margins,)
-    kink_log: Any = None  # a `kinks.KinkLog` without tangents, if requested
+    kink_log: Any = None  # a `tangents.KinkLog` without tangents, if requested
 
     @property
     def has_integration_failed(self) -> Array:
@@ -170,7 +176,7 @@ class SearchEnd(NamedTuple):
     enter_sides: EnterSides | None  # None for phases without kinks
     sides: Vector  # sides of the kinks at the end
     margin_minima_result: MarginMinimaResult | None = None
-    kink_tangents: Array | None = None  # see `kinks.KinkLog`
+    kink_tangents: Array | None = None  # see `tangents.KinkLog`
 
 
 def compute_phase_end_jvp(
@@ -359,7 +365,7 @@ def _make_phase_end(
     """Return the end of a phase without minima, and the index of the guard that is zero there.
 
     - `start_event_guard_index`: index of the guard whose event is the start itself, or -1;
-    - `end_guard_index`: see `kinks.KinkPassage`.
+    - `end_guard_index`: see `tangents.KinkPassage`.
     """
     is_crossing = integrator_state.has_guard_crossed
     is_event_unresolved = is_crossing & event_search.is_event_unresolved
@@ -624,27 +630,6 @@ def _init_integrator_state(
             without_shared(initial_state),
         )._replace(**shared_fields)
     return initial_state
-
-
-def make_idle_state(
-    start_state: StageState, guard_values: Array, initial_dt: Array
-) -> IntegratorState:
-    """Return the state of the loop before the first solver step, in which no element runs."""
-    counts, count = jnp.zeros(initial_dt.shape, jnp.int32), jnp.zeros((), jnp.int32)
-    return IntegratorState(
-        state=start_state,
-        guard_values=guard_values,
-        next_step_length=initial_dt,
-        elapsed_time=jnp.zeros_like(initial_dt),
-        integration_status=counts + IntegrationStatus.IDLE,
-        middle_guard_values=guard_values,
-        end_guard_values=guard_values,
-        n_tried_steps=counts,
-        n_iterations_until_half_ended=count,
-        n_iterations=count,
-        margin_minima_state=None,
-        state_tangents=None,
-    )
 
 
 def _classify_solver_step(

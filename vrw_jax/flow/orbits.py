@@ -24,8 +24,8 @@ from jaxtyping import Array, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_reals
+from vrw_jax.base.elementwise import Scalar
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Scalar
 from vrw_jax.flow.hybrid_simulation import (
     Guard,
     HybridSolution,
@@ -42,7 +42,7 @@ from vrw_jax.flow.phase_integration import (
     sample_phase,
 )
 from vrw_jax.lanes.autodiff import forbid_reverse_mode
-from vrw_jax.lanes.saved_traces import call_compiled_program
+from vrw_jax.lanes.program import call_compiled_program
 
 
 class FlowSegments(NamedTuple):

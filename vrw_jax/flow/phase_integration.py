@@ -22,9 +22,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from vrw_jax import lanes
-from vrw_jax.base.elementwise import select_entry_by_mask
+from vrw_jax.base.elementwise import Scalar, Vector, select_entry_by_mask
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Scalar, Vector
 from vrw_jax.flow.event_location import (
     GUARD_ROUNDOFF_IN_EPS,
     IntegratorState,
@@ -102,6 +101,48 @@ class GuardsAndMargins(NamedTuple):
             is_guard_zero = self.is_zero_at_start
             is_guard_met = jnp.where(is_guard_zero, guard_rates <= 0.0, is_guard_met)
         return is_guard_met, is_guard_met & is_guard_zero & (guard_rates < 0.0)
+
+
+PROBE_TIME_RATIO = 1e-2
+"""Time after which a guard at rest is evaluated again, as a fraction of the first solver step.
+
+The value is chosen because the cube of the time, with which the height of a foot begins to grow, is
+then above round-off.
+"""
+
+MAX_SHARE_AT_REST = 1e-3
+"""Largest change of a guard by its initial rate, as a fraction of its growth over the probe, for
+which the guard begins at rest. A guard that falls so slowly would be negative by round-off only.
+"""
+
+MAX_SHARE_OF_ROUNDOFF = 1e-6
+"""Largest negative value of a guard, as a fraction of its growth, that is treated as zero."""
+
+
+def evaluate_rise_from_rest(
+    vector_field: VectorField,
+    evaluate_guards: Callable[[StateArray], Array],
+    guard_values: Array,
+    guard_rates: Array,
+    state: StateArray,
+    dt0: Array,
+) -> Float[Array, " n_guards"]:
+    """Return the value after the probe of each guard that starts at zero and at rest, else 0.
+
+    A guard that grows does not end the mode. A foot that lifts off smoothly has no height, no rate
+    and no acceleration at first. Only the values after a short time, by Heun's method of third
+    order, determine its direction.
+    """
+    h = PROBE_TIME_RATIO * dt0
+    start_rates = vector_field(state)
+    middle_rates = vector_field(state + (h / 3.0) * start_rates)
+    last_rates = vector_field(state + (2.0 * h / 3.0) * middle_rates)
+    growth = lax.stop_gradient(
+        evaluate_guards(state + (0.25 * h) * (start_rates + 3.0 * last_rates))
+    )
+    is_at_rest = h * jnp.abs(guard_rates) <= MAX_SHARE_AT_REST * growth
+    is_zero = (guard_values <= 0.0) & (-guard_values <= MAX_SHARE_OF_ROUNDOFF * growth)
+    return jnp.where(is_zero & is_at_rest & (growth > 0.0), growth, 0.0)
 
 
 class PhaseKinks(NamedTuple):

@@ -21,12 +21,12 @@ from jax import lax
 from jaxtyping import Array
 
 from vrw_jax.base.elementwise import (
+    Vector,
     approximate_power,
     run_if_any_element_active,
     select_trees_by_condition,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Vector
 
 
 class ButcherTableau(NamedTuple):
@@ -479,7 +479,7 @@ class BatchPhase(NamedTuple):
     sides: Vector = ()
     """Signs for which the equations are smooth; empty without kinks."""
     n_logged_kinks: int = 0
-    """Largest number of kinks that the end of the phase lists, see `kinks.KinkLog`."""
+    """Largest number of kinks that the end of the phase lists, see `tangents.KinkLog`."""
 
     def make_state(self, q: Any, v: Any) -> StageState:
         """Return the state with positions `q`, rates `v` and the accelerations there."""

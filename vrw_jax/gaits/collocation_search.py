@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import export, lax
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.elementwise import LaneArray, select_trees_by_condition
-from vrw_jax.base.types import Vector
+from vrw_jax.base.elementwise import LaneArray, Vector, select_trees_by_condition
+from vrw_jax.gaits.cycle import CycleOptions
 from vrw_jax.gaits.gauss import (
     N_GAUSS_NODES,
     CollocationPhase,
@@ -28,7 +28,6 @@ from vrw_jax.gaits.gauss import (
     estimate_mesh_error,
     reconstruct_gait_step,
 )
-from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_sequence import (
     ADMISSIBILITY_CHECKS,
     N_LAW_SCALES,

@@ -1,9 +1,10 @@
-"""Define the interface of limit cycles for all models and search methods."""
+"""Limit cycles: options of their search, margins that searches keep, and what every cycle has."""
 
 import abc
 import dataclasses
+import functools
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -13,21 +14,172 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vrw_jax.base.checks import check_choice
-from vrw_jax.base.measures import Measure, name_measures
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import (
+from vrw_jax.base import small_matrices
+from vrw_jax.base.checks import check_choice, check_int, check_positive, check_type, format_value
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
     AbstractPrintable,
     LabelAndText,
+    Measure,
+    Outcome,
     format_each_batch_element,
     format_numbers,
     format_outcome_counts,
+    name_measures,
 )
-from vrw_jax.base.progress import announce_wait
-from vrw_jax.gaits import floquet
-from vrw_jax.lanes.settings import with_default_jax_settings
-from vrw_jax.models.measures import FORCE_PEAK_MEASURES
+from vrw_jax.lanes.environment import with_default_jax_settings
+from vrw_jax.models.measures import FORCE_PEAK_MEASURES, MEASURES
 from vrw_jax.wheel.params import WheelParams
+
+
+@dataclasses.dataclass(frozen=True)
+class CycleOptions:
+    """Numerical options of `limit_cycle`.
+
+    JAX compiles the search again whenever an option changes. With the defaults, relative errors are
+    1e-9 in values and 1e-8 in first derivatives.
+
+    - `mesh_intervals`: number of mesh intervals in each of DLS, SLS-I and SLS-II; the method has
+      order 8;
+    - `mesh_grading`: ratio of the last to the first mesh interval in SLS-I;
+    - `tolerance`: largest norm of Newton's last correction, in units of the wheel;
+    - `max_newton_iterations`: largest number of Newton iterations in one attempt;
+    - `first_newton_iterations`: number of Newton iterations after which the wheels of a batch that
+      need more iterations are gathered;
+    - `homotopy_steps`: number of parameter steps in a homotopy from the wheel in Table 1 of the
+      paper, which is used if the first attempt fails;
+    - `batch_size`: number of wheels that are solved together.
+
+    Examples:
+        >>> vrw.CycleOptions(mesh_intervals=(20, 16, 6)).mesh_intervals  # a finer mesh
+        (20, 16, 6)
+    """
+
+    mesh_intervals: tuple[int, int, int] = (10, 8, 3)
+    mesh_grading: float = 2.0
+    tolerance: float = 1e-10
+    max_newton_iterations: int = 12
+    first_newton_iterations: int = 4
+    homotopy_steps: int = 12
+    batch_size: int = 64
+
+    def __post_init__(self) -> None:
+        set_option = functools.partial(object.__setattr__, self)
+        for option_name in (
+            "max_newton_iterations",
+            "first_newton_iterations",
+            "homotopy_steps",
+            "batch_size",
+        ):
+            set_option(option_name, check_int(option_name, getattr(self, option_name)))
+        for option_name in ("mesh_grading", "tolerance"):
+            set_option(option_name, check_positive(option_name, getattr(self, option_name)))
+        if not isinstance(self.mesh_intervals, tuple | list) or len(self.mesh_intervals) != 3:
+            raise ValueError(
+                f"mesh_intervals is {format_value(self.mesh_intervals)}, but it counts the "
+                f"intervals in "
+                "DLS, SLS-I and SLS-II: "
+                "give three whole numbers of at least 1, as (10, 8, 3)."
+            )
+        mesh_intervals = tuple(
+            check_int(f"mesh_intervals[{i}]", interval_count)
+            for i, interval_count in enumerate(self.mesh_intervals)
+        )
+        set_option("mesh_intervals", mesh_intervals)
+
+    def check_tolerances(self, parameter_dtype: np.dtype) -> None:
+        """Raise ValueError if the number format cannot resolve the tolerance.
+
+        If `jax_enable_x64` is off, 64-bit parameters of a wheel are treated as 32-bit numbers, as
+        in JAX.
+        """
+        jax_dtype = jax.dtypes.canonicalize_dtype(parameter_dtype)
+        if self.tolerance < jnp.finfo(jax_dtype).eps:
+            dtype_statement = (
+                "the wheel holds"
+                if jax_dtype == parameter_dtype
+                else "jax_enable_x64 is off: JAX takes"
+            )
+            raise ValueError(
+                f"{dtype_statement} {jax_dtype.name} numbers, in which no limit cycle is "
+                f"found to {self.tolerance:g}: call vrw.start_jax() before WheelParams are made."
+            )
+
+    def refine_mesh(self) -> "CycleOptions":
+        """Return options with about twice as many mesh intervals."""
+        n_dls_intervals, n_sls1_intervals, n_sls2_intervals = self.mesh_intervals
+        return dataclasses.replace(
+            self,
+            mesh_intervals=(
+                2 * n_dls_intervals,
+                2 * n_sls1_intervals,
+                max(2 * n_sls2_intervals, n_sls1_intervals),
+            ),
+        )
+
+    @classmethod
+    def tight(cls) -> "CycleOptions":
+        """Return options whose errors are about 1e-12 in values and 1e-10 in first derivatives."""
+        return cls(mesh_intervals=(16, 20, 4), tolerance=1e-13)
+
+
+DEFAULT_MARGIN_NAMES: tuple[str, ...] = (
+    "fore_foot_force",
+    "takeoff_acceleration",
+    "clearance_sls1",
+    "clearance_sls2",
+    "locked_stopper_force",
+    "rear_stopper_force",
+    "contraction",
+    "friction_fore",
+    "lambda_I4",
+    "lambda_2_plus",
+    "lambda_4_plus",
+)
+"""Names of the margins (forces, clearances and indicators) that a search can keep positive."""
+
+DEFAULT_MARGIN_SHARE = 1e-3
+"""Default lower limit of a margin, as a fraction of the wheel's weight, leg length or gravity."""
+
+
+@with_default_jax_settings
+def default_margins(params: WheelParams) -> Mapping[str, float]:
+    """Return the default lower limit for each margin in `DEFAULT_MARGIN_NAMES`.
+
+    Each limit is a thousandth of the margin's natural scale for this wheel. The limits are above
+    zero, because a search needs a distance from the boundary. At lambda_4_plus = 0, for example,
+    the branch of gaits ends.
+
+    Args:
+        params: one wheel.
+
+    Returns:
+        Lower limits by the name of the margin, each in the unit of the margin.
+
+    Raises:
+        TypeError, ValueError: if an argument is invalid; the message names the remedy.
+
+    Examples:
+        >>> round(vrw.default_margins(vrw.WheelParams())["lambda_4_plus"], 3)
+        0.177
+    """
+    check_type("params", params, WheelParams, "write vrw.WheelParams(damping=..., slope=...)")
+    params.require_single_wheel("take one after the other")
+    total_mass = float(params.hub_mass + params.n_legs * params.leg_mass)
+    leg_length = float(params.locked_length)
+    gravity_acceleration = float(params.gravity)
+    margin_unit_values = {
+        "N": total_mass * gravity_acceleration,
+        "m": leg_length,
+        "m/s^2": gravity_acceleration,
+        "N s": total_mass * (gravity_acceleration * leg_length) ** 0.5,
+        "1": 1.0,
+    }
+    return {
+        margin_name: DEFAULT_MARGIN_SHARE * margin_unit_values[MEASURES[margin_name].unit]
+        for margin_name in DEFAULT_MARGIN_NAMES
+    }
+
 
 SAME_STATE_RELATIVE_TOLERANCE = 1e-7
 """Relative distance below which two section states of a cycle are treated as equal.
@@ -214,19 +366,19 @@ class AbstractCycle(AbstractPrintable):
 
         The multipliers are differentiable if the section has at most three coordinates.
         """
-        return floquet.floquet_multipliers(self.monodromy)
+        return small_matrices.floquet_multipliers(self.monodromy)
 
     @property
     def spectral_radius(self) -> Array:
         """Return the largest modulus of the Floquet multipliers, which is below 1 for
         stable gaits.
         """
-        return floquet.compute_spectral_radius(self.monodromy)
+        return small_matrices.compute_spectral_radius(self.monodromy)
 
     @property
     def spectral_radius_value(self) -> Array:
         """Return the spectral radius without derivatives."""
-        return floquet.compute_spectral_radius(lax.stop_gradient(self.monodromy_value))
+        return small_matrices.compute_spectral_radius(lax.stop_gradient(self.monodromy_value))
 
     @property
     def spectral_margin(self) -> Array:
@@ -240,10 +392,10 @@ class AbstractCycle(AbstractPrintable):
     def stability_margin(self) -> Array:
         """Return the smooth minimum of the Jury margins, which is positive only for stable gaits.
 
-        See `floquet.compute_stability_margin`. The margin is defined for sections of at most three
-        coordinates, and therefore not for unilateral contact.
+        See `small_matrices.compute_stability_margin`. The margin is defined for sections of at most
+        three coordinates, and therefore not for unilateral contact.
         """
-        return self._zero_without_gait(floquet.compute_stability_margin(self.monodromy))
+        return self._zero_without_gait(small_matrices.compute_stability_margin(self.monodromy))
 
     @property
     def condition_number(self) -> Array:
@@ -351,7 +503,7 @@ def format_floquet_multipliers(monodromy_matrix: np.ndarray) -> tuple[float, str
     The multipliers are in the order of decreasing modulus. If multipliers are zero to five digits,
     the text contains only their number.
     """
-    floquet_multipliers = floquet.compute_multipliers(monodromy_matrix)
+    floquet_multipliers = small_matrices.compute_multipliers(monodromy_matrix)
     multiplier_texts = [
         f"{multiplier:.5f}" if multiplier.imag else f"{multiplier.real:.5f}"
         for multiplier in floquet_multipliers

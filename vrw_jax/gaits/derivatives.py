@@ -21,9 +21,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from vrw_jax.base import small_matrices
 from vrw_jax.base.elementwise import evaluate_with_jvps
 from vrw_jax.base.options import StepOptions
-from vrw_jax.gaits import floquet
 from vrw_jax.gaits.collocation_search import (
     CycleSearchResult,
     init_search_result,
@@ -52,8 +52,8 @@ from vrw_jax.lanes.batching import (
     make_zeros_like_output,
     unbatch,
 )
+from vrw_jax.lanes.environment import call_python, with_default_jax_settings
 from vrw_jax.lanes.lane_function import compile_batch_function
-from vrw_jax.lanes.settings import call_python, with_default_jax_settings
 from vrw_jax.models import walk_batch as scales
 from vrw_jax.wheel.params import (
     NO_LAWS,
@@ -502,7 +502,7 @@ def compute_sensitivity_norms(slope_response: SlopeResponse) -> SensitivityNormP
     Lyapunov equation `P = A P A^T + b b^T`. The norm is infinite if the gait is not stable.
     """
     A, B1, B0, C, D1, D0 = slope_response
-    is_gait_stable = floquet.compute_spectral_radius(lax.stop_gradient(A)) < 1.0
+    is_gait_stable = small_matrices.compute_spectral_radius(lax.stop_gradient(A)) < 1.0
     A = jnp.where(is_gait_stable, A, 0.0)
     b = A @ B0 + B1
 

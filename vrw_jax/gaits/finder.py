@@ -15,9 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Measure, Outcome
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import SlopeResponse, compute_step_slope_response
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
@@ -31,6 +30,9 @@ from vrw_jax.models.measures import (
 )
 from vrw_jax.models.step_results import AbstractStep, combine_steps
 from vrw_jax.wheel.params import WheelParams
+
+GAIT_BATCH_SIZES = (1, 8, 64, 512, 4096)
+"""Numbers of limit cycles of the paper's model that one Newton iteration computes together."""
 
 STATE_AGREEMENT_TOLERANCE = 1e-8
 """Largest accepted difference between the section states at the start and the end of a gait step.

@@ -17,24 +17,24 @@ from vrw_jax.base.checks import (
     check_reals,
     check_type,
 )
-from vrw_jax.base.printing import (
+from vrw_jax.base.elementwise import Scalar
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
     format_each_batch_element,
     format_heading_and_rows,
     format_numbers,
     format_quantity,
 )
-from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.types import Scalar
-from vrw_jax.flow.hybrid_simulation import Termination
-from vrw_jax.flow.orbits import ReturnMap
-from vrw_jax.gaits.floquet import (
+from vrw_jax.base.small_matrices import (
     UNIT_CIRCLE_DISTANCE,
     compute_multipliers,
     floquet_multipliers,
 )
+from vrw_jax.flow.hybrid_simulation import Termination
+from vrw_jax.flow.orbits import ReturnMap
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian, make_zero_tangent
-from vrw_jax.lanes.saved_traces import get_compiled_program
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.environment import with_default_jax_settings
+from vrw_jax.lanes.program import get_compiled_program
 
 UNIT_MULTIPLIER_ADVICE = (
     "A multiplier is 1, which a conserved quantity or a fold causes: name the conserved quantity "

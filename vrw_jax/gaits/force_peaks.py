@@ -25,10 +25,9 @@ import numpy as np
 from jax import export, lax
 from jaxtyping import Array, Bool, Float
 
-from vrw_jax.base.elementwise import select_entry_by_mask
-from vrw_jax.base.measures import Measure
-from vrw_jax.base.types import Scalar
-from vrw_jax.flow.kinks import StepForceExtrema, summarize_forces
+from vrw_jax.base.elementwise import Scalar, select_entry_by_mask
+from vrw_jax.base.results import Measure
+from vrw_jax.flow.extrema import StepForceExtrema, summarize_forces
 from vrw_jax.flow.solver_steps import load_explicit_tableau
 from vrw_jax.gaits.derivatives import attach_derivatives, make_tangent_function
 from vrw_jax.gaits.gauss import (

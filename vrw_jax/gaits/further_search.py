@@ -23,16 +23,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import (
     has_traced_leaf,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.gaits.collocation_finder import CollocationFinder
+from vrw_jax.base.results import Outcome
+from vrw_jax.base.small_matrices import compute_multipliers
 from vrw_jax.gaits.collocation_search import CycleSearchResult
 from vrw_jax.gaits.cycle import RETRY_OUTCOMES, AbstractCycle
-from vrw_jax.gaits.floquet import compute_multipliers
+from vrw_jax.gaits.finder import GAIT_BATCH_SIZES
 from vrw_jax.gaits.gait_walks import (
     MAX_NEWTON_START_DEFECT,
     MAX_SETTLED_DEFECT,
@@ -47,6 +46,7 @@ from vrw_jax.gaits.gait_walks import (
 )
 from vrw_jax.gaits.limit_cycle_result import LimitCycle, transfer_solution_to_mesh
 from vrw_jax.gaits.phase_sequence import ADMISSIBILITY_CHECKS, CollocationState, CollocationSystem
+from vrw_jax.gaits.wheel_finders import CollocationFinder
 from vrw_jax.lanes.batching import (
     concatenate_tree_rows,
     is_inside_jit,
@@ -56,7 +56,7 @@ from vrw_jax.lanes.batching import (
     select_tree_rows,
     unbatch,
 )
-from vrw_jax.lanes.settings import call_python, can_programs_call_jax
+from vrw_jax.lanes.environment import call_python, can_programs_call_jax
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_batch import SolverIndex, select_cheapest_solver, step_batch
 from vrw_jax.models.stepping import convert_model_argument, convert_step_options
@@ -467,7 +467,7 @@ def search_with_fallbacks(
             gait_finder,
             params_and_cycle[0],
             summarize_search(params_and_cycle[1]),
-            batch_sizes.GAIT_BATCH_SIZES,
+            GAIT_BATCH_SIZES,
             section_state,
             can_refine_mesh,
         ),
@@ -492,7 +492,7 @@ def search_with_fallbacks(
 
 def summarize_search(cycle: LimitCycle) -> MeshSearch:
     """Return the cycles of a batch with their mesh errors, from which a search goes on."""
-    mesh_error = map_in_batches(lambda cycle: cycle.mesh_error, batch_sizes.GAIT_BATCH_SIZES, cycle)
+    mesh_error = map_in_batches(lambda cycle: cycle.mesh_error, GAIT_BATCH_SIZES, cycle)
     return MeshSearch(cycle.outcome, mesh_error, cycle.collocation_state, cycle)
 
 
@@ -501,9 +501,7 @@ def find_cycles_from_starts(
 ) -> MeshSearch:
     """Search for the cycles of a batch from the given starts only."""
     find_cycles = functools.partial(gait_finder.find_cycles, starts_only_from_guess=True)
-    return summarize_search(
-        map_in_batches(find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, starts)
-    )
+    return summarize_search(map_in_batches(find_cycles, GAIT_BATCH_SIZES, params, starts))
 
 
 def _collect_starts_on_finest_mesh(
@@ -519,7 +517,7 @@ def _collect_starts_on_finest_mesh(
     for mesh_finder, wheel_indices, mesh_search in gaits_by_mesh:
         if gait_finder.cycle_options != mesh_finder.cycle_options:
             collocation_state = transfer_to_mesh(
-                gait_finder, mesh_finder, collocation_state, batch_sizes.GAIT_BATCH_SIZES
+                gait_finder, mesh_finder, collocation_state, GAIT_BATCH_SIZES
             )
             gait_finder = mesh_finder
         collocation_state = replace_rows(
@@ -581,7 +579,7 @@ def _search_without_fallbacks(
         return gait_finder.find_cycle(params, cycle_guess, **search_options)
     if cycle_guess is not None or has_traced_leaf(params):
         return gait_finder.find_cycles(params, cycle_guess, **search_options)
-    return map_in_batches(gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
+    return map_in_batches(gait_finder.find_cycles, GAIT_BATCH_SIZES, params)
 
 
 def _search_missing_cycles(
@@ -613,9 +611,7 @@ def _search_missing_cycles(
         if collocation_system.coarse_options is not None:
             coarse_options = collocation_system.coarse_options
             coarse_finder = dataclasses.replace(gait_finder, cycle_options=coarse_options)
-            guesses = transfer_to_mesh(
-                coarse_finder, gait_finder, guesses, batch_sizes.GAIT_BATCH_SIZES
-            )
+            guesses = transfer_to_mesh(coarse_finder, gait_finder, guesses, GAIT_BATCH_SIZES)
         rows = [select_tree_rows((params, guesses), i) for i in range(len(missing))]
         cycles = [search(*jax.device_put(row)) for row in rows]
         cycle = jax.tree.map(lambda *x: np.stack(x), *cycles)
@@ -674,9 +670,7 @@ def _choose_first_step(
         if finder_and_starts is not None or int(cycle.outcome[0]) not in RETRY_OUTCOMES:
             break
         section_states = step_batch(params, section_states, model=gait_finder.model).section_state
-        cycle = map_in_batches(
-            gait_finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params, section_states
-        )
+        cycle = map_in_batches(gait_finder.find_cycles, GAIT_BATCH_SIZES, params, section_states)
         if cycle.found[0]:
             finder_and_starts = gait_finder, cycle.collocation_state
     gait_finder, collocation_state = finder_and_starts or (gait_finder, cycle.collocation_state)

@@ -20,22 +20,24 @@ from vrw_jax.base.checks import (
     has_traced_leaf,
     require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure, find_own_measures, name_measures
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import NoGaitError, Outcome
-from vrw_jax.base.printing import format_numbers
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
+    Measure,
+    NoGaitError,
+    Outcome,
+    find_own_measures,
+    format_numbers,
+    name_measures,
+)
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import AbstractWalker, is_own_walker
-from vrw_jax.gaits.collocation_finder import CollocationFinder, KinkedGaitFinder
-from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, AbstractCycle, replace_by_nan
+from vrw_jax.gaits.cycle import LAST_GAIT_DESCRIBERS, AbstractCycle, CycleOptions, replace_by_nan
 from vrw_jax.gaits.finder import AbstractGaitFinder, GaitMeasures
 from vrw_jax.gaits.further_search import describe_last_gait, search_with_fallbacks
 from vrw_jax.gaits.gait_walks import GaitChoice, find_attracting_gaits, parse_gait_choice
 from vrw_jax.gaits.limit_cycle_result import LimitCycle
-from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_sequence import CollocationState
-from vrw_jax.gaits.return_map_finder import ReturnMapCycle, ReturnMapFinder
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
 from vrw_jax.gaits.walker_finder import (
     HybridGait,
@@ -45,11 +47,17 @@ from vrw_jax.gaits.walker_finder import (
     is_known_missing,
     make_walker_finder,
 )
+from vrw_jax.gaits.wheel_finders import (
+    CollocationFinder,
+    KinkedGaitFinder,
+    ReturnMapCycle,
+    ReturnMapFinder,
+)
 from vrw_jax.lanes.batching import (
     select_rows_on_device,
     select_tree_rows,
 )
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.environment import with_default_jax_settings
 from vrw_jax.models.stepping import (
     ModelLike,
     convert_model_argument,

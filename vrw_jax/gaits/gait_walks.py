@@ -18,14 +18,14 @@ import numpy as np
 
 from vrw_jax.base.checks import check_choice, check_real
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.lanes.batching import (
     concatenate_tree_rows,
     select_rows_on_device,
     select_tree_rows,
 )
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.environment import with_default_jax_settings
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.wheel.params import WheelParams, compute_wheel_units_of_rows
 

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.polynomial import legendre
 
-from vrw_jax.base.elementwise import LaneArray
-from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.elementwise import Elementwise, LaneArray, Vector
 
 N_GAUSS_NODES = 4
 """Number of Gauss nodes per mesh interval. The value is chosen because a method of order 8 reaches

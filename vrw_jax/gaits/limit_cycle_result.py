@@ -15,13 +15,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.base import small_matrices
 from vrw_jax.base.checks import require_known_name
-from vrw_jax.base.measures import Measure
+from vrw_jax.base.elementwise import Scalar
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import LabelAndText, format_numbers
-from vrw_jax.base.types import Scalar
-from vrw_jax.gaits import floquet
+from vrw_jax.base.results import LabelAndText, Measure, Outcome, format_numbers
 from vrw_jax.gaits.collocation_search import FAILED_MESH_CHECK_CODE
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.derivatives import (
@@ -128,14 +126,14 @@ class LimitCycle(AbstractCycle):
     def jury_margins(self) -> Array:
         """Return the margins to a fold, a period doubling and a Neimark-Sacker bifurcation.
 
-        See `floquet.compute_jury_margins`.
+        See `small_matrices.compute_jury_margins`.
         """
-        return floquet.compute_jury_margins(self.monodromy)
+        return small_matrices.compute_jury_margins(self.monodromy)
 
     @property
     def has_double_multiplier(self) -> Bool[Array, "..."]:
         """Return whether two equal multipliers cause a kink of the spectral radius."""
-        return floquet.has_double_multiplier(self.monodromy_value) & self.found
+        return small_matrices.has_double_multiplier(self.monodromy_value) & self.found
 
     @property
     def mesh_error(self) -> Array:

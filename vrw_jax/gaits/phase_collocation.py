@@ -29,6 +29,7 @@ from vrw_jax import lanes
 from vrw_jax.base.elementwise import (
     FusionBarrierFn,
     LaneArray,
+    Vector,
     apply_matrix,
     contract_inner_axis,
     evaluate_with_jvps,
@@ -38,7 +39,6 @@ from vrw_jax.base.elementwise import (
     solve_node_equations,
     sum_with_weights,
 )
-from vrw_jax.base.types import Vector
 from vrw_jax.gaits.gauss import (
     DOUBLE_END_WEIGHTS,
     DOUBLE_INTEGRATION_MATRIX,

@@ -28,8 +28,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from vrw_jax.base.elementwise import LaneArray, compute_sine_cosine
-from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.elementwise import Elementwise, LaneArray, Vector, compute_sine_cosine
+from vrw_jax.gaits.cycle import CycleOptions
 from vrw_jax.gaits.gauss import (
     N_GAUSS_NODES,
     CollocationPhase,
@@ -43,7 +43,6 @@ from vrw_jax.gaits.gauss import (
     reconstruct_gait_step,
     transfer_accelerations,
 )
-from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_collocation import CycleLinearization, close_cycle, linearize_steps
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import Motion, rotate_to_rear_leg

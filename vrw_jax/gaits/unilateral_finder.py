@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import has_traced_leaf
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
 from vrw_jax.gaits.finder import (
     Gait,
     ParameterValues,
@@ -27,7 +26,7 @@ from vrw_jax.gaits.finder import (
 )
 from vrw_jax.gaits.fixed_points import FixedPointResult
 from vrw_jax.gaits.gait_walks import find_slow_gaits, stack_section_units
-from vrw_jax.gaits.return_map_finder import (
+from vrw_jax.gaits.wheel_finders import (
     ReturnMapCycle,
     ReturnMapFinder,
     compute_newton_tolerance,
@@ -45,6 +44,11 @@ from vrw_jax.models.stepping import convert_step_arguments
 from vrw_jax.models.unilateral_wheel import UnilateralWheel
 from vrw_jax.wheel.params import WheelParams
 
+CONTACT_GAIT_BATCH_SIZES = (1, 8, 64, 512)
+"""Numbers of limit cycles with unilateral contact that are computed together. Their search needs
+few iterations, but their steps are expensive.
+"""
+
 
 class UnilateralFinder(ReturnMapFinder):
     """Finder of gaits with unilateral contact and their first derivatives.
@@ -53,9 +57,7 @@ class UnilateralFinder(ReturnMapFinder):
     """
 
     model: UnilateralWheel
-    gait_batch_sizes: tuple[int, ...] = eqx.field(
-        static=True, default=batch_sizes.CONTACT_GAIT_BATCH_SIZES
-    )
+    gait_batch_sizes: tuple[int, ...] = eqx.field(static=True, default=CONTACT_GAIT_BATCH_SIZES)
 
     cycle_measures: ClassVar[tuple[str, ...]] = (
         "spectral_radius",

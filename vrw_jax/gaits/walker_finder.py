@@ -12,10 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_reals, has_traced_leaf, require_known_name
-from vrw_jax.base.elementwise import select_trees_by_condition
-from vrw_jax.base.measures import Measure
+from vrw_jax.base.elementwise import Scalar, select_trees_by_condition
 from vrw_jax.base.options import (
     ParameterDomain,
     StepOptions,
@@ -23,15 +21,15 @@ from vrw_jax.base.options import (
     list_tree_parameters,
     replace_tree_parameter,
 )
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import (
+from vrw_jax.base.results import (
+    Measure,
+    Outcome,
     format_each_batch_element,
     format_heading_and_rows,
     format_numbers,
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import (
     AbstractWalker,
     check_arguments,
@@ -45,7 +43,7 @@ from vrw_jax.base.walker import (
     propose_starts,
 )
 from vrw_jax.gaits.derivatives import SlopeResponse
-from vrw_jax.gaits.finder import AbstractGaitFinder, ParameterValues
+from vrw_jax.gaits.finder import GAIT_BATCH_SIZES, AbstractGaitFinder, ParameterValues
 from vrw_jax.gaits.fixed_points import (
     MAX_NEWTON_ITERATIONS,
     MAX_RESIDUAL,
@@ -60,8 +58,8 @@ from vrw_jax.lanes.batching import (
     select_rows_on_device,
     select_tree_rows,
 )
-from vrw_jax.lanes.saved_traces import call_compiled_program
-from vrw_jax.lanes.settings import call_python, can_programs_call_jax
+from vrw_jax.lanes.environment import call_python, can_programs_call_jax
+from vrw_jax.lanes.program import call_compiled_program
 
 
 class HybridGait(NamedTuple):
@@ -243,7 +241,7 @@ def find_walker_gaits(
         return jax.vmap(lambda *row: _find_missing_inside_jit(walker, options, period_n, *row))(
             params, guesses, gaits
         )
-    find_each = functools.partial(map_in_batches, find_gaits, batch_sizes.GAIT_BATCH_SIZES)
+    find_each = functools.partial(map_in_batches, find_gaits, GAIT_BATCH_SIZES)
     return find_gaits_with_walks(find_each, walker, params, guesses, options, period_n)
 
 

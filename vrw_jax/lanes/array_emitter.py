@@ -18,20 +18,20 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from vrw_jax.lanes.lazy_arrays import (
+from vrw_jax.lanes.llvm import (
     EntryIndex,
     JoinedArray,
     LazyArray,
     LlvmArray,
+    LlvmValue,
     MemoryArray,
     PendingArrayUpdate,
     UninitializedArray,
+    ir,
 )
-from vrw_jax.lanes.machine import ir
 from vrw_jax.lanes.value_emitter import (
     I64,
     LLVM_NUMBER_TYPES,
-    LlvmValue,
     ValueEmitter,
     emit_llvm_elementwise_primitive,
 )

@@ -18,23 +18,19 @@ from vrw_jax.lanes.array_emitter import (
     make_entry_array,
     make_lane_mixing_error,
 )
-from vrw_jax.lanes.lazy_arrays import (
+from vrw_jax.lanes.llvm import (
     EntryIndex,
     JoinedArray,
     LazyArray,
     LlvmArray,
+    LlvmValue,
     MemoryArray,
     PendingArrayUpdate,
     TransposedMemoryView,
     UninitializedArray,
+    ir,
 )
-from vrw_jax.lanes.machine import ir
-from vrw_jax.lanes.value_emitter import (
-    I64,
-    LLVM_NUMBER_TYPES,
-    LlvmValue,
-    emit_llvm_elementwise_primitive,
-)
+from vrw_jax.lanes.value_emitter import I64, LLVM_NUMBER_TYPES, emit_llvm_elementwise_primitive
 
 
 def emit_broadcast_array(

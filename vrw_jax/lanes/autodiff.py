@@ -28,8 +28,8 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
 from vrw_jax.lanes.batching import BatchFunction, unbatch
-from vrw_jax.lanes.code_cache import targets_machine_code
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.environment import with_default_jax_settings
+from vrw_jax.lanes.machine_code import targets_machine_code
 
 ForwardFunction = Callable[..., tuple[PyTree[Array], PyTree[Array]]]
 """Function of floating-point arrays that returns (float outputs, other outputs without

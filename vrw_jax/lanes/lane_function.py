@@ -18,15 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from vrw_jax.lanes import disk_cache, program
+from vrw_jax.lanes import environment, program
 from vrw_jax.lanes.array_emitter import MAX_UNROLLED_ENTRIES, LaneAxisError
 from vrw_jax.lanes.autodiff import enable_all_ad_modes
-from vrw_jax.lanes.batching import BatchFunction, apply_function_in_blocks, unbatch
-from vrw_jax.lanes.code_cache import (
-    LaneProgram,
-    get_lane_program,
-    targets_machine_code,
+from vrw_jax.lanes.batching import (
+    BatchFunction,
+    append_lane_axis,
+    apply_function_in_blocks,
+    unbatch,
 )
+from vrw_jax.lanes.environment import with_default_jax_settings
 from vrw_jax.lanes.keys import (
     UnresolvableFunctionError,
     lift_numbers,
@@ -34,16 +35,15 @@ from vrw_jax.lanes.keys import (
     make_key_with_origin,
     make_placeholder,
 )
-from vrw_jax.lanes.lane_axis import append_lane_axis
+from vrw_jax.lanes.machine_code import LaneProgram, get_lane_program, targets_machine_code
 from vrw_jax.lanes.program import (
     ArgumentTypes,
     call_machine_code,
     is_machine_code_available,
     make_argument_shapes,
     run_machine_code,
+    wrap_with_saved_trace,
 )
-from vrw_jax.lanes.saved_traces import wrap_with_saved_trace
-from vrw_jax.lanes.settings import with_default_jax_settings
 
 STRAGGLER_COUNT_DIVISOR = 8
 """Ratio of the block size to the number of unfinished lanes at which an XLA program stops.
@@ -147,8 +147,8 @@ class CompiledBatchFunction:
         Raise a `_NoMachineCodeError` if XLA has to compute the function. The code of one lane is
         compiled later, so its errors appear in `LaneCall.lower`.
         """
-        environment = disk_cache.describe_trace_environment()
-        make_signature = lambda n: (structure, argument_types, n, environment)
+        trace_environment = environment.describe_trace_environment()
+        make_signature = lambda n: (structure, argument_types, n, trace_environment)
         for signature in map(make_signature, numbers_of_lanes):
             if signature in self._programs:
                 return self._programs[signature]

@@ -30,16 +30,17 @@ from vrw_jax.lanes.array_emitter import (
     split_into_entry_arrays,
 )
 from vrw_jax.lanes.decompositions import DECOMPOSITIONS
-from vrw_jax.lanes.lazy_arrays import (
+from vrw_jax.lanes.llvm import (
     LazyArray,
     LlvmArray,
+    LlvmValue,
     MemoryArray,
     PendingArrayUpdate,
     TransposedMemoryView,
+    ir,
     mark_memory_as_shared,
 )
-from vrw_jax.lanes.machine import ir
-from vrw_jax.lanes.value_emitter import ELEMENTWISE_RULES, I64, LlvmValue, TextBuilder, ValueEmitter
+from vrw_jax.lanes.value_emitter import ELEMENTWISE_RULES, I64, TextBuilder, ValueEmitter
 
 PrimitiveRule = Callable[["JaxprLowering", Any, list[LlvmArray]], list[LlvmArray]]
 """Function that lowers one primitive. It takes the lowering, an equation and the operands, emits

@@ -12,10 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.lanes.machine import ir
-
-LlvmValue = Any
-"""An LLVM value: a scalar, or a vector with one entry per lane."""
+from vrw_jax.lanes.llvm import LlvmValue, ir
 
 I1, I8, I32, I64 = (ir.IntType(n_bits) for n_bits in (1, 8, 32, 64))
 LLVM_NUMBER_TYPES = {

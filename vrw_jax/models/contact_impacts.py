@@ -11,8 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.elementwise import run_if_any_element_active, select_trees_by_condition
-from vrw_jax.base.types import Elementwise
+from vrw_jax.base.elementwise import (
+    Elementwise,
+    run_if_any_element_active,
+    select_trees_by_condition,
+)
 from vrw_jax.models.contact_jvp import (
     ContactConfiguration,
     WheelForceSolution,

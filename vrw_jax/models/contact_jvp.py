@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from vrw_jax.base.types import Elementwise
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.base.elementwise import Elementwise
+from vrw_jax.lanes.environment import with_default_jax_settings
 from vrw_jax.models.contact_mechanics import (
     ContactInverseInertia,
     ContactSlots,

@@ -19,14 +19,13 @@ from jaxtyping import Array
 
 from vrw_jax.base.elementwise import make_opaque_loop_condition, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.event_location import IntegratorState
+from vrw_jax.base.results import Outcome
+from vrw_jax.flow.event_location import IntegratorState, make_idle_state
 from vrw_jax.flow.integrate import (
     Interruption,
     PhaseEnd,
     SearchEnd,
     integrate_to_event,
-    make_idle_state,
 )
 from vrw_jax.flow.solver_steps import ButcherTableau
 from vrw_jax.lanes.batching import make_zeros_like_output

@@ -22,8 +22,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Shaped
 
-from vrw_jax.base.elementwise import compute_sine_cosine
-from vrw_jax.base.types import Elementwise, Scalar
+from vrw_jax.base.elementwise import Elementwise, Scalar, compute_sine_cosine
 from vrw_jax.wheel.laws import (
     compute_leg_potential,
     evaluate_hub_torque,

@@ -26,8 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from vrw_jax import lanes
-from vrw_jax.base.elementwise import select_trees_by_condition
-from vrw_jax.base.types import Elementwise
+from vrw_jax.base.elementwise import Elementwise, select_trees_by_condition
 from vrw_jax.models.contact_jvp import (
     WheelForceSolution,
     replace_infinite_friction,

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from vrw_jax.base.elementwise import Elementwise
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.types import Elementwise
 from vrw_jax.models.contact_impacts import ContactEvent, ContactEventResult
 from vrw_jax.models.contact_mechanics import (
     WheelMotion,

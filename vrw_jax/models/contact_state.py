@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.base.types import Elementwise, Scalar
+from vrw_jax.base.elementwise import Elementwise, Scalar
 from vrw_jax.flow.event_location import has_guard_crossed
 from vrw_jax.models.contact_jvp import (
     ContactConfiguration,

@@ -22,7 +22,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from vrw_jax import lanes
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
 from vrw_jax.flow.integrate import compute_phase_end_jvp
 from vrw_jax.flow.solver_steps import BatchPhase
@@ -64,6 +63,11 @@ from vrw_jax.wheel.params import (
     stack_parameters,
 )
 from vrw_jax.wheel.transitions import ContactMode
+
+CONTACT_XLA_BATCH_SIZE = 2048
+"""Number of steps with unilateral contact that one XLA call computes, on devices without machine
+code.
+"""
 
 
 def walk_batch(
@@ -299,7 +303,7 @@ def _compile_section_function(
     evaluate_lanes = lambda parameters, section_states: section_function(
         compute_symbols(n_legs, *parameters), section_states
     )
-    return compile_batch_function(evaluate_lanes, batch_sizes.CONTACT_XLA_BATCH_SIZE)
+    return compile_batch_function(evaluate_lanes, CONTACT_XLA_BATCH_SIZE)
 
 
 def _make_static_walk_settings(
@@ -373,7 +377,7 @@ def embed_section_states(
 @functools.cache
 def _compile_walks(static_walk_settings: BatchWalkSettings) -> CompiledBatchFunction:
     run_lane_walks = functools.partial(_run_lane_walks, static_walk_settings)
-    return compile_batch_function(run_lane_walks, batch_sizes.CONTACT_XLA_BATCH_SIZE)
+    return compile_batch_function(run_lane_walks, CONTACT_XLA_BATCH_SIZE)
 
 
 def _run_lane_walks(

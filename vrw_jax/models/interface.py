@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vrw_jax.base.checks import has_traced_leaf
-from vrw_jax.base.measures import Measure
+from vrw_jax.base.elementwise import Elementwise
 from vrw_jax.base.options import ParameterDomain, StepOptions
-from vrw_jax.base.printing import format_quantity
-from vrw_jax.base.types import Elementwise
+from vrw_jax.base.results import Measure, format_quantity
 from vrw_jax.base.walker import AbstractWalker, AdvanceResult
 from vrw_jax.models.measures import MEASURES
 from vrw_jax.models.step_results import SectionState, combine_steps

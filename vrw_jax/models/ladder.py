@@ -21,12 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from vrw_jax.base.elementwise import RealInput, Scalar
 from vrw_jax.base.options import StepOptions, list_tree_parameters
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_each_batch_element
-from vrw_jax.base.types import RealInput, Scalar
+from vrw_jax.base.results import AbstractPrintable, LabelAndText, Outcome, format_each_batch_element
 from vrw_jax.base.walker import AdvanceResult
-from vrw_jax.lanes.disk_cache import find_library_version
+from vrw_jax.lanes.environment import find_library_version
 from vrw_jax.models.contact_record import LOCKED_CODE_OFFSET, FullState, embed_section_state
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import MARGIN_MEASURES, SELECTION_MARGIN_NAMES, make_flag_attributes

@@ -18,11 +18,10 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.base.checks import require_known_name
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import ParameterDomain
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.flow.kinks import (
+from vrw_jax.base.results import Measure, Outcome
+from vrw_jax.base.results import xarray as xr
+from vrw_jax.flow.extrema import (
     SmoothParts,
     StepForceExtrema,
     find_extrema,

@@ -16,10 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.elementwise import compute_sine_cosine, select_trees_by_condition
+from vrw_jax.base.elementwise import (
+    Elementwise,
+    Vector,
+    compute_sine_cosine,
+    select_trees_by_condition,
+)
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.results import Outcome
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.integrate import PhaseEnd
 from vrw_jax.flow.phase_integration import (

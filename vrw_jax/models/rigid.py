@@ -11,10 +11,9 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from vrw_jax.base.checks import check_bool
-from vrw_jax.base.elementwise import select_trees_by_condition
+from vrw_jax.base.elementwise import Elementwise, select_trees_by_condition
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.types import Elementwise
+from vrw_jax.base.results import Outcome
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.lanes.autodiff import compute_square_root
 from vrw_jax.models.interface import AbstractWheel

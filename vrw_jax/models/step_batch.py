@@ -21,7 +21,6 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax import lanes
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import (
     check_choice,
     check_int,
@@ -32,8 +31,8 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import SolverName, StepOptions
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import Outcome
 from vrw_jax.base.walker import (
     AbstractWalker,
     check_parameters,
@@ -55,7 +54,9 @@ from vrw_jax.models.stepping import (
 )
 from vrw_jax.models.viscoelastic import N_STEP_INPUTS, advance_gait_step
 from vrw_jax.models.walk_batch import (
+    DIFFRAX_BATCH_SIZE,
     START_INPUT_NAME,
+    XLA_LANE_BATCH_SIZE,
     StepBatchResult,
     StepInput,
     WalkBatch,
@@ -519,7 +520,7 @@ def _compile_lane_step(
     n_kernel_inputs = N_STEP_INPUTS + n_law_parameters + n_ground_inputs
     return compile_batch_function(
         step_lanes,
-        batch_sizes.XLA_LANE_BATCH_SIZE,
+        XLA_LANE_BATCH_SIZE,
         n_kernel_inputs if input_indices else lanes.MAX_UNROLLED_ENTRIES,
         marks_unfinished_lanes=True,
     )
@@ -548,7 +549,7 @@ def _step_lanes_by_diffrax(
         step_block = functools.partial(
             _step_elements_by_vmap, model, to_dtype(options), n_legs, input_indices
         )
-        results = map_in_batches(step_block, (batch_sizes.DIFFRAX_BATCH_SIZE,), step_input_matrix)
+        results = map_in_batches(step_block, (DIFFRAX_BATCH_SIZE,), step_input_matrix)
         return jax.tree.map(lambda x: np.array(x).T, results)
 
     def step_elements_with_jacobian(step_input_matrix: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import (
+from vrw_jax.base.results import (
     AbstractPrintable,
     LabelAndText,
+    Outcome,
     describe_step_ending,
     format_outcome_counts,
     format_quantity,

@@ -19,15 +19,16 @@ from jaxtyping import Array, Int
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_int, check_reals, check_type, format_value
 from vrw_jax.base.options import EngineName, StepOptions
-from vrw_jax.base.outcomes import Outcome, describe_outcomes
-from vrw_jax.base.printing import (
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
     AbstractPrintable,
     LabelAndText,
+    Outcome,
+    describe_outcomes,
     format_numbers,
     format_outcome_counts,
     format_quantity,
 )
-from vrw_jax.base.progress import announce_wait
 from vrw_jax.base.walker import (
     AbstractWalker,
     AdvanceResult,

@@ -18,13 +18,13 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax.base.checks import check_int, check_type, require_untraced_arguments
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import check_parameters, is_own_walker, propose_starts
+from vrw_jax.flow.extrema import StepForceExtrema, summarize_forces
 from vrw_jax.flow.hybrid_system import HybridSystem, sample_walk_of_system
-from vrw_jax.flow.kinks import StepForceExtrema, summarize_forces
 from vrw_jax.models.contact_mechanics import (
     compute_foot_heights,
     compute_foot_positions,

@@ -19,9 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_choice, check_int, check_reals, check_type
-from vrw_jax.base.elementwise import make_opaque_loop_condition
+from vrw_jax.base.elementwise import Elementwise, RealInput, Scalar, make_opaque_loop_condition
 from vrw_jax.base.options import ParameterDomain, StepOptions
-from vrw_jax.base.types import Elementwise, RealInput, Scalar
 from vrw_jax.base.walker import AdvanceResult
 from vrw_jax.flow.phase_integration import sample_phase
 from vrw_jax.flow.solver_steps import (

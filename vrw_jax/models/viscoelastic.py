@@ -23,14 +23,12 @@ from jaxtyping import Array, Float
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_bool
-from vrw_jax.base.elementwise import approximate_power, compute_sine_cosine
-from vrw_jax.base.measures import Measure
+from vrw_jax.base.elementwise import Elementwise, Vector, approximate_power, compute_sine_cosine
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.results import Measure, Outcome
 from vrw_jax.base.walker import AdvanceResult
+from vrw_jax.flow.extrema import NODE_FRACTIONS, SmoothParts
 from vrw_jax.flow.integrate import PhaseEnd, integrate_batch_phase
-from vrw_jax.flow.kinks import NODE_FRACTIONS, SmoothParts, find_sides
 from vrw_jax.flow.phase_integration import (
     sample_phase,
 )
@@ -44,6 +42,7 @@ from vrw_jax.flow.solver_steps import (
     load_explicit_tableau,
     sample_batch_phase,
 )
+from vrw_jax.flow.tangents import find_sides
 from vrw_jax.lanes.autodiff import with_batched_jvp
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.measures import evaluate_own_measure, measure_forces

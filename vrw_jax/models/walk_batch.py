@@ -19,10 +19,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome, describe_outcomes
-from vrw_jax.base.printing import (
+from vrw_jax.base.results import (
     AbstractPrintable,
     LabelAndText,
+    Outcome,
+    describe_outcomes,
     format_outcome_counts,
     format_quantity,
 )
@@ -31,6 +32,15 @@ from vrw_jax.lanes.autodiff import compute_jacobian_columns
 from vrw_jax.lanes.batching import BatchFunction
 from vrw_jax.models.contact_walks import embed_section_states, step_batch_with_jacobian, walk_batch
 from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_DOMAINS, PARAMETER_NAMES, UNIT_POWERS
+
+DIFFRAX_BATCH_SIZE = 256
+"""Number of walking steps that one call with the diffrax engine computes. The value is chosen
+because the loop of this engine runs until the slowest element ends.
+"""
+XLA_LANE_BATCH_SIZE = 32_768
+"""Number of walking steps that one call of the "lanes" engine computes if XLA compiles it. The
+value is chosen because a GPU needs many batch elements.
+"""
 
 
 class StepSensitivity(eqx.Module):

@@ -21,11 +21,10 @@ from vrw_jax.base.checks import (
     check_type,
     require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import EngineName, StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import AbstractPrintable, LabelAndText, Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import check_arguments, check_one_walker, is_own_walker, name_coordinates
 from vrw_jax.gaits.cycle import AbstractCycle
 from vrw_jax.gaits.gait_search import limit_cycle

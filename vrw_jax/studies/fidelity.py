@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
+from vrw_jax.gaits.finder import GAIT_BATCH_SIZES
 from vrw_jax.gaits.further_search import find_cycles_from_starts, search_further, summarize_search
 from vrw_jax.gaits.gait_search import make_finder
 from vrw_jax.lanes.autodiff import evaluate_with_jacobian
@@ -302,7 +302,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
     The Jacobians are those of one walking step from each gait's section state.
     """
     finder: Any = make_finder(None, params.n_legs)
-    cycles = map_in_batches(finder.find_cycles, batch_sizes.GAIT_BATCH_SIZES, params)
+    cycles = map_in_batches(finder.find_cycles, GAIT_BATCH_SIZES, params)
     section_states, outcomes = np.array(cycles.section_state), np.array(cycles.outcome)
     # Each element has its own mesh, so that its digits do not depend on the batch.
     for _, wheel_indices, mesh_search in search_further(
@@ -310,7 +310,7 @@ def find_paper_gaits(params: WheelParams, step_options: StepOptions) -> LowerFid
         finder,
         params,
         summarize_search(cycles),
-        batch_sizes.GAIT_BATCH_SIZES,
+        GAIT_BATCH_SIZES,
     ):
         section_states[wheel_indices] = mesh_search.gaits.section_state
         outcomes[wheel_indices] = mesh_search.outcome
@@ -360,7 +360,7 @@ def find_rigid_gaits(params: WheelParams) -> LowerFidelityGaits:
     unilateral contact approach this gait. If the rear foot stays on the ground at landing, as in
     the paper, the gait is half as fast again.
     """
-    gaits = map_in_batches(_compute_rigid_gaits, batch_sizes.GAIT_BATCH_SIZES, params)
+    gaits = map_in_batches(_compute_rigid_gaits, GAIT_BATCH_SIZES, params)
     return LowerFidelityGaits.from_steps(ModelIndex.RIGID, *map(np.asarray, gaits))
 
 

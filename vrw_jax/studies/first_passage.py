@@ -18,17 +18,18 @@ from vrw_jax.base.checks import (
     has_traced_leaf,
     require_untraced_arguments,
 )
+from vrw_jax.base.elementwise import Scalar
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import NoGaitError, Outcome
-from vrw_jax.base.printing import (
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
     AbstractPrintable,
     LabelAndText,
+    NoGaitError,
+    Outcome,
     StatusCode,
     describe_step_ending,
     format_outcome_counts,
 )
-from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.types import Scalar
 from vrw_jax.base.walker import AbstractWalker, check_one_walker, is_own_walker
 from vrw_jax.gaits.gait_search import limit_cycle, resolve_model
 from vrw_jax.lanes.autodiff import make_zero_tangent

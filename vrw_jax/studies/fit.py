@@ -22,10 +22,10 @@ from vrw_jax.base.checks import (
     require_known_name,
     require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions, list_parameters, parameter
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import is_own_walker, propose_starts
 from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_finder, resolve_model
 from vrw_jax.studies.fit_problem import (

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from vrw_jax.base.checks import check_range, check_real, require_known_name
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
 from vrw_jax.base.walker import compile_step
 from vrw_jax.lanes.batching import map_in_batches, replace_rows, select_tree_rows
 

@@ -26,8 +26,8 @@ from vrw_jax.base.checks import (
     format_value,
     require_known_name,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.printing import format_heading_and_rows, format_html_table
+from vrw_jax.base.results import format_heading_and_rows, format_html_table
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.studies.fit_problem import (
     HEIGHT_COLUMN,
     FitProblem,

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from vrw_jax.base.checks import format_name_suggestion
-from vrw_jax.base.measures import Measure
-from vrw_jax.gaits.collocation_finder import CollocationFinder
+from vrw_jax.base.results import Measure
 from vrw_jax.gaits.unilateral_finder import UnilateralFinder
+from vrw_jax.gaits.wheel_finders import CollocationFinder
 from vrw_jax.models.interface import AbstractWheel
 from vrw_jax.models.ladder import SELECTION_VARIABLE_ATTRIBUTES
 from vrw_jax.models.measures import (

@@ -22,8 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import StatusCode
+from vrw_jax.base.results import Outcome, StatusCode
 from vrw_jax.gaits.gait_walks import compute_walk_starts
 from vrw_jax.gaits.unilateral_finder import solve_linear_systems
 from vrw_jax.lanes.batching import replace_rows, select_rows_on_device, select_tree_rows

@@ -21,7 +21,7 @@ from jax.scipy.linalg import lu_factor, lu_solve
 from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
-from vrw_jax.base.types import Scalar
+from vrw_jax.base.elementwise import Scalar
 from vrw_jax.wheel.params import WheelParams
 from vrw_jax.wheel.transitions import compute_line_slope
 

@@ -21,25 +21,26 @@ from vrw_jax.base.checks import (
     has_traced_leaf,
     require_known_name,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure
+from vrw_jax.base.elementwise import Scalar
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import NoGaitError, Outcome
-from vrw_jax.base.printing import (
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
     AbstractPrintable,
     LabelAndText,
+    Measure,
+    NoGaitError,
+    Outcome,
     describe_step_ending,
     format_each_batch_element,
     format_outcome_counts,
 )
-from vrw_jax.base.progress import announce_wait
-from vrw_jax.base.types import Scalar
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import is_own_walker
 from vrw_jax.branches.branch import Branch
+from vrw_jax.gaits.cycle import CycleOptions
 from vrw_jax.gaits.derivatives import compute_sensitivity_norms
 from vrw_jax.gaits.finder import AbstractGaitFinder
 from vrw_jax.gaits.gait_search import UserCycleGuess, limit_cycle, resolve_finder, resolve_model
-from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.models.stepping import ModelLike, convert_model_argument, convert_step_options
 from vrw_jax.studies.basins import (
     MAX_ARRIVAL_DISTANCE,

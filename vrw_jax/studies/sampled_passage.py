@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vrw_jax.base.outcomes import Outcome
 from vrw_jax.base.progress import report_progress
+from vrw_jax.base.results import Outcome
 from vrw_jax.studies.walker_groups import (
     GaussianMixture,
     StepTransition,

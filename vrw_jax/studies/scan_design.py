@@ -27,9 +27,8 @@ from vrw_jax.base.checks import (
     require_no_masked_entries,
     require_untraced_arguments,
 )
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import format_quantity
+from vrw_jax.base.results import Outcome, format_quantity
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.wheel.params import FRICTION_NAME, PARAMETER_NAMES
 
 JsonObject = dict[str, Any]
@@ -636,3 +635,19 @@ def _estimate_sobol_indices(measure_values: np.ndarray, roundoff_spreads: np.nda
             [scipy_result.first_order, scipy_result.total_order], (2, len(varying_measures), -1)
         )
     return sobol_index_estimates
+
+
+def require_map_grid(design: SampleDesign) -> None:
+    """Raise a ValueError if the design is not a grid over two parameters with ascending values."""
+    if len(design.shape) != 2:
+        raise ValueError(
+            f"the design sweeps {', '.join(design.swept_parameters)}, but a map is a grid over two "
+            "parameters: sweep two below [grid], or in vrw.grid."
+        )
+    for parameter_name in design.swept_parameters:
+        parameter_values = design.values_by_parameter[parameter_name]
+        if len(parameter_values) < 2 or not np.all(np.diff(parameter_values) > 0.0):
+            raise ValueError(
+                f"{parameter_name} has the values {parameter_values.tolist()}, but each side of "
+                "a map has at least two ascending ones: sort them, or give more."
+            )

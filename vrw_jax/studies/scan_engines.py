@@ -29,18 +29,16 @@ import numpy as np
 from jaxtyping import Array
 
 from vrw_jax import lanes
-from vrw_jax.base import batch_sizes
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.gaits.collocation_finder import KinkedGaitFinder
+from vrw_jax.base.results import Measure, Outcome
+from vrw_jax.gaits.cycle import CycleOptions
 from vrw_jax.gaits.finder import MeasureReader, confirm_outcome_by_step, evaluate_on_gaits
 from vrw_jax.gaits.further_search import MAX_UNREFINED_MESH_ERROR, MeshSearch, search_further
 from vrw_jax.gaits.gait_search import make_finder
 from vrw_jax.gaits.gait_walks import find_slow_gaits
-from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.phase_sequence import CollocationState
 from vrw_jax.gaits.walker_finder import find_gaits_with_walks, make_walker_finder
+from vrw_jax.gaits.wheel_finders import KinkedGaitFinder
 from vrw_jax.lanes.batching import (
     choose_batch_size,
     concatenate_tree_rows,
@@ -48,8 +46,8 @@ from vrw_jax.lanes.batching import (
     replace_rows,
     select_tree_rows,
 )
-from vrw_jax.lanes.saved_traces import compile_exported_function
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.lanes.environment import with_default_jax_settings
+from vrw_jax.lanes.program import compile_exported_function
 from vrw_jax.models.ladder import ModelCode, find_selection_reason
 from vrw_jax.models.measures import MARGIN_MEASURES, PASSAGE_MEASURES, SELECTION_MARGIN_NAMES
 from vrw_jax.studies.fidelity import ModelIndex
@@ -69,6 +67,21 @@ from vrw_jax.wheel.params import (
     WheelParams,
     make_wheel_from_parameters,
 )
+
+SCAN_BATCH_SIZE = 512
+"""Number of samples of a scan that one call computes, fixed so that the results for a sample do not
+depend on other samples.
+"""
+GPU_SCAN_BATCH_SIZE = 4096
+"""Number of samples of a scan that one call on a GPU computes, chosen because it is the default
+size of a chunk.
+"""
+SCAN_TASK_SIZE = 512
+"""Largest number of samples with unilateral contact that one thread task computes."""
+GAIT_READ_BATCH_SIZE = 64
+"""Number of gaits with unilateral contact that one call measures, fixed for the same reason as
+`SCAN_BATCH_SIZE`.
+"""
 
 UNSTABLE_GAIT_MESH_ERROR = 1e-11
 """Largest mesh error of a gait that an event-driven step has not confirmed on a coarser mesh.
@@ -188,7 +201,7 @@ class CollocationScanEngine:
         """
         finder, step_options = self._finder, self._request.step_options
         rows = self._request.stack_parameter_rows(samples_by_parameter)
-        size = choose_batch_size(batch_sizes.SCAN_BATCH_SIZE, batch_sizes.GPU_SCAN_BATCH_SIZE)
+        size = choose_batch_size(SCAN_BATCH_SIZE, GPU_SCAN_BATCH_SIZE)
         with self._compilation_lock, ThreadPoolExecutor(2) as pool:
             cycles = pool.submit(self._compile, "cycles", self.evaluate_cycles, size, rows)
             # The dtype and the number of entries of a section state are those of three columns.
@@ -199,7 +212,7 @@ class CollocationScanEngine:
         def find_from_starts(
             mesh_finder: Any, params: WheelParams, starts: CollocationState
         ) -> MeshSearch:
-            size, key = batch_sizes.GAIT_READ_BATCH_SIZE, mesh_finder.cycle_options
+            size, key = GAIT_READ_BATCH_SIZE, mesh_finder.cycle_options
             arguments = (mesh_finder.model.collect_batch_parameter_values(params), starts)
             with self._compilation_lock:
                 self._compile(key, self._make_cycle_function(mesh_finder), size, *arguments)
@@ -222,7 +235,7 @@ class CollocationScanEngine:
                 finder,
                 select_tree_rows(params, searched),
                 search,
-                (batch_sizes.GAIT_READ_BATCH_SIZE,),
+                (GAIT_READ_BATCH_SIZE,),
                 can_refine_mesh=can_refine_mesh,
                 max_mesh_error=max_mesh_error,
             ):
@@ -370,14 +383,14 @@ def evaluate_gaits(
     rows, finder = request.stack_parameter_rows(samples_by_parameter), request.make_gait_finder()
     is_in_domain = is_searched = request.are_rows_in_domain(rows)
     if finder.is_multistable:
-        finder = dataclasses.replace(finder, gait_batch_sizes=(batch_sizes.GAIT_READ_BATCH_SIZE,))
+        finder = dataclasses.replace(finder, gait_batch_sizes=(GAIT_READ_BATCH_SIZE,))
         # Over a period friction balances the weight along the slope.
         friction, slope = rows[:, -1], rows[:, PARAMETER_NAMES.index("slope")]
         is_searched = is_in_domain & (friction >= np.tan(slope))
     searched_rows = rows[is_searched] if is_searched.any() else rows[:1]
     # Walkers of the user are computed in batches of one size, which are not divided.
-    unit = 1 if finder.model.is_wheel else batch_sizes.GAIT_READ_BATCH_SIZE
-    size = min(batch_sizes.SCAN_TASK_SIZE, unit * -(-len(searched_rows) // (unit * n_threads)))
+    unit = 1 if finder.model.is_wheel else GAIT_READ_BATCH_SIZE
+    size = min(SCAN_TASK_SIZE, unit * -(-len(searched_rows) // (unit * n_threads)))
     first_block, *other_blocks = np.split(searched_rows, range(size, len(searched_rows), size))
     evaluate = functools.partial(_evaluate_block, request, finder)
     first_results = evaluate(first_block)  # This call compiles for all threads.
@@ -392,7 +405,7 @@ def evaluate_gaits(
 
 def _evaluate_block(request: EvaluationRequest, finder: Any, rows: np.ndarray) -> ValuesByVariable:
     """Return outcomes, measures and derivatives of the gaits of all rows, by name."""
-    size, has_kinks = (batch_sizes.GAIT_READ_BATCH_SIZE,), isinstance(finder, KinkedGaitFinder)
+    size, has_kinks = (GAIT_READ_BATCH_SIZE,), isinstance(finder, KinkedGaitFinder)
     cycles, derivatives = _find_gaits(finder, rows), request.derivatives
     names = [name for name in request.measure_names if parse_derivative(name) is None]
     reader = request.make_reader(finder, [*names, *(MARGIN_MEASURES if has_kinks else ())])
@@ -424,7 +437,7 @@ def _find_gaits(finder: Any, rows: np.ndarray) -> Any:
         return jax.tree.map(
             lambda *x: jnp.stack(x), *map(finder.find_cycle_from_values, jnp.asarray(rows))
         )
-    size = (batch_sizes.GAIT_READ_BATCH_SIZE,)
+    size = (GAIT_READ_BATCH_SIZE,)
     return find_gaits_with_walks(
         functools.partial(map_in_numpy_batches, functools.partial(_find_cycles, finder), size),
         finder.model.walker,
@@ -489,7 +502,7 @@ def find_selection_reasons(
     """
     reasons, _ = map_in_numpy_batches(
         _find_selection_reason,
-        (batch_sizes.GAIT_READ_BATCH_SIZE,),
+        (GAIT_READ_BATCH_SIZE,),
         {name: paper_results[name] for name in (*SELECTION_MARGIN_NAMES, "outcome")},
         friction - wheel_model.viscoelastic_model.friction,
     )

@@ -2,43 +2,60 @@
 
 A scan is divided into chunks of samples, which the same compiled function computes. If a store is
 given, each chunk is written as soon as it is computed. An interrupted scan continues with the
-missing chunks. A forecast measures time and memory while some samples are computed. A map of
-special points is a scan over two parameters, with curves between its samples.
+missing chunks. A map of special points is a scan over two parameters, with curves between its
+samples.
+
+On a dask cluster, each worker that is free computes a chunk. Workers only compute, and the calling
+process writes the store. If a worker dies, other workers compute its chunks. Each worker returns a
+description of its environment. A chunk raises an error if this environment differs from that of the
+calling process, because the last digits of its results might differ.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
+import functools
+import itertools
+import logging
 import math
-import sys
+import pickle
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
-from typing import Any, NamedTuple
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import jax
 import numpy as np
 
 from vrw_jax import lanes
 from vrw_jax.base.checks import check_callable, check_names, check_path, check_type
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import NoGaitError, Outcome
-from vrw_jax.base.progress import announce_wait, report_progress
+from vrw_jax.base.progress import announce_wait, report_progress, start_jax
+from vrw_jax.base.results import Measure, NoGaitError, Outcome
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.branches.branch import SpecialPointCurve
 from vrw_jax.branches.special_point_curves import (
     SPECIAL_POINT_MEASURES,
     ScanSignChange,
     trace_special_points,
 )
-from vrw_jax.gaits.options import CycleOptions
-from vrw_jax.lanes.settings import with_default_jax_settings
+from vrw_jax.gaits.cycle import CycleOptions
+from vrw_jax.lanes.environment import with_default_jax_settings
 from vrw_jax.models.ladder import describe_accepted_models
 from vrw_jax.models.stepping import ModelLike, convert_model_argument
-from vrw_jax.studies.scan_design import MANIFEST_ATTRIBUTE, ParameterSamples, SampleDesign
+from vrw_jax.studies.measure_catalog import ValuesByVariable
+from vrw_jax.studies.scan_design import (
+    MANIFEST_ATTRIBUTE,
+    ParameterSamples,
+    SampleDesign,
+    require_map_grid,
+)
+from vrw_jax.studies.scan_engines import SampleEvaluator, make_scan_engine
 from vrw_jax.studies.scan_planning import (
     PROVENANCE_ATTRIBUTE,
     ChunkExecutor,
@@ -56,6 +73,10 @@ from vrw_jax.studies.scan_store import (
     read_stored_manifest,
 )
 from vrw_jax.wheel.params import WheelParams
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
 
 ProgressCallback = Callable[["ScanProgress"], None]
 """Function that is called with the progress of a scan after each chunk."""
@@ -169,11 +190,7 @@ def resolve_executor(dask: str | None) -> contextlib.AbstractContextManager[Chun
 
     With None, the chunks are computed in this process.
     """
-    if dask is None:
-        return contextlib.nullcontext()
-    from vrw_jax.studies.scan_dask import connect_dask_workers
-
-    return connect_dask_workers(dask)
+    return contextlib.nullcontext() if dask is None else connect_dask_workers(dask)
 
 
 @with_default_jax_settings
@@ -325,110 +342,6 @@ def find_matching_store(
     return ZarrResultStore(store_path, scan_plan.result_layout, verifies_files)
 
 
-SCAN_STARTUP_SECONDS = 5.0
-"""Typical time until the first sample is computed with cached code, s; see
-docs/benchmarks/scans.md.
-"""
-
-TYPICAL_SCAN_MEMORY_BYTES = 500_000_000
-"""Typical memory that code and arrays of a scan occupy, bytes; see docs/benchmarks/scans.md."""
-
-
-@with_default_jax_settings
-def forecast_scan(scan_plan: ScanPlan, store_path: Path) -> dict[str, str]:
-    """Return a forecast of a scan: its size, chunks, memory and time, as texts by label.
-
-    No file is written. Time and memory are measured while samples that are spread over the design
-    are computed.
-
-    - `store_path`: folder of the scan's store. Only chunks that are missing in the store are
-      forecast.
-    """
-    result_layout, n_samples = scan_plan.result_layout, scan_plan.design.size
-    measure_catalog = scan_plan.measure_catalog
-    existing_store = find_matching_store(scan_plan, store_path, verifies_files=False)
-    missing_chunks = (
-        range(result_layout.n_chunks)
-        if existing_store is None
-        else existing_store.find_missing_chunks()
-    )
-    n_missing_samples = sum(
-        math.prod(result_layout.compute_chunk_sample_shape(chunk_index))
-        for chunk_index in missing_chunks
-    )
-    chunk_size = math.prod(result_layout.chunk_shape)
-    sample_axes_description = " x ".join(
-        f"{axis_length} {sample_axis_name}"
-        for sample_axis_name, axis_length in zip(
-            scan_plan.design.dims, scan_plan.design.shape, strict=True
-        )
-    )
-    forecast_texts = {
-        "samples": f"{n_samples:,} ({sample_axes_description})",
-        "measures": ", ".join(scan_plan.requested_measures),
-        "always included": ", ".join(measure_catalog.always_included_variables),
-        "chunks": f"{result_layout.n_chunks:,} of up to {chunk_size:,} samples, "
-        f"{len(missing_chunks):,} to compute",
-        "result": f"{_format_bytes(n_samples * result_layout.bytes_per_sample)} before compression",
-    }
-    if not n_missing_samples:
-        return forecast_texts | {"time": "none: the store is complete"}
-    n_measured_samples = min(
-        n_missing_samples, measure_catalog.forecast_samples_per_core * lanes.count_available_cores()
-    )
-    scan_engine = scan_plan.build_scan_engine()
-    start_seconds = perf_counter()
-    scan_engine(_select_spread_samples(scan_plan.design, 1))
-    compilation_end_seconds = perf_counter()
-    scan_engine(_select_spread_samples(scan_plan.design, n_measured_samples))
-    samples_per_second = n_measured_samples / (perf_counter() - compilation_end_seconds)
-    try:
-        import resource
-
-        bytes_per_unit = 1 if sys.platform == "darwin" else 1024
-        peak_memory_bytes = bytes_per_unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    except ImportError:  # Windows has no such module.
-        peak_memory_bytes = TYPICAL_SCAN_MEMORY_BYTES
-    forecast_memory_bytes = peak_memory_bytes + chunk_size * 2 * result_layout.bytes_per_sample
-    return forecast_texts | {
-        "memory": f"about {_format_bytes(forecast_memory_bytes)}, whatever the number of samples",
-        "time": f"about "
-        f"{format_duration(n_missing_samples / samples_per_second + SCAN_STARTUP_SECONDS)}: "
-        f"{n_missing_samples:,} samples at {samples_per_second:,.0f} per "
-        f"second on {lanes.count_available_cores()} cores, {SCAN_STARTUP_SECONDS:.0f} s to start",
-        "measured": f"just now, on {n_measured_samples:,} samples spread over the design; the code "
-        f"for it took {compilation_end_seconds - start_seconds:.0f} s and is kept",
-    }
-
-
-def _select_spread_samples(design: SampleDesign, n_selected_samples: int) -> ParameterSamples:
-    flat_sample_indices = np.linspace(0, design.size - 1, n_selected_samples).round().astype(int)
-    axis_indices = np.unravel_index(flat_sample_indices, design.shape)
-    indices_by_axis = dict(zip(design.dims, axis_indices, strict=True))
-    return {
-        parameter_name: parameter_values[indices_by_axis.get(parameter_name, axis_indices[0])]
-        for parameter_name, parameter_values in design.values_by_parameter.items()
-    }
-
-
-def _format_bytes(n_bytes: int | float) -> str:
-    for unit_of_bytes in ("B", "kB", "MB"):
-        if n_bytes < 1000:
-            return f"{n_bytes:.3g} {unit_of_bytes}"
-        n_bytes /= 1000
-    return f"{n_bytes:.3g} GB"
-
-
-def format_duration(seconds: float) -> str:
-    """Return a text that states a duration in s, min or h.
-
-    - `seconds`: the duration, s.
-    """
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
 class SpecialPointMap(NamedTuple):
     """Gaits on a grid over two parameters, and all curves of special points between the samples.
 
@@ -557,17 +470,229 @@ def follow_special_points(
     )
 
 
-def require_map_grid(design: SampleDesign) -> None:
-    """Raise a ValueError if the design is not a grid over two parameters with ascending values."""
-    if len(design.shape) != 2:
+N_QUEUED_CHUNKS_PER_THREAD = 2
+"""Number of submitted chunks per thread of the cluster.
+
+The value is chosen because a thread then always has work, and little memory is used.
+"""
+
+DASK_SCHEDULER_TIMEOUT = "10s"
+"""Longest time until a dask scheduler must respond, in the notation of dask."""
+
+MAX_SECONDS_WITHOUT_RESULT = 10.0
+"""Longest time without a result, s, after which the connected workers are counted.
+
+The value is chosen because workers that have just started are connected by then.
+"""
+
+
+@contextlib.contextmanager
+def connect_dask_workers(scheduler_address: str) -> Iterator[ChunkExecutor]:
+    """Yield a function that computes chunks on the dask cluster at `scheduler_address`.
+
+    The address "local" starts a cluster with one process per core.
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as connection_error:
         raise ValueError(
-            f"the design sweeps {', '.join(design.swept_parameters)}, but a map is a grid over two "
-            "parameters: sweep two below [grid], or in vrw.grid."
-        )
-    for parameter_name in design.swept_parameters:
-        parameter_values = design.values_by_parameter[parameter_name]
-        if len(parameter_values) < 2 or not np.all(np.diff(parameter_values) > 0.0):
-            raise ValueError(
-                f"{parameter_name} has the values {parameter_values.tolist()}, but each side of "
-                "a map has at least two ascending ones: sort them, or give more."
+            "a scan on a cluster needs dask.distributed, which is not installed: "
+            "run pip install 'vrw-jax[dask]'."
+        ) from connection_error
+    with contextlib.ExitStack() as exit_stack:
+        exit_stack.enter_context(hide_cancelled_tasks_in_log())
+        if scheduler_address == "local":
+            local_cluster = LocalCluster(
+                n_workers=lanes.count_available_cores(),
+                threads_per_worker=1,
+                dashboard_address=None,
             )
+            dask_client = Client(exit_stack.enter_context(local_cluster), set_as_default=False)
+        else:
+            try:
+                _require_scheduler_response(scheduler_address)
+                dask_client = Client(
+                    scheduler_address, timeout=DASK_SCHEDULER_TIMEOUT, set_as_default=False
+                )
+            # Libraries raise different errors for a wrong address.
+            except Exception as connection_error:
+                raise ValueError(
+                    f"no dask scheduler answers at {scheduler_address!r}: give the address that "
+                    "it printed when it started, such as tcp://host:8786, or 'local'."
+                ) from connection_error
+        exit_stack.enter_context(dask_client)
+        yield functools.partial(_compute_chunks_on_cluster, dask_client, scheduler_address)
+
+
+@contextlib.contextmanager
+def hide_cancelled_tasks_in_log() -> Iterator[None]:
+    """Return a context in which the client of dask logs no tasks that a lost scheduler cancels."""
+    dask_client_logger = logging.getLogger("distributed.client")
+
+    def is_log_record_shown(log_record: logging.LogRecord) -> bool:
+        logged_error_type = log_record.exc_info[0] if log_record.exc_info else None
+        return logged_error_type is None or not issubclass(
+            logged_error_type, asyncio.CancelledError
+        )
+
+    dask_client_logger.addFilter(is_log_record_shown)
+    try:
+        yield
+    finally:
+        dask_client_logger.removeFilter(is_log_record_shown)
+
+
+def _require_scheduler_response(scheduler_address: str) -> None:
+    """Raise an error if no scheduler responds at `scheduler_address`.
+
+    Without this check, a client would wait without limit.
+    """
+    from dask.utils import parse_timedelta
+    from distributed.comm import connect
+    from distributed.security import Security
+
+    async def connect_to_scheduler() -> None:
+        connection_arguments = Security().get_connection_args("client")
+        timeout_seconds = parse_timedelta(DASK_SCHEDULER_TIMEOUT)
+        scheduler_connection = await asyncio.wait_for(
+            connect(scheduler_address, timeout=timeout_seconds, **connection_arguments),
+            2 * timeout_seconds,
+        )
+        scheduler_connection.abort()
+
+    # The event loop of a notebook is already running.
+    with ThreadPoolExecutor(1) as connection_pool:
+        connection_pool.submit(asyncio.run, connect_to_scheduler()).result()
+
+
+def _compute_chunks_on_cluster(
+    dask_client: "Client",
+    scheduler_address: str,
+    scan_plan: ScanPlan,
+    missing_chunks: Sequence[int],
+) -> Iterator[ChunkResult]:
+    """Yield each missing chunk's index and results, in the order of completion."""
+    from distributed.protocol.pickle import dumps  # pickles functions of a script too
+
+    request = scan_plan.evaluation_request
+    pickled_request = dumps((request, len(jax.tree.leaves(request))))
+    local_computing_environment = describe_computing_environment()
+    remaining_chunks = iter(missing_chunks)
+    chunk_index_by_future: dict[Future, int] = {}
+    completed_futures: SimpleQueue[Future] = SimpleQueue()
+    has_warned_of_no_workers = False
+
+    def submit_remaining_chunks() -> None:
+        """Submit chunks until there are `N_QUEUED_CHUNKS_PER_THREAD` chunks per thread of the
+        cluster, or until all chunks are submitted.
+        """
+        n_submittable_chunks = N_QUEUED_CHUNKS_PER_THREAD * max(
+            1, sum(dask_client.nthreads().values())
+        ) - len(chunk_index_by_future)
+        for chunk_index in itertools.islice(remaining_chunks, max(n_submittable_chunks, 0)):
+            samples_by_parameter = scan_plan.select_chunk_samples(chunk_index)
+            chunk_future = dask_client.submit(
+                _compute_chunk_in_worker, pickled_request, samples_by_parameter, pure=False
+            )
+            chunk_index_by_future[chunk_future] = chunk_index
+            chunk_future.add_done_callback(completed_futures.put)
+
+    try:
+        with _explain_lost_cluster(scheduler_address, OSError):
+            submit_remaining_chunks()
+        while chunk_index_by_future:
+            try:
+                chunk_future = completed_futures.get(timeout=MAX_SECONDS_WITHOUT_RESULT)
+            except Empty:
+                with _explain_lost_cluster(scheduler_address, OSError):
+                    is_warning_due = not (has_warned_of_no_workers or dask_client.nthreads())
+                if is_warning_due:
+                    warnings.warn(
+                        f"the dask cluster at {scheduler_address} has no workers, so that nothing "
+                        f"is computed: start some, as with `dask worker {scheduler_address}`; the "
+                        "scan continues as soon as there is one.",
+                        stacklevel=1,
+                    )
+                    has_warned_of_no_workers = True
+                continue
+            with _explain_lost_cluster(scheduler_address):
+                worker_environment, chunk_results = chunk_future.result()
+            environment_difference_text = describe_settings_difference(
+                local_computing_environment, worker_environment
+            )
+            if environment_difference_text:
+                raise ValueError(
+                    "a worker computes by other means than this process: "
+                    f"{environment_difference_text}. Start the workers from the same installation "
+                    "on machines of one kind."
+                )
+            yield chunk_index_by_future.pop(chunk_future), chunk_results
+            del chunk_future  # The cluster can then release the result.
+            with _explain_lost_cluster(scheduler_address, OSError):
+                submit_remaining_chunks()
+    finally:
+        if dask_client.status == "running":
+            dask_client.cancel(list(chunk_index_by_future))
+
+
+@contextlib.contextmanager
+def _explain_lost_cluster(
+    scheduler_address: str, *further_loss_errors: type[Exception]
+) -> Iterator[None]:
+    """Return a context that replaces the error for a lost worker or scheduler by a ValueError with
+    a remedy.
+
+    - `further_loss_errors`: additional exceptions that the context replaces, because the
+      computation of a chunk cannot raise them.
+    """
+    from distributed import CancelledError, KilledWorker
+    from distributed.comm import CommClosedError
+
+    cluster_loss_errors: tuple[type[BaseException], ...] = (
+        CancelledError,
+        CommClosedError,
+        *further_loss_errors,
+    )
+    try:
+        yield
+    except KilledWorker as loss_error:
+        raise ValueError(
+            "a chunk was given up because each worker that had it died: see to the workers "
+            "(their memory, say) and run the same again, it goes on from there."
+        ) from loss_error
+    except cluster_loss_errors as loss_error:
+        raise ValueError(
+            f"the dask cluster at {scheduler_address} is gone: start it again and run the same "
+            "again, it goes on with the chunks that its store lacks."
+        ) from loss_error
+
+
+def _compute_chunk_in_worker(
+    pickled_request: bytes, samples_by_parameter: ParameterSamples
+) -> tuple[dict[str, object], ValuesByVariable]:
+    """Compute a chunk in a worker.
+
+    Return a description of the worker's environment, and the values of each variable in the chunk,
+    by the name of the variable.
+    """
+    start_jax()
+    return describe_computing_environment(), make_worker_engine(pickled_request)(
+        samples_by_parameter
+    )
+
+
+@functools.cache
+def make_worker_engine(pickled_request: bytes) -> SampleEvaluator:
+    """Return the scan engine for a pickled `EvaluationRequest` and its number of leaves.
+
+    Each worker creates the engine once.
+    """
+    from distributed import get_worker
+
+    request, n_leaves = pickle.loads(pickled_request)
+    if len(jax.tree.leaves(request)) != n_leaves:  # Equinox finds no fields in a pickled class.
+        raise ValueError(
+            "the model or its parameters are of a class that the workers cannot import: define it "
+            "in a module that they can import, or scan without dask."
+        )
+    return make_scan_engine(request, get_worker().state.nthreads)

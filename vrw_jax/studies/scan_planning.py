@@ -17,16 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax import lanes
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_names, check_positive, check_type
-from vrw_jax.base.lazy_xarray import xarray as xr
-from vrw_jax.base.measures import Measure, find_own_measures, name_measures
 from vrw_jax.base.options import StepOptions
+from vrw_jax.base.results import Measure, find_own_measures, name_measures
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import check_parameters, is_own_walker
+from vrw_jax.gaits.cycle import CycleOptions
 from vrw_jax.gaits.gait_search import make_finder
-from vrw_jax.gaits.options import CycleOptions
 from vrw_jax.gaits.walker_finder import ParameterizedWalker, make_walker_finder
-from vrw_jax.lanes.disk_cache import compute_source_digest
+from vrw_jax.lanes.environment import compute_source_digest
 from vrw_jax.lanes.keys import UnresolvableFunctionError, make_key
 from vrw_jax.models.ladder import collect_provenance_attributes, describe_accepted_models
 from vrw_jax.models.measures import MARGIN_MEASURES, describe_parameter, make_locked_leg_coordinate
@@ -55,6 +54,11 @@ from vrw_jax.studies.scan_design import (
 )
 from vrw_jax.studies.scan_engines import EvaluationRequest, SampleEvaluator, make_scan_engine
 from vrw_jax.wheel.params import FRICTION_NAME, LAW_NAMES, WheelParams, check_parameter_name
+
+SCAN_CHUNK_SIZE = 4096
+"""Default number of samples of a scan that are written together. A scan that is killed may lose as
+many samples.
+"""
 
 PROVENANCE_ATTRIBUTE = "provenance"
 """Name of the attribute of a store that describes the origin of the results."""
@@ -298,7 +302,7 @@ def plan_scan(
     options.check_tolerances(dtype)
     gait_finder.search_options.check_tolerances(dtype)
     if chunk is None:
-        chunk = batch_sizes.SCAN_CHUNK_SIZE if slope_sd is None else N_PASSAGE_SAMPLES_PER_CHUNK
+        chunk = SCAN_CHUNK_SIZE if slope_sd is None else N_PASSAGE_SAMPLES_PER_CHUNK
     chunk = check_int("chunk", chunk)
     if design.size > MAX_SCAN_SAMPLES:
         raise ValueError(

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from vrw_jax.base.checks import check_bool, check_path
-from vrw_jax.base.lazy_xarray import xarray as xr
+from vrw_jax.base.results import xarray as xr
 from vrw_jax.studies.measure_catalog import ValuesByVariable, canonicalize_variable_name
 from vrw_jax.studies.scan_design import MANIFEST_ATTRIBUTE, JsonObject, read_scan_manifest
 from vrw_jax.studies.scan_planning import (

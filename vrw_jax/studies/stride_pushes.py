@@ -17,12 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vrw_jax.base import batch_sizes
 from vrw_jax.base.checks import check_int, check_positive, check_type, require_known_name
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
 from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import AbstractPrintable, LabelAndText, Outcome, format_quantity
 from vrw_jax.base.walker import AdvanceResult, compile_step
 from vrw_jax.flow.hybrid_simulation import HybridStep
 from vrw_jax.flow.hybrid_system import HybridSystem, compile_finish
@@ -36,6 +34,11 @@ from vrw_jax.studies.basins import (
     require_can_start_within_step,
     walk_until_on_gait,
 )
+
+DISTURBANCE_BATCH_SIZES = (64, 1024)
+"""Numbers of disturbed steps that one call computes: one disturbance size at each instant, or
+many.
+"""
 
 DISTURBANCE_SIGNS = np.array([-1.0, 1.0])
 """Signs of the change in backward and forward disturbances, in this order."""
@@ -394,7 +397,7 @@ def _walk_after_disturbance(
         )
         section_states[is_in_phase], walk_outcomes[is_in_phase] = map_in_batches(
             finish_disturbed_batch,
-            batch_sizes.DISTURBANCE_BATCH_SIZES,
+            DISTURBANCE_BATCH_SIZES,
             disturbed_states[is_in_phase],
         )
     # A change that crosses a guard of the mode, such as that of a speed at an apex, is skipped.

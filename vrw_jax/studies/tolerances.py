@@ -36,15 +36,15 @@ from vrw_jax.base.checks import (
     require_untraced_arguments,
 )
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import (
+from vrw_jax.base.progress import announce_wait
+from vrw_jax.base.results import (
     AbstractPrintable,
     LabelAndText,
+    Outcome,
     describe_step_ending,
     format_each_batch_element,
     format_outcome_counts,
 )
-from vrw_jax.base.progress import announce_wait
 from vrw_jax.gaits.gait_walks import GaitChoice, parse_gait_choice
 from vrw_jax.lanes.batching import select_rows_on_device, select_tree_rows
 from vrw_jax.models.measures import MEASURES

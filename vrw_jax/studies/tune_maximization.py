@@ -24,9 +24,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import StatusCode
 from vrw_jax.base.progress import report_progress
+from vrw_jax.base.results import Outcome, StatusCode
 from vrw_jax.gaits.finder import Gait
 from vrw_jax.lanes.batching import concatenate_tree_rows, select_tree_rows
 

@@ -27,10 +27,10 @@ from vrw_jax.base.checks import (
     format_value,
     require_known_name,
 )
-from vrw_jax.base.measures import Measure
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import NoGaitError, Outcome
+from vrw_jax.base.results import Measure, NoGaitError, Outcome
 from vrw_jax.base.walker import check_parameters, is_own_walker
+from vrw_jax.gaits.cycle import CycleOptions, default_margins
 from vrw_jax.gaits.finder import (
     AbstractGaitFinder,
     GaitFunction,
@@ -40,7 +40,6 @@ from vrw_jax.gaits.finder import (
     is_same_branch,
 )
 from vrw_jax.gaits.gait_search import make_finder, resolve_model
-from vrw_jax.gaits.options import CycleOptions, default_margins
 from vrw_jax.gaits.walker_finder import WalkerFinder, make_walker_finder
 from vrw_jax.models.measures import SELECTION_MARGIN_NAMES
 from vrw_jax.models.stepping import (

@@ -17,13 +17,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.checks import check_int, check_positive, require_untraced_arguments
-from vrw_jax.base.lazy_xarray import xarray as xr
 from vrw_jax.base.options import StepOptions
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.printing import format_heading_and_rows, format_html_table, format_quantity
 from vrw_jax.base.progress import announce_wait, report_progress
+from vrw_jax.base.results import (
+    Outcome,
+    format_heading_and_rows,
+    format_html_table,
+    format_quantity,
+)
+from vrw_jax.base.results import xarray as xr
+from vrw_jax.gaits.cycle import CycleOptions, default_margins
 from vrw_jax.gaits.finder import Gait
-from vrw_jax.gaits.options import CycleOptions, default_margins
 from vrw_jax.models.ladder import collect_provenance_attributes
 from vrw_jax.models.measures import (
     MARGIN_MEASURES,

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.options import StepOptions, find_tree_parameter, replace_tree_parameter
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
 from vrw_jax.lanes.batching import concatenate_tree_rows, replace_rows
 from vrw_jax.models.step_batch import step_batch
 from vrw_jax.models.walk_batch import StepBatchResult

@@ -1,6 +1,6 @@
 """The paper's equations for one wheel: parameters, geometry, dynamics, phases."""
 
-from vrw_jax.base.outcomes import Outcome
+from vrw_jax.base.results import Outcome
 from vrw_jax.wheel.dynamics import Motion, compute_landing_foot_height, compute_rear_foot_height
 from vrw_jax.wheel.params import (
     FRICTION_NAME,

@@ -20,8 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vrw_jax.base.elementwise import compute_sine_cosine
-from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.elementwise import Elementwise, Vector, compute_sine_cosine
 from vrw_jax.wheel.laws import (
     compute_leg_potential,
     evaluate_damping_power,

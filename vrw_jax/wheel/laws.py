@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.checks import check_reals, format_value
-from vrw_jax.base.elementwise import compute_sine_cosine
+from vrw_jax.base.elementwise import Elementwise, Vector, compute_sine_cosine
 from vrw_jax.base.options import list_parameters, parameter
-from vrw_jax.base.types import Elementwise, Vector
 from vrw_jax.wheel.params import PARAMETER_DOMAINS, Symbols, WheelLaws, WheelUnits
 
 

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from vrw_jax.base.checks import check_int, check_reals, format_value, require_known_name
-from vrw_jax.base.elementwise import compute_sine_cosine
+from vrw_jax.base.elementwise import Elementwise, RealInput, Scalar, compute_sine_cosine
 from vrw_jax.base.options import (
     ModuleParameter,
     ParameterDomain,
@@ -21,8 +21,7 @@ from vrw_jax.base.options import (
     list_parameters,
     make_real_field,
 )
-from vrw_jax.base.printing import AbstractPrintable, LabelAndText, format_quantity
-from vrw_jax.base.types import Elementwise, RealInput, Scalar
+from vrw_jax.base.results import AbstractPrintable, LabelAndText, format_quantity
 
 MIN_SI_VALUE = 1e-15
 """Smallest value of a positive parameter in SI units, chosen because quotients of smaller values

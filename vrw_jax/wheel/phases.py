@@ -17,9 +17,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from vrw_jax.base.elementwise import compute_sine_cosine
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.types import Elementwise, Vector
+from vrw_jax.base.elementwise import Elementwise, Vector, compute_sine_cosine
+from vrw_jax.base.results import Outcome
 from vrw_jax.wheel import dynamics, transitions
 from vrw_jax.wheel.dynamics import (
     Acceleration,

@@ -22,9 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vrw_jax.base.elementwise import compute_arcsine, compute_sine_cosine
-from vrw_jax.base.outcomes import Outcome
-from vrw_jax.base.types import Elementwise
+from vrw_jax.base.elementwise import Elementwise, compute_arcsine, compute_sine_cosine
+from vrw_jax.base.results import Outcome
 from vrw_jax.wheel.dynamics import (
     EquationTerms,
     FootForce,
