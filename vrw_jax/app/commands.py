@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
-import jax.numpy as jnp
 import typer
 
 from vrw_jax.app import output as printing
@@ -28,8 +27,6 @@ from vrw_jax.app.config import (
     is_figure_file,
     load_config,
     parse_assignments,
-    require_writable_folder,
-    require_writable_output,
 )
 from vrw_jax.app.explorer import make_page_address
 from vrw_jax.app.output import (
@@ -37,6 +34,8 @@ from vrw_jax.app.output import (
     print_error_sentence,
     replace_unencodable_output,
     report_command_errors,
+    require_writable_folder,
+    require_writable_output,
     show_computation_stages,
     show_warnings_as_sentences,
     stdout_console,
@@ -61,7 +60,6 @@ from vrw_jax.studies.first_passage import first_passage
 from vrw_jax.studies.robustness import gait_sensitivity
 from vrw_jax.studies.scan_design import require_map_grid
 from vrw_jax.studies.scan_execution import follow_special_points
-from vrw_jax.studies.tuning import tune
 from vrw_jax.wheel.params import WheelParams
 
 MAX_OPTION_INTEGER = 10**9
@@ -204,9 +202,7 @@ def run_gait_command(
         gait_model: Any
         gait_model, model_selection_reason = resolve_model_with_reason(params, model)
         options = gait_config.make_options()
-        start = gait_config.gait.start
-        section_state = model.compute_default_start(params) if start is None else jnp.asarray(start)
-        section_state = model.complete_section_state(params, section_state)
+        section_state = gait_config.gait.make_start(params, model)
         n_steps_walked, n_steps = 0, steps or gait_config.gait.steps
         models_of_legs = model.list_models_of_legs()
         while True:
@@ -222,7 +218,7 @@ def run_gait_command(
         finder = make_finder(gait_model, params.n_legs, period_n=model.leg_period)
         limit_cycle_result: Any = limit_cycle(
             params,
-            guess=None if start is None or finder.supports_cold_start else guess,
+            guess=None if gait_config.gait.start is None or finder.supports_cold_start else guess,
             period_n=model.leg_period,
             model=gait_model,
             options=options if isinstance(options, finder.options_type) else None,
@@ -567,15 +563,10 @@ def run_tune_command(
         assert tune_config is not None
         require_writable_output(command_config, folder, picture)
 
-        tune_result = tune(
+        tune_result = tune_config.tune_wheel(
             command_config.make_wheel(),
-            tune_config.objective,
-            tuple(tune_config.bounds),
-            tune_config.bounds,
-            tune_config.constraints,
             model=command_config.make_model(),
             options=command_config.make_options(),
-            max_evaluations=tune_config.evaluations,
         )
         printing.print_text_table("Tuned gait", tune_result.describe().items())
         printing.print_written_paths(

@@ -7,14 +7,14 @@ value, the allowed values and the remedy.
 import dataclasses
 import importlib.util
 import math
-import os
 import sys
-import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from pydantic import (
     AfterValidator,
@@ -42,6 +42,7 @@ from vrw_jax.models.ladder import MODEL_CLASSES, list_model_config_names
 from vrw_jax.studies import scan_design as designs
 from vrw_jax.studies.measure_catalog import check_measure_names, select_measure_catalog
 from vrw_jax.studies.scan_design import MAX_LISTED_SAMPLES
+from vrw_jax.studies.tuning import TuneResult, tune
 from vrw_jax.wheel.parameter_sets import parameter_sets
 from vrw_jax.wheel.params import (
     FRICTION_NAME,
@@ -204,6 +205,11 @@ class GaitConfig:
     steps: Whole = 30
     start: SectionState | None = None
 
+    def make_start(self, params: WheelParams, model: AbstractWheel) -> jax.Array:
+        """Return the section state of the model from which a walk begins."""
+        start = model.compute_default_start(params) if self.start is None else self.start
+        return model.complete_section_state(params, jnp.asarray(start))
+
 
 @dataclass(frozen=True)
 class TuneConfig:
@@ -220,6 +226,18 @@ class TuneConfig:
     bounds: Bounds = dataclasses.field(default_factory=dict)
     constraints: Constraints | None = None
     evaluations: Whole = 200
+
+    def tune_wheel(self, params: WheelParams, **arguments: Any) -> TuneResult:
+        """Return the tuned wheel. The other arguments are those of `vrw.tune`."""
+        return tune(
+            params,
+            self.objective,
+            tuple(self.bounds),
+            self.bounds,
+            self.constraints,
+            max_evaluations=self.evaluations,
+            **arguments,
+        )
 
 
 @dataclass(frozen=True)
@@ -296,6 +314,14 @@ class FigureConfig:
         Annotated[Path, AfterValidator(_check_figure_file), _must_be('a path, such as "fig3.pdf"')]
         | None
     ) = None
+
+    def list_files(self, figure_name: str, folder: Path, is_only_figure: bool) -> list[Path]:
+        """Return the files of a figure, which are in `folder` unless the config names a file."""
+        if self.file is None:
+            return [folder / f"{figure_name}.{figure_format}" for figure_format in self.formats]
+        return [
+            self.file if is_only_figure else self.file.with_stem(f"{self.file.stem}_{figure_name}")
+        ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -656,47 +682,3 @@ def _make_value_error(setting_name: str, config_value: object, requirement_text:
     elif isinstance(config_value, str):
         value_text = value_text.replace("'", '"')
     return ValueError(f"{setting_name} is {value_text}, but it must be {requirement_text}.")
-
-
-def require_writable_folder(folder: Path, draws_figure: bool = False) -> None:
-    """Raise a ValueError if the folder is not writable, or if figures are to be drawn and the
-    requested matplotlib backend does not exist. No folder is created.
-    """
-    existing_parent_folder = folder
-    while not existing_parent_folder.exists():
-        existing_parent_folder = existing_parent_folder.parent
-    try:
-        with tempfile.TemporaryDirectory(dir=existing_parent_folder):
-            pass
-    except OSError as write_error:
-        raise ValueError(
-            f"nothing can be written to {folder} ({write_error.strerror}): give a place of your "
-            "own."
-        ) from write_error
-    if not draws_figure:
-        return
-    try:
-        importlib.import_module("vrw_jax.plot")
-    except ValueError as backend_error:
-        raise ValueError(
-            f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
-            "it, or set it to agg."
-        ) from backend_error
-
-
-def require_writable_output(
-    command_config: Config, folder: Path, draws_figure: bool, tests_backend: bool = True
-) -> None:
-    require_writable_folder(folder, draws_figure and tests_backend)
-    if (figure_file := command_config.figures.file) is not None:
-        if not draws_figure:
-            raise ValueError(
-                f"--no-picture is given, but the figure {figure_file} is asked for: drop one of "
-                "the two."
-            )
-        if figure_file.is_dir():
-            raise ValueError(
-                f"{figure_file} is a folder, but the figure is written to a file of this name: "
-                "give another name."
-            )
-        require_writable_folder(figure_file.parent)

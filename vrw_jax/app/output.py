@@ -1,16 +1,16 @@
 """Output of commands: text in the terminal, error messages, and files in a folder."""
 
-from __future__ import annotations
-
 import codecs
 import contextlib
 import csv
 import enum
+import importlib
 import io
 import itertools
 import json
 import os
 import sys
+import tempfile
 import time
 import tomllib
 import unicodedata
@@ -448,25 +448,61 @@ def _print_step_margins(step_result: StepResult) -> None:
     )
 
 
+def require_writable_folder(folder: Path, draws_figure: bool = False) -> None:
+    """Raise a ValueError if the folder is not writable, or if figures are to be drawn and the
+    requested matplotlib backend does not exist. No folder is created.
+    """
+    existing_folder = next(filter(Path.exists, (folder, *folder.parents)))
+    try:
+        with tempfile.TemporaryDirectory(dir=existing_folder):
+            pass
+    except OSError as write_error:
+        raise ValueError(
+            f"nothing can be written to {folder} ({write_error.strerror}): give a place of your "
+            "own."
+        ) from write_error
+    if not draws_figure:
+        return
+    try:
+        importlib.import_module("vrw_jax.plot")
+    except ValueError as backend_error:
+        raise ValueError(
+            f"MPLBACKEND is {os.environ.get('MPLBACKEND')!r}, which matplotlib doesn't know: unset "
+            "it, or set it to agg."
+        ) from backend_error
+
+
+def require_writable_output(
+    command_config: Config, folder: Path, draws_figure: bool, tests_backend: bool = True
+) -> None:
+    """Raise a ValueError if a command cannot write its results or figures."""
+    require_writable_folder(folder, draws_figure and tests_backend)
+    if (figure_file := command_config.figures.file) is not None:
+        if not draws_figure:
+            raise ValueError(
+                f"--no-picture is given, but the figure {figure_file} is asked for: drop one of "
+                "the two."
+            )
+        if figure_file.is_dir():
+            raise ValueError(
+                f"{figure_file} is a folder, but the figure is written to a file of this name: "
+                "give another name."
+            )
+        require_writable_folder(figure_file.parent)
+
+
 def write_figures(
     figure_by_name: Mapping[str, Any], folder: Path, figure_config: FigureConfig
 ) -> list[Path]:
     """Write figures into `folder`, or to the file of the config, and return the paths."""
     from vrw_jax import plot
 
-    formats, figure_file = figure_config.formats, figure_config.file
-    if figure_file is not None:
-        formats, folder = (figure_file.suffix[1:],), figure_file.parent
-        has_one_figure = len(figure_by_name) == 1
-        figure_by_name = {
-            figure_file.stem if has_one_figure else f"{figure_file.stem}_{figure_name}": figure
-            for figure_name, figure in figure_by_name.items()
-        }
+    has_one_figure = len(figure_by_name) == 1
     return [
         figure_path
         for figure_name, figure in figure_by_name.items()
-        for figure_format in formats
-        for figure_path in plot.save(figure, folder, f"{figure_name}.{figure_format}")
+        for path in figure_config.list_files(figure_name, folder, has_one_figure)
+        for figure_path in plot.save(figure, path.parent, path.name)
     ]
 
 
