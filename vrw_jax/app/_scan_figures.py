@@ -614,6 +614,22 @@ def map_figure(
     figure.colorbar(image, ax=axes, aspect=30, pad=0.01).set_label(
         format_axis_label(measure, dataset=scan)
     )
+    _draw_special_point_curves(axes, curves, x, y)
+    axes.set(
+        xlabel=format_axis_label(x, dataset=scan),
+        ylabel=format_axis_label(y, dataset=scan),
+        xlim=scan[x].values[[0, -1]],
+        ylim=scan[y].values[[0, -1]],
+    )
+    if curves:
+        add_figure_legend(figure, axes.get_legend_handles_labels()[0], 2)
+    return figure
+
+
+def _draw_special_point_curves(
+    axes: Axes, curves: Sequence[SpecialPointCurve], x: str, y: str
+) -> None:
+    """Draw curves of special points, and mark the points at which two special points coincide."""
     labeled = set()
     for curve in curves:
         color, line_style = select_special_point_style(curve.name)
@@ -649,12 +665,3 @@ def map_figure(
             markeredgewidth=0.6,
             label="two special points at once",
         )
-    axes.set(
-        xlabel=format_axis_label(x, dataset=scan),
-        ylabel=format_axis_label(y, dataset=scan),
-        xlim=scan[x].values[[0, -1]],
-        ylim=scan[y].values[[0, -1]],
-    )
-    if curves:
-        add_figure_legend(figure, axes.get_legend_handles_labels()[0], 2)
-    return figure

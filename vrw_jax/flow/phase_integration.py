@@ -102,6 +102,21 @@ class GuardsAndMargins(NamedTuple):
             is_guard_met = jnp.where(is_guard_zero, guard_rates <= 0.0, is_guard_met)
         return is_guard_met, is_guard_met & is_guard_zero & (guard_rates < 0.0)
 
+    def require_flag_of_each_margin(self, n_margins: int) -> None:
+        """Raise a ValueError if `includes_phase_start` does not have one flag for each margin."""
+        if len(self.includes_phase_start) != n_margins:
+            raise ValueError(
+                f"includes_phase_start has {len(self.includes_phase_start)} flags, but there are "
+                f"{n_margins} margins: give one flag for each."
+            )
+
+    def compute_margin_minima(
+        self, start_margins: Array, interior_minima: Array, end_margins: Array
+    ) -> Array:
+        """Return the minimum of each margin over a phase: inside it, and at its ends."""
+        margin_minima = jnp.where(jnp.asarray(self.includes_phase_start), start_margins, jnp.inf)
+        return jnp.minimum(jnp.minimum(interior_minima, margin_minima), end_margins)
+
 
 PROBE_TIME_RATIO = 1e-2
 """Time after which a guard at rest is evaluated again, as a fraction of the first solver step.
@@ -183,13 +198,7 @@ def integrate_phase(
         *lax.stop_gradient((start_values[:n_guards], start_rates[:n_guards]))
     )
     evaluate_armed_guards = guards_and_margins.evaluate_armed_guards
-    includes_start = guards_and_margins.includes_phase_start
-    n_margins = len(start_values) - n_guards
-    if len(includes_start) != n_margins:
-        raise ValueError(
-            f"includes_phase_start has {len(includes_start)} flags, but there are {n_margins} "
-            "margins: give one flag for each."
-        )
+    guards_and_margins.require_flag_of_each_margin(len(start_values) - n_guards)
 
     def make_phase(
         field: VectorField, evaluate: EvaluateGuardsAndMargins, sides: tuple = ()
@@ -199,7 +208,7 @@ def integrate_phase(
         phase = phase._replace(
             evaluate_guards=lambda state: evaluate(state.v[0])[:n_all_guards],
             evaluate_margins=lambda state: tuple(evaluate(state.v[0])[n_all_guards:]),
-            margins_include_start=includes_start,
+            margins_include_start=guards_and_margins.includes_phase_start,
             guard_scales=guards_and_margins.guard_scales,
             guards_met_at_start=is_guard_met,
             sides=sides,
@@ -243,9 +252,9 @@ def integrate_phase(
     )
     margin_minima = start_values[n_guards:]
     if search_end.margin_minima_result is not None:
-        margin_minima = jnp.where(jnp.asarray(includes_start), margin_minima, jnp.inf)
-        margin_minima = jnp.minimum(
-            jnp.minimum(search_end.margin_minima_result.interior_margin_minima, margin_minima),
+        margin_minima = guards_and_margins.compute_margin_minima(
+            margin_minima,
+            search_end.margin_minima_result.interior_margin_minima,
             evaluate(end_state)[n_guards:],
         )
     return phase_end._replace(state=end_state, duration=end_time, margin_minima=margin_minima)

@@ -205,6 +205,70 @@ def solve_passage_on_slopes(
     )
 
 
+class _RandomGround(NamedTuple):
+    """Ground of random slopes or heights, as deviations z from the mean in standard deviations."""
+
+    rate_map: Any
+    mean_slope: Scalar
+    ground_sd: Scalar
+    foot_distance: Scalar
+    has_heights: bool
+
+    @property
+    def max_deviation(self) -> float:
+        """Return the largest deviation that the survival operator contains."""
+        return MAX_HEIGHT_DEVIATION if self.has_heights else MAX_SLOPE_DEVIATION
+
+    def find_slope(self, z: Array, next_z: Array) -> Array:
+        """Return the slope of a line, from the standardized deviations of its two ends."""
+        if self.has_heights:
+            return compute_line_slope(
+                self.mean_slope, self.ground_sd * (next_z - z), self.foot_distance
+            )
+        return self.mean_slope + self.ground_sd * next_z
+
+    def find_next_deviation(self, z: Array, slope: Array | float) -> Array:
+        """Return the deviation with which `find_slope` returns the slope."""
+        if self.has_heights:
+            return z + jnp.sin(self.mean_slope - slope) * self.foot_distance / self.ground_sd
+        return (slope - self.mean_slope) / self.ground_sd
+
+    def find_level_rate(self, squared_rate: Array, z: Array) -> Array:
+        """Return the next squared rate if the next foothold is on the mean line.
+
+        After a foothold of any height, the probability of a failure depends on hardly anything
+        else. On random slopes, the squared rate itself has this property.
+        """
+        if not self.has_heights:
+            return squared_rate
+        linear_slope = self.mean_slope + self.ground_sd * z / self.foot_distance
+        return self.rate_map.compute_next_squared_rate(squared_rate, linear_slope)
+
+    def make_deviation_quadrature(
+        self, z: Array, flattest_slope: Array | float
+    ) -> tuple[Array, Array, Array]:
+        """Return nodes and weights of the deviations between a slope and the vertical line, and the
+        probability of all other deviations.
+        """
+        legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(N_DEVIATION_NODES)
+        limits = [
+            jnp.clip(self.find_next_deviation(z, slope), -self.max_deviation, self.max_deviation)
+            for slope in (flattest_slope, 0.5 * np.pi)
+        ]
+        lower, upper = reversed(limits) if self.has_heights else limits
+        next_z = lower + 0.5 * (upper - lower) * (1.0 + legendre_nodes)
+        density = jnp.exp(-0.5 * next_z**2) / np.sqrt(2.0 * np.pi)
+        weights = 0.5 * (upper - lower) * legendre_weights * density
+        return next_z, weights, ndtr(lower) + ndtr(-upper)
+
+    def compute_step_distance(self, z: Array) -> Array:
+        """Return the mean distance to a next foothold that the wheel can reach, m."""
+        steepest_climb = self.mean_slope - 0.5 * np.pi if self.has_heights else -0.5 * np.pi
+        next_z, weights, _ = self.make_deviation_quadrature(z, steepest_climb)
+        line_angles = self.find_slope(z, next_z) - self.mean_slope
+        return self.foot_distance * (weights @ jnp.cos(line_angles)) / jnp.sum(weights)
+
+
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
 def solve_passage_by_interpolation(
     params: WheelParams, ground_sd: Scalar, rigid_model: Any, n_nodes: int, has_heights: bool
@@ -220,36 +284,13 @@ def solve_passage_by_interpolation(
     """
     rate_map, mean_slope = rigid_model.make_vertical_rate_map(params), params.slope
     foot_distance = rigid_model.compute_foot_distance(params, jnp.zeros_like(mean_slope)[None])
+    ground = _RandomGround(rate_map, mean_slope, ground_sd, foot_distance, has_heights)
     n_heights = round(0.5 * n_nodes**0.5) if has_heights else 1
     n_rates = n_nodes // n_heights
-    z_max = MAX_HEIGHT_DEVIATION if has_heights else MAX_SLOPE_DEVIATION
-
-    def find_slope(z: Array, next_z: Array) -> Array:
-        """Return the slope of a line, from the standardized deviations of its two ends."""
-        if has_heights:
-            return compute_line_slope(mean_slope, ground_sd * (next_z - z), foot_distance)
-        return mean_slope + ground_sd * next_z
-
-    def find_next_deviation(z: Array, slope: Array | float) -> Array:
-        """Return the deviation with which `find_slope` returns the slope."""
-        if has_heights:
-            return z + jnp.sin(mean_slope - slope) * foot_distance / ground_sd
-        return (slope - mean_slope) / ground_sd
-
-    def find_level_rate(squared_rate: Array, z: Array) -> Array:
-        """Return the next squared rate if the next foothold is on the mean line.
-
-        After a foothold of any height, the probability of a failure depends on hardly anything
-        else. On random slopes, the squared rate itself has this property.
-        """
-        if not has_heights:
-            return squared_rate
-        linear_slope = mean_slope + ground_sd * z / foot_distance
-        return rate_map.compute_next_squared_rate(squared_rate, linear_slope)
-
+    z_max = ground.max_deviation
     level_rate_limits = [
         rate_map.compute_fixed_point(jnp.minimum(slope, rate_map.slope_of_largest_squared_rate))
-        for slope in map(find_slope, jnp.zeros(2), jnp.array([z_max, -z_max]))
+        for slope in map(ground.find_slope, jnp.zeros(2), jnp.array([z_max, -z_max]))
     ]
     gait_squared_rate = rate_map.compute_fixed_point(mean_slope)
     retained_fraction = rate_map.retained_squared_rate_fraction
@@ -267,32 +308,8 @@ def solve_passage_by_interpolation(
     deviations = jnp.tile(jnp.asarray(z_max * np.cos(height_angles)), n_rates)
     squared_rates = level_rates
     if has_heights:
-        rates_from_rest = find_level_rate(jnp.zeros_like(level_rates), deviations)
+        rates_from_rest = ground.find_level_rate(jnp.zeros_like(level_rates), deviations)
         squared_rates = (level_rates - rates_from_rest) / retained_fraction
-    legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(N_DEVIATION_NODES)
-
-    def make_deviation_quadrature(
-        z: Array, flattest_slope: Array | float
-    ) -> tuple[Array, Array, Array]:
-        """Return nodes and weights of the deviations between a slope and the vertical line, and the
-        probability of all other deviations.
-        """
-        limits = [
-            jnp.clip(find_next_deviation(z, slope), -z_max, z_max)
-            for slope in (flattest_slope, 0.5 * np.pi)
-        ]
-        lower, upper = reversed(limits) if has_heights else limits
-        next_z = lower + 0.5 * (upper - lower) * (1.0 + legendre_nodes)
-        density = jnp.exp(-0.5 * next_z**2) / np.sqrt(2.0 * np.pi)
-        weights = 0.5 * (upper - lower) * legendre_weights * density
-        return next_z, weights, ndtr(lower) + ndtr(-upper)
-
-    def compute_step_distance(z: Array) -> Array:
-        """Return the mean distance to a next foothold that the wheel can reach, m."""
-        steepest_climb = mean_slope - 0.5 * np.pi if has_heights else -0.5 * np.pi
-        next_z, weights, _ = make_deviation_quadrature(z, steepest_climb)
-        line_angles = find_slope(z, next_z) - mean_slope
-        return foot_distance * (weights @ jnp.cos(line_angles)) / jnp.sum(weights)
 
     def evaluate_kernel_row(
         z: Array, flattest_slope: Array, compute_next_squared_rate: Callable[[Array], Array]
@@ -302,9 +319,9 @@ def solve_passage_by_interpolation(
         The arguments are those of a foothold: its deviation, the slope of the next line below which
         the wheel falls back, and the next squared rate for each slope.
         """
-        next_z, weights, failure_probability = make_deviation_quadrature(z, flattest_slope)
-        next_slopes = find_slope(z, next_z)
-        next_level_rates = find_level_rate(compute_next_squared_rate(next_slopes), next_z)
+        next_z, weights, failure_probability = ground.make_deviation_quadrature(z, flattest_slope)
+        next_slopes = ground.find_slope(z, next_z)
+        next_level_rates = ground.find_level_rate(compute_next_squared_rate(next_slopes), next_z)
         rate_basis = _evaluate_chebyshev_basis(
             2.0 * (next_level_rates - lowest) / (highest - lowest) - 1.0, rate_angles
         )
@@ -328,7 +345,7 @@ def solve_passage_by_interpolation(
             lambda slope: landing_rate - rate_map.compute_climb(slope),
         )
     states = jnp.stack([squared_rates, ground_sd * deviations][: 1 + has_heights], 1)
-    step_distances = jax.vmap(compute_step_distance)(deviations)
+    step_distances = jax.vmap(ground.compute_step_distance)(deviations)
     passage = _analyze_passage(*rows, step_distances, start_row, states, 2.0 * ndtr(-z_max))
     return passage._replace(mean_steps_from_gait=passage.mean_steps_from_gait - int(has_heights))
 

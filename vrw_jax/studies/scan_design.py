@@ -469,32 +469,7 @@ def sobol_indices(
         >>> indices.sel(measure="speed").first_order.values.round(1).tolist()
         [0.8, 0.2]
     """
-    check_type("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
-    design = read_scan_manifest(scan.attrs).get("design", {})
-    if design.get("kind") != SALTELLI_DESIGN_KIND:
-        raise ValueError(
-            f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices "
-            "need those of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
-        )
-    if len(design["swept"]) < 2:
-        raise ValueError(
-            f"the scan varies only {design['swept'][0]}, which causes all variance of a measure: "
-            "give vrw.saltelli the ranges of two parameters or more."
-        )
-    measure_names = list(check_names("measures", measures))
-    if not measure_names:
-        raise ValueError('measures is empty, but indices are of a measure: give ["speed"], say.')
-    for name in ("outcome", *measure_names):
-        if name not in scan:
-            raise ValueError(
-                f"{name!r} is no measure of this scan{format_name_suggestion(name, map(str, scan))}"
-                ": ask for one that was scanned."
-            )
-        if scan[name].dims != ("sample",):
-            raise ValueError(
-                f"{name!r} has the axes {', '.join(map(str, scan[name].dims))}, but indices need "
-                'one value per sample: reduce it, as by scan.min("leg", keep_attrs=True).'
-            )
+    design, measure_names = _check_index_arguments(scan, measures)
     positions = _locate_design_samples(scan, design["swept"], design["shape"][0])
     is_present = positions >= 0
     has_gait = is_present & (scan.outcome.values[positions] == Outcome.STEPPED)
@@ -531,6 +506,39 @@ def sobol_indices(
         {"measure": measure_names, "parameter": design["swept"]},
         {"rows": n_rows, "left_out": 1.0 - len(complete_rows) / len(is_complete)},
     )
+
+
+def _check_index_arguments(
+    scan: xr.Dataset, measures: Iterable[str]
+) -> tuple[JsonObject, list[str]]:
+    """Return the design of a scan and the names of measures of which it has Sobol' indices."""
+    check_type("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
+    design = read_scan_manifest(scan.attrs).get("design", {})
+    if design.get("kind") != SALTELLI_DESIGN_KIND:
+        raise ValueError(
+            f"the scan's samples are of kind {design.get('kind')!r}, but Sobol' indices "
+            "need those of vrw.saltelli({...}, n), or of a table [saltelli]: scan these."
+        )
+    if len(design["swept"]) < 2:
+        raise ValueError(
+            f"the scan varies only {design['swept'][0]}, which causes all variance of a measure: "
+            "give vrw.saltelli the ranges of two parameters or more."
+        )
+    measure_names = list(check_names("measures", measures))
+    if not measure_names:
+        raise ValueError('measures is empty, but indices are of a measure: give ["speed"], say.')
+    for name in ("outcome", *measure_names):
+        if name not in scan:
+            raise ValueError(
+                f"{name!r} is no measure of this scan{format_name_suggestion(name, map(str, scan))}"
+                ": ask for one that was scanned."
+            )
+        if scan[name].dims != ("sample",):
+            raise ValueError(
+                f"{name!r} has the axes {', '.join(map(str, scan[name].dims))}, but indices need "
+                'one value per sample: reduce it, as by scan.min("leg", keep_attrs=True).'
+            )
+    return design, measure_names
 
 
 def _compute_index_variables(values: np.ndarray) -> dict[str, tuple]:
