@@ -202,49 +202,6 @@ def summarize_by_border(rows: list[Row]) -> list[Row]:
     return table_rows
 
 
-LARGEST_SHOWN_DISTANCE = 1e-6
-"""Largest relative distance from a border in the table, because no outcome differs beyond it."""
-
-
-def corners(rows: list[Row]) -> str:
-    """Other outcomes of the lane engine, and of the diffrax engine, by border and distance."""
-    result = summarize_by_border(rows)
-    distances = [
-        distance
-        for distance in dict.fromkeys(row["distance"] for row in result)
-        if float(distance) <= LARGEST_SHOWN_DISTANCE
-    ]
-    lines = [
-        (
-            border.replace(" | ", " / "),
-            rows_of_group[0]["cases"],
-            *(row["other_outcome"] for row in rows_of_group if row["distance"] in distances),
-        )
-        for border, rows_of_group in group_rows(result, "border").items()
-    ]
-    return format_markdown(("border", "cases", *distances), lines)
-
-
-def limits(rows: list[Row]) -> str:
-    """Write a table of the behavior near each limit, with the values at which it changes."""
-    lines = []
-    for limit, rows_of_group in group_rows(rows, "limit").items():
-        result: list[str] = []
-        for i, row in enumerate(rows_of_group):
-            if i == 0 or row["outcome"] != rows_of_group[i - 1]["outcome"]:
-                result.append(f"from {row['value']}: {row['outcome']}")
-        is_same = sum(row["outcome"] == row["isolated"] for row in rows_of_group)
-        cells = (
-            limit,
-            "; ".join(result),
-            f"{is_same} of {len(rows_of_group)}",
-            f"{max(read_column(rows_of_group, 'time_difference_s')):.0e} s",
-        )
-        lines.append(cells)
-    header = ("limit", "outcomes by value", "as isolated", "times differ by")
-    return format_markdown(header, lines)
-
-
 def first_order(rows: list[Row]) -> Figure:
     """Error and cost of a leg of first order over c/m."""
     figure = Figure(figsize=(PAGE_FIGURE_WIDTH_INCHES, 2.8))
@@ -487,8 +444,6 @@ def draw(
         "switch": ("stiffness", automatic),
         "events": ("events", lambda rows: as_table(events(rows))),
         "dips": ("dips", lambda rows: as_table(dips(rows))),
-        "between": ("between", corners),
-        "limits": ("limits", limits),
         "long_walk": (
             "long_walk",
             lambda rows: as_table(

@@ -29,6 +29,7 @@ from experiments.shared.tables import (
     read_table,
     replace_block,
     write_named_rows,
+    write_table,
 )
 from experiments.shared.timing import start_without_cache, use_one_core
 from vrw_jax.plot import PAGE_FIGURE_WIDTH_INCHES as WIDE
@@ -109,9 +110,10 @@ def select_exact_rows(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 
 def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()) -> None:
-    """Write the table of results and that of origins, with a line for each case.
+    """Write the table of results and the file of origins, with a line for each case.
 
-    If several cases were measured now, both get a new line of command, commit, machine and date.
+    If several cases were measured now, the table gets a new line of command, commit, machine and
+    date.
     """
     results, origins = [], []
     for name, selection in group_rows(rows, "case").items():
@@ -125,12 +127,11 @@ def format_page(rows: list[dict[str, str]], measured_names: Collection[str] = ()
         ]
         link = f"[{case.title}]({PROBLEMS.name}#{anchor(case.title)})"
         results.append([link, *method_cells, f"{max(errors):.0e}" if errors else "-"])
-        origins.append([f"[{case.title}](#{anchor(case.title)})", case.reference, case.source])
+        origins.append([case.title, case.reference, case.source])
     header = ["problem", *VERDICT_LABELS.values(), "error of vrw_jax over condition"]
     source = describe_run("experiments.atlas.failures") if len(measured_names) > 1 else None
     replace_block(OVERVIEW, "failures", format_markdown(header, results), source)
-    header = ["problem", "reference", "origin"]
-    replace_block(PROBLEMS, "origins of failures", format_markdown(header, origins), source)
+    write_table(FIGURES / "atlas_failure_origins.csv", ["problem", "reference", "origin"], origins)
 
 
 def draw(name: str, rows: list[dict[str, str]]) -> None:

@@ -16,12 +16,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from scipy.interpolate import make_interp_spline
 
 import vrw_jax as vrw
 from experiments.gaits.force_peak_borders import (
     BISECTION_TABLE,
-    CURVE_TABLE,
     MAP_TABLE,
     compute_borders,
 )
@@ -120,11 +118,6 @@ def compute_maps() -> None:
     write_named_rows(MAP_TABLE, [{name: row.get(name, "") for name in header} for row in rows])
 
 
-def select_gaits(rows: list[Row], panel: tuple[str, str]) -> list[Row]:
-    """Return the gaits of one map, given by the text of its damping ratio and natural length."""
-    return [row for row in rows if row["n_force_peaks"] and get_panel(row) == panel]
-
-
 def get_panel(row: Row) -> tuple[str, str]:
     """Return the damping ratio and natural length of the map to which a wheel belongs."""
     return row["damping_ratio"], row["natural_length"]
@@ -177,23 +170,6 @@ def summarize_comparisons() -> str:
     return format_markdown(header, lines)
 
 
-def summarize_curve() -> str:
-    """Return a table in Markdown: the curve of special points beside the border by bisection."""
-    curve = read_table(CURVE_TABLE)
-    stiffness, slope = (read_column(curve, name) for name in ("stiffness_number", "slope"))
-    order = np.argsort(stiffness)
-    interpolate = make_interp_spline(stiffness[order], slope[order], 3)
-    bisected = [row for row in select_borders("1")
-                if stiffness.min() < float(row["stiffness_number"]) < stiffness.max()]  # fmt: skip
-    difference = interpolate(read_column(bisected, "stiffness_number")) - read_column(
-        bisected, "slope"
-    )
-    header = ("k L0 / (M g)", "slope, rad", "bisected wheels", "largest difference of slopes, rad")
-    line = [describe_range(curve, "stiffness_number"), describe_range(curve, "slope"),
-            len(bisected), f"{np.abs(difference).max():.0e}"]  # fmt: skip
-    return format_markdown(header, [line])
-
-
 def select_borders(natural_length: str) -> list[Row]:
     """Return the bisected wheels with this natural length, m."""
     return [row for row in read_table(BISECTION_TABLE) if row["natural_length"] == natural_length]
@@ -202,23 +178,6 @@ def select_borders(natural_length: str) -> list[Row]:
 def is_cut_off(row: Row) -> bool:
     """Return whether the second peak of a border is lost at a touchdown, with a deep trough."""
     return float(row["trough_to_peak"]) > LEAST_RELATIVE_TROUGH
-
-
-def summarize_bisections() -> str:
-    """Return a table in Markdown: one line per kind of border."""
-    borders, lines = read_table(BISECTION_TABLE), []
-    for label, group in (
-        ("meets the trough", [row for row in borders if not is_cut_off(row)]),
-        ("touchdown at the peak", [row for row in borders if is_cut_off(row)]),
-    ):
-        lines.append([
-            label, len(group),
-            *(describe_range(group, name) for name in ("stiffness_number", "slope",
-              "first_peak_to_touchdown")),
-        ])  # fmt: skip
-    header = ("end of the second peak", "wheels", "k L0 / (M g)", "slope, rad",
-              "first peak to touchdown")  # fmt: skip
-    return format_markdown(header, lines)
 
 
 def describe_range(rows: list[Row], name: str) -> str:
@@ -290,8 +249,6 @@ def main() -> None:
     run = describe_run("experiments.gaits.force_peaks")
     blocks = {
         "force_peaks": ("maps", summarize_maps(read_table(MAP_TABLE))),
-        "force_peak_curve": ("borders", summarize_curve()),
-        "force_peak_bisections": ("borders", summarize_bisections()),
         "force_peak_comparisons": ("comparisons", summarize_comparisons()),
     }
     for block, (part, text) in blocks.items():

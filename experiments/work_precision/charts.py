@@ -271,34 +271,6 @@ def table(rows: list[Row]) -> str:
     return format_markdown(header, lines)
 
 
-def on_the_front(rows: list[Row]) -> str:
-    """Return the distance of the defaults from the fastest method that is at least as accurate."""
-    unit = unit_of(rows)
-    lines = []
-    for row in rows:
-        if not is_default(row) or row["lanes"] == "1":
-            continue
-        for quantity, (group, _) in QUANTITIES.items():
-            if group != row["group"]:
-                continue
-            error = float(row[f"{quantity}_p99"])
-            selected_rows = [
-                r
-                for r in rows
-                if r["family"] not in (*SCALAR, "diffrax by hand")
-                and r["group"] == group
-                and r["lanes"] != "1"
-                and int(r["failed"]) == 0
-                and float(r[f"{quantity}_p99"] or "inf") <= error
-            ]
-            ratio = time_of(row, unit) / min(time_of(r, unit) for r in selected_rows)
-            default = f"{label_of(row)}, {row['setting']}"
-            costs = f"{error:.1e}", format_time(time_of(row, unit)), f"{ratio:.2g}"
-            lines.append((default, QUANTITIES[quantity][1], *costs))
-    header = ("default", "quantity", "p99 error", "per gait", "ratio")
-    return format_markdown(header, lines)
-
-
 def floors(rows: list[Row]) -> str:
     """Return the least p99 error of each quantity by number format, and its method."""
     lines = []
@@ -393,5 +365,4 @@ def draw(rows: list[Row], batches: list[Row], source: str | None = None) -> None
     write_page(rows, FIGURES / "work_precision.html", works(unit))
     page = DOCS / "benchmarks" / "work_precision.md"
     replace_block(page, "what to use", table(rows), source)
-    replace_block(page, "defaults", on_the_front(rows), source)
     replace_block(page, "floors", floors(rows), source)
