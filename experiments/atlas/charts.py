@@ -388,25 +388,20 @@ def automatic(rows: list[Row]) -> str:
 
 
 def events(rows: list[Row]) -> list[Row]:
-    """Count the cases by kind over all chunks."""
-    table_rows = []
-    for kind, rows_of_group in group_rows(rows, "kind").items():
-        pairs: dict[str, int] = {}
-        for part in filter(
-            None, "; ".join(row["ours/isolated"] for row in rows_of_group).split("; ")
-        ):
-            pair, count = part.split(": ")
-            pairs[pair] = pairs.get(pair, 0) + int(count)
-        counts = ("cases", "stepped", "other_outcome", "late")
-        table_rows.append(
-            {"kind": kind}
-            | {name: str(sum(int(row[name]) for row in rows_of_group)) for name in counts}
-            | {
-                "largest_time_difference": f"{max(read_column(rows_of_group, 'largest_time_difference')):.2e}"  # noqa: E501
-            }
-            | {"ours/isolated": "; ".join(f"{pair}: {n}" for pair, n in sorted(pairs.items()))}
-        )
-    return table_rows
+    """Count the cases by kind over all chunks, and those in which our solver gave up."""
+    counts = ("cases", "stepped", "late", "other_outcome")
+    gave_up = re.compile(r"SOLVER_FAILED/\w+: (\d+)")
+    return [
+        {"kind": kind}
+        | {name: str(sum(int(row[name]) for row in rows_of_group)) for name in counts}
+        | {
+            "of_them_gave_up": str(
+                sum(int(n) for row in rows_of_group for n in gave_up.findall(row["ours/isolated"]))
+            ),
+            "largest_time_difference": f"{max(read_column(rows_of_group, 'largest_time_difference')):.2e}",  # noqa: E501
+        }
+        for kind, rows_of_group in group_rows(rows, "kind").items()
+    ]
 
 
 def dips(rows: list[Row]) -> list[Row]:
