@@ -191,15 +191,39 @@ def test_a_pitchfork_is_met_along_its_side_branch():
     np.testing.assert_allclose(branch.dataset.x[:, 0] ** 2, branch.values, atol=1e-9)
 
 
-@pytest.mark.parametrize("tolerance", [1e-10, 1e-12])
-def test_a_crossing_of_two_branches_is_located_between_the_points_that_are_found(tolerance):
-    """x = sin p crosses another branch at p = 0.4321, next to which Newton's method fails."""
-    cross = lambda _, x, p: x + 0.1 * (x - jnp.sin(p)) * (p - 0.4321 - 0.3 * (x - jnp.sin(p)))
+def cross(_, x, p):
+    """x = sin p crosses x = sin p + (p - 0.4321) / 0.3."""
+    offset = x - jnp.sin(p)
+    return x + 0.1 * offset * (p - 0.4321 - 0.3 * offset)
+
+
+def cross_at_a_small_angle(_, x, p):
+    """x = sin p crosses another branch, whose slope differs by a twentieth of exp 0.4321."""
+    offset = x - jnp.sin(p)
+    return x + 0.3 * offset * (offset - 0.05 * (p - 0.4321) * jnp.exp(p))
+
+
+def fork(_, x, p):
+    """x = (p, 0) meets the parabola (x[0] - p)² = p - 0.4321, but for the second entry."""
+    offset = x[0] - p
+    first = x[0] + offset * (p - 0.4321 - offset**2 + 0.2 * x[1])
+    return jnp.stack([first, 0.5 * x[1] + 0.3 * offset])
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-8, 1e-10, 1e-11, 1e-12])
+@pytest.mark.parametrize(
+    ("function", "start"),
+    [(cross, [np.sin(0.1)]), (cross_at_a_small_angle, [np.sin(0.1)]), (fork, [0.1, 0.0])],
+)
+def test_a_branch_crosses_another_one_at_every_tolerance(function, start, tolerance):
+    """Next to the crossing, Newton's method amplifies round-off above the smaller tolerances."""
     options = vrw.ArclengthOptions(tolerance=tolerance)
-    branch = vrw.continue_map(cross, [np.sin(0.1)], 0.1, (0.0, 1.0), options=options)
+    branch = vrw.continue_map(function, start, 0.1, (0.0, 1.0), options=options)
     (border,) = branch.special_points
     assert border.kind == "branch_point"
     assert abs(border.value - 0.4321) < LOCATION_TOLERANCE
+    known = branch.values if function is fork else np.sin(branch.values)
+    np.testing.assert_allclose(branch.dataset.x[:, 0], known, atol=10.0 * tolerance)
 
 
 @pytest.mark.parametrize("p", [0.8661, 0.87, -0.86])

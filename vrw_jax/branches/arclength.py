@@ -357,6 +357,12 @@ class Correction(NamedTuple):
 MAX_RANGE_EXCESS = 1e-12
 """Largest round-off of the parameter beyond its bounds, as a fraction of its range."""
 
+SUSPICIOUS_STEP_TOLERANCE = 1e-10
+"""Tolerance of the points up to a suspicious one. The value is chosen because Newton's method may
+turn onto a crossing branch at a distance of some thousand tolerances, and does not reach smaller
+ones there.
+"""
+
 Plane = tuple[np.ndarray, np.ndarray]
 """Plane across a branch: one of its points and its normal, in the coordinates of arc length."""
 PointRequests = Generator[tuple[Unknowns, float], NewtonStep, Any]
@@ -413,6 +419,11 @@ class ArclengthDriver:
     def parameter_range(self) -> float:
         """Return the difference between the bounds."""
         return self.parameter_bounds[1] - self.parameter_bounds[0]
+
+    def with_tolerance(self, tolerance: float) -> Any:
+        """Return the driver with another tolerance."""
+        options = dataclasses.replace(self.options, tolerance=tolerance)
+        return dataclasses.replace(self, options=options)
 
     def compute_fraction(self, p: Any) -> Any:
         """Return the parameter as a fraction of its range."""
@@ -590,8 +601,9 @@ class ArclengthDriver:
         points = [self.make_point(args, correction, direction_sign * along_parameter, fraction)]
         previous, ds, is_range_end, takes_other_plane = points[0], options.initial_ds, False, False
         # A suspicious step may have reached another branch; shorter steps then avoid the jump. If
-        # they do not, the next step is accepted with any multipliers.
-        suspicious_ds, accepts_any_multipliers, is_point_new = 0.0, False, True
+        # they stall within its length, as at a crossing, its point is accepted.
+        suspicious, length_to_suspicious, is_point_new = None, 0.0, True
+        near_crossing = self.with_tolerance(SUSPICIOUS_STEP_TOLERANCE)
         while True:
             trial_z, trial_fraction, plane, length_to_end, is_next_range_end = self.predict(
                 previous, points[-1], ds, takes_other_plane
@@ -602,9 +614,15 @@ class ArclengthDriver:
                     points[-1] = points[0]
                 return Track(points, status)
             if ds < options.min_ds:
-                return Track(points, ContinuationStatus.STEP_SIZE_UNDERFLOW)
+                if suspicious is None:
+                    return Track(points, ContinuationStatus.STEP_SIZE_UNDERFLOW)
+                previous, ds, is_range_end = suspicious
+                points.append(previous)
+                suspicious, takes_other_plane, is_point_new = None, False, True
+                continue
             is_range_end = is_next_range_end
-            correction = yield from self.correct(trial_z, trial_fraction, plane, ds)
+            driver = self if suspicious is None else near_crossing
+            correction = yield from driver.correct(trial_z, trial_fraction, plane, ds)
             current = points[-1]
             tangent = self.coordinates(current.arclength_tangent, current.fraction_rate)
             new_tangent = self.coordinates(correction.fraction_tangent, 1.0)
@@ -622,14 +640,13 @@ class ArclengthDriver:
             is_point_new = (correction.has_converged and is_within) and (
                 not is_kink or (self.problem.has_kinks and is_short)
             )
-            is_suspicious, trial_ds = False, ds
+            is_suspicious = False
             if is_point_new:
                 point = self.make_point(
                     args, correction, tangent, trial_fraction if is_range_end else None
                 )
                 is_suspicious = bool(
                     self.problem.has_multipliers
-                    and not accepts_any_multipliers
                     and point.is_admissible
                     and not is_multiplier_change_explained(
                         current.return_map_jacobian,
@@ -638,7 +655,12 @@ class ArclengthDriver:
                     )
                 )
             is_point_new &= not is_suspicious
+            if is_suspicious and suspicious is None:
+                suspicious, length_to_suspicious = (point, ds, is_range_end), ds
             if is_point_new:
+                length_to_suspicious -= ds
+                if length_to_suspicious <= 0.0:
+                    suspicious = None
                 # The cubic prediction must not cross a kink.
                 previous, takes_other_plane = point if is_kink else current, False
                 points.append(point)
@@ -647,14 +669,3 @@ class ArclengthDriver:
                 ds = min(ds * growth, options.max_ds)
             elif not takes_other_plane:
                 ds *= 0.5
-            if is_suspicious and suspicious_ds == 0.0:
-                suspicious_ds = trial_ds
-            has_no_shorter_step = not accepts_any_multipliers and ds < options.min_ds
-            has_no_shorter_step = has_no_shorter_step and suspicious_ds > 0.0
-            if has_no_shorter_step:
-                ds = suspicious_ds
-            if is_point_new and (accepts_any_multipliers or ds >= suspicious_ds):
-                suspicious_ds = 0.0
-            accepts_any_multipliers = not is_point_new and (
-                accepts_any_multipliers or has_no_shorter_step
-            )

@@ -171,10 +171,14 @@ MIN_BRACKET_FRACTION = 1e-6
 # Fractions of the chord up to an ill-conditioned root, at which the point next to the root is
 # computed again.
 RETRY_CHORD_FRACTIONS = (0.99, 0.9)
-# Offsets of the inner points, as fractions of a chord, between which a crossing of two branches is
-# interpolated. They grow until all points are found. The first is chosen because the error of a
-# cubic polynomial is then below round-off.
-CROSSING_OFFSETS = (1e-3, 1e-2, 1e-1, 3e-1)
+# Arc lengths between the six points from which a crossing of two branches is interpolated. Next to
+# the crossing, Newton's method amplifies round-off or fails. The first length is chosen because it
+# keeps the errors of round-off and interpolation below 1e-9. The second is for crossings that are
+# nearer to another special point.
+CROSSING_DISTANCES = (1e-2, 1e-3)
+# Tolerance of these points. The value is above their amplified round-off, to which two converged
+# Newton iterations reduce their errors.
+CROSSING_TOLERANCE = 1e-8
 # Largest absolute value of a margin to the fold whose sign is only round-off. The value is chosen
 # above the round-off of a determinant of numbers of order one, which is 1e-15. Points so near to a
 # branch point are rare.
@@ -249,9 +253,13 @@ class _SpecialPointLocator(NamedTuple):
             for i, p in enumerate(end.points.p)
         }
 
-        def solve(fractions: np.ndarray, indices: np.ndarray) -> PointTable:
+        def solve(
+            fractions: np.ndarray,
+            indices: np.ndarray,
+            tolerance: float = self.continuation.options.tolerance,
+        ) -> PointTable:
             left_points, right_points = select_tree_rows((left.points, right.points), indices)
-            points, is_found = self.continuation.solve_on_chords(
+            points, is_found = self.continuation.with_tolerance(tolerance).solve_on_chords(
                 left.owners[indices], left_points, right_points, fractions
             )
             parameters.update(zip(zip(indices, fractions, strict=True), points.p, strict=True))
@@ -284,24 +292,27 @@ class _SpecialPointLocator(NamedTuple):
                 beside = replace_rows(beside, failed, retried)
         roots = np.array([parameters[i, x] for i, x in enumerate(fractions)])
         crossings = np.array([i for i in every if requests[i].name == BRANCH_POINT], int)
-        for offset in CROSSING_OFFSETS:
-            # Next to a crossing of two branches no point is found, or only an inaccurate one.
+        section_state = self.continuation.problem.section_state
+        state_chords = section_state(right.points.z) - section_state(left.points.z)
+        parameter_chords = (right.points.p - left.points.p) / self.continuation.parameter_range
+        chords = np.hypot(np.linalg.norm(state_chords, axis=1), parameter_chords)
+        for distance in CROSSING_DISTANCES:
             if not len(crossings):
                 break
-            nodes = fractions[crossings, None] + offset * np.array([-3.0, -1.0, 1.0, 3.0])
-            indices = np.repeat(crossings, 4)
-            table = solve(nodes.ravel(), indices)
-            values, p = evaluate(table, indices).reshape(-1, 4), table.points.p.reshape(-1, 4)
-            is_monotonic = np.abs(np.sum(np.sign(np.diff(values)), -1)) == 3.0
-            has_sign_change = np.prod(values[:, 1:3], -1) < 0.0
-            for row in np.flatnonzero(is_monotonic & has_sign_change):
+            offsets = distance * np.arange(-2.5, 3.0)
+            nodes = fractions[crossings, None] + offsets / chords[crossings, None]
+            indices = np.repeat(crossings, len(offsets))
+            table = solve(nodes.ravel(), indices, CROSSING_TOLERANCE)
+            values, p = (x.reshape(nodes.shape) for x in (evaluate(table, indices), table.points.p))
+            is_monotonic = np.abs(np.sum(np.sign(np.diff(values)), -1)) == len(offsets) - 1
+            is_found = is_monotonic & (np.prod(values[:, 2:4], -1) < 0.0)
+            for row in np.flatnonzero(is_found):
                 scaled_values, i = values[row] / np.ptp(values[row]), crossings[row]
-                # The location and the parameter are cubic polynomials of the value.
-                fit = np.polyfit(scaled_values, np.stack([nodes[row], p[row] - p[row, 0]], -1), 3)
-                location, parameter = fit[-1] + [0.0, p[row, 0]]
-                if nodes[row, 1] <= location <= nodes[row, 2]:
-                    fractions[i], roots[i] = location, parameter
-            crossings = crossings[~(is_monotonic & has_sign_change)]
+                # The location and the parameter are polynomials of the value.
+                data = np.stack([nodes[row], p[row] - p[row, 0]], -1)
+                fit = np.polyfit(scaled_values, data, len(offsets) - 1)
+                fractions[i], roots[i] = fit[-1] + [0.0, p[row, 0]]
+            crossings = crossings[~is_found]
         return [
             request._replace(
                 parameter=float(roots[i]),
@@ -459,7 +470,9 @@ class _SpecialPointLocator(NamedTuple):
         requests += [
             Root.of_test(pair, BRANCH_POINT, BRANCH_POINT)
             for pair in regular_pairs
-            if has_turned[pair] and np.prod(tests[FOLD][list(pair)]) > 0.0
+            if has_turned[pair]
+            and self.continuation.problem.has_multipliers
+            and np.prod(tests[FOLD][list(pair)]) > 0.0
         ]
         # The sum is NaN where the quantity is.
         compare = lambda name, value: (
