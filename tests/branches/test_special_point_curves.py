@@ -104,6 +104,34 @@ def test_bifurcations_of_henon_are_on_their_parabolas(name, factor):
     np.testing.assert_allclose(margins, {"period_doubling": 0.0, "fold": 1e-6}[name], atol=1e-8)
 
 
+class FoldAndDoubling(vrw.AbstractWalker):
+    """x has a fold at a = 0, and y doubles its period where b = x."""
+
+    def advance(self, params, x, options):
+        x, y = x
+        end = jnp.stack([x + params["a"] - x**2, (x - 1.0 - params["b"]) * y])
+        return vrw.AdvanceResult(end, jnp.ones(1))
+
+
+@pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])
+def test_a_curve_meets_a_fold_whichever_parameter_turns_back_there(names):
+    """The fixed point is x = sqrt(a), so that the curve is the parabola a = b²."""
+    params, walker = {"a": 0.25, "b": 0.6}, FoldAndDoubling()
+    gait = vrw.limit_cycle(params, model=walker, guess=[0.5, 0.0])
+    bounds = {"a": (-1.0, 1.0), "b": (-0.8, 0.8)}
+    curve = vrw.continue_special_point(
+        "period_doubling", names, gait, model=walker, params=params, bounds=bounds
+    )
+    values = dict(zip(names, curve.values.T, strict=True))
+    np.testing.assert_allclose(values["a"], values["b"] ** 2, atol=1e-9)
+    (fold,) = curve.codim2_points
+    assert fold.name == "fold"
+    # The fold is the minimum of a parabola, where 1e-9 of a is 3e-5 of b.
+    assert dict(zip(names, fold.values, strict=True)) == pytest.approx(
+        {"a": 0.0, "b": 0.0}, abs=3e-5
+    )
+
+
 class HenonWithInvariant(vrw.AbstractWalker):
     """Hénon's map with a + c, where c = z + x² is conserved."""
 

@@ -573,6 +573,8 @@ class _SpecialPointLocator(NamedTuple):
         continuation, problem = self.continuation, self.continuation.problem
         if name == ADMISSIBILITY:
             name = continuation.name_branch_end(self.table.quantities, root.pair[1])
+        if name == BRANCH_POINT and not problem.has_multipliers:
+            name = FOLD  # A curve of special points may meet a fold without turning back.
         test = continuation.find_test_function(name)
         kinds = {BRANCH_POINT, *(test.kind for test in problem.test_functions.values())}
         return SpecialPoint(

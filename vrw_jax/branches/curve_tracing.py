@@ -17,7 +17,7 @@ import numpy as np
 from vrw_jax.base.options import StepOptions
 from vrw_jax.base.results import xarray as xr
 from vrw_jax.branches.arclength import ArclengthOptions
-from vrw_jax.branches.branch import BIFURCATIONS, BRANCH_POINT, FOLD, Codim2Point, SpecialPointCurve
+from vrw_jax.branches.branch import BIFURCATIONS, Codim2Point, SpecialPointCurve
 from vrw_jax.branches.branch_continuation import Continuation
 from vrw_jax.branches.branch_location import BranchData, continue_and_locate_special_points
 from vrw_jax.branches.continuation import MAX_BRANCH_MESH_REFINEMENTS, continue_branches
@@ -397,12 +397,9 @@ def choose_continued_special_point_name(
 ) -> str:
     """Return the name under which a special point of a gait is continued as a curve.
 
-    A branch point is continued as a fold. In gaits with double support, special points of the rear
-    foot's force are continued as `DLS_VANISHING_NAME` or "lambda_4_plus".
+    In gaits with double support, special points of the rear foot's force are continued as
+    `DLS_VANISHING_NAME` or "lambda_4_plus".
     """
-    # A curve of folds may continue in one direction at its special points.
-    if special_point_name == BRANCH_POINT:
-        return FOLD
     ends_by_rear_force = special_point_name in ("lambda_4_plus", DLS_VANISHING_NAME)
     has_double_support = branch_wheel.is_phase_active[0, 0] >= 0.5
     if has_double_support and ends_by_rear_force and z.durations[0, 0] < MAX_ZERO_DLS_DURATION_S:
