@@ -29,10 +29,9 @@ from vrw_jax.base.small_matrices import (
 
 
 class TestFunction(NamedTuple):
-    """What it means that a quantity of a branch vanishes or changes, and what follows.
+    """What follows where a quantity of a branch vanishes or changes.
 
     - `kind`: kind of the `SpecialPoint`;
-    - `meaning`: what happens there;
     - `ends_branch`: whether the branch ends, because the order of events changes;
     - `is_stepwise`: whether the quantity has integer values, of which each change is located;
     - `explains`: kind of a change that is not reported where this quantity vanishes;
@@ -40,7 +39,6 @@ class TestFunction(NamedTuple):
     """
 
     kind: str
-    meaning: str
     ends_branch: bool = False
     is_stepwise: bool = False
     explains: str = ""
@@ -51,13 +49,9 @@ FOLD, BRANCH_POINT, PERIOD_DOUBLING, NEIMARK_SACKER = (
     "fold", "branch_point", "period_doubling", "neimark_sacker",
 )  # fmt: skip
 BIFURCATIONS: Mapping[str, TestFunction] = {
-    FOLD: TestFunction(FOLD, "The branch turns back, or crosses another one.", n_multipliers=1),
-    PERIOD_DOUBLING: TestFunction(
-        PERIOD_DOUBLING, "A branch of twice the period begins.", n_multipliers=1
-    ),
-    NEIMARK_SACKER: TestFunction(
-        NEIMARK_SACKER, "A closed curve of states begins.", n_multipliers=2
-    ),
+    FOLD: TestFunction(FOLD, n_multipliers=1),
+    PERIOD_DOUBLING: TestFunction(PERIOD_DOUBLING, n_multipliers=1),
+    NEIMARK_SACKER: TestFunction(NEIMARK_SACKER, n_multipliers=2),
 }
 """Bifurcations by name."""
 

@@ -77,22 +77,14 @@ disappears, at an event or inside a phase.
 
 GAIT_TEST_FUNCTIONS: Mapping[str, TestFunction] = {
     **BIFURCATIONS,
-    **{name: TestFunction("lost", "A phase vanishes.", True) for name in BRANCH_ENDING_QUANTITIES},
-    FRICTION_SURPLUS: TestFunction("lost", "No contact carries the weight along the slope.", True),
-    **{
-        name: TestFunction(BORDER_COLLISION, MEASURES[name].description) for name in MARGIN_MEASURES
-    },
-    **{
-        name: TestFunction(BORDER_COLLISION, "A landing without double support begins.", True)
-        for name in DOUBLE_SUPPORT_INDICATOR_NAMES
-    },
-    SECOND_PEAK_RATE_NAME: TestFunction(
-        BORDER_COLLISION, "A force peak appears inside a phase.", explains=FORCE_PEAK_COUNT_CHANGE
+    **dict.fromkeys((*PHASE_DURATIONS, FRICTION_SURPLUS), TestFunction("lost", ends_branch=True)),
+    **dict.fromkeys(MARGIN_MEASURES, TestFunction(BORDER_COLLISION)),
+    **dict.fromkeys(
+        DOUBLE_SUPPORT_INDICATOR_NAMES, TestFunction(BORDER_COLLISION, ends_branch=True)
     ),
-    EVENT_ORDER: TestFunction(EVENT_ORDER_CHANGE, "Events change their order.", is_stepwise=True),
-    FORCE_PEAK_COUNT: TestFunction(
-        FORCE_PEAK_COUNT_CHANGE, "A force peak appears or disappears.", is_stepwise=True
-    ),
+    SECOND_PEAK_RATE_NAME: TestFunction(BORDER_COLLISION, explains=FORCE_PEAK_COUNT_CHANGE),
+    EVENT_ORDER: TestFunction(EVENT_ORDER_CHANGE, is_stepwise=True),
+    FORCE_PEAK_COUNT: TestFunction(FORCE_PEAK_COUNT_CHANGE, is_stepwise=True),
 }
 """Test functions of gaits by name."""
 

@@ -272,8 +272,7 @@ class GaitCurveProblem(AbstractCurveProblem):
 
     @property
     def test_functions(self) -> Mapping[str, TestFunction]:  # type: ignore[override]
-        edge = TestFunction("lost", "The second parameter's range ends.", True)
-        return {**self.gaits.test_functions, RANGE_EDGE: edge}
+        return {**self.gaits.test_functions, RANGE_EDGE: TestFunction("lost", ends_branch=True)}
 
     def describe_branch_end(self, end_name: str, parameter_value: float) -> str:
         if end_name == RANGE_EDGE:
@@ -374,7 +373,8 @@ class CollocationCurveProblem(GaitCurveProblem):
 
     @property
     def test_functions(self) -> Mapping[str, TestFunction]:  # type: ignore[override]
-        force_fall = TestFunction("lost", "The force begins to rise.", True)
+        # The force begins to rise at the end of the curve.
+        force_fall = TestFunction("lost", ends_branch=True)
         return {**super().test_functions, INITIAL_FORCE_FALL_NAME: force_fall}
 
     def measure(self, wheels: CurveWheel, points: ContinuationPoint) -> QuantitiesByName:

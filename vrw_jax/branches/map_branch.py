@@ -363,13 +363,8 @@ class WalkerProblem(ReturnMapProblem):
     def test_functions(self) -> dict[str, TestFunction]:  # type: ignore[override]
         return {
             **BIFURCATIONS,
-            EVENT_ORDER: TestFunction(
-                "order_of_events_changes", "Events change their order.", is_stepwise=True
-            ),
-            **{
-                margin.name: TestFunction(BORDER_COLLISION, "A margin vanishes.")
-                for margin in self.margins
-            },
+            EVENT_ORDER: TestFunction("order_of_events_changes", is_stepwise=True),
+            **{margin.name: TestFunction(BORDER_COLLISION) for margin in self.margins},
         }
 
     def make_point_reader(self, wheel: BranchWheel, point: ContinuationPoint) -> Callable:
