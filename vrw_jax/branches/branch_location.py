@@ -247,12 +247,6 @@ class _SpecialPointLocator(NamedTuple):
             for indices in np.array([request.pair for request in requests]).T
         )
         every = np.arange(len(requests))
-        parameters = {
-            (i, fraction): p
-            for fraction, end in ((0.0, left), (1.0, right))
-            for i, p in enumerate(end.points.p)
-        }
-
         def solve(
             fractions: np.ndarray,
             indices: np.ndarray,
@@ -262,7 +256,6 @@ class _SpecialPointLocator(NamedTuple):
             points, is_found = self.continuation.with_tolerance(tolerance).solve_on_chords(
                 left.owners[indices], left_points, right_points, fractions
             )
-            parameters.update(zip(zip(indices, fractions, strict=True), points.p, strict=True))
             points = points._replace(is_admissible=points.is_admissible & is_found)
             table = self.continuation.make_table(points, left.owners[indices])
             # A transposed array has its points on the last axis.
@@ -290,7 +283,7 @@ class _SpecialPointLocator(NamedTuple):
             if len(failed):
                 retried = solve(retry_fraction * left_ends[failed], failed)
                 beside = replace_rows(beside, failed, retried)
-        roots = np.array([parameters[i, x] for i, x in enumerate(fractions)])
+        roots = solve(fractions, every).points.p
         crossings = np.array([i for i in every if requests[i].name == BRANCH_POINT], int)
         section_state = self.continuation.problem.section_state
         state_chords = section_state(right.points.z) - section_state(left.points.z)
