@@ -447,14 +447,20 @@ def test_walks_with_infinite_friction_equal_those_with_large_friction():
 @pytest.mark.slow
 @pytest.mark.parametrize("stoppers", ["bilateral", "one-sided"])
 def test_results_approach_infinite_friction_as_the_inverse_of_the_friction(stoppers):
-    """Ten steps, over all of which one combination of contacts is admissible."""
-    damping, friction = np.array([20.0, 50.0, 100.0, 150.0, 400.0]), 10.0 ** np.arange(4, 7)
-    wheels = vrw.WheelParams(damping=np.repeat(damping, 4))
-    ground = vrw.UnilateralWheel(np.tile([*friction, math.inf], 5), 4000, stoppers)
-    starts, options = np.tile(START, (20, 1)), vrw.StepOptions.tight()
+    """Ten steps, over all of which one combination of contacts is admissible.
+
+    Events of one-sided stoppers follow each other ever faster, up to five hundred in a step, and in
+    some of them round-off decides whether a stopper opens again, which shifts the end by up to
+    3e-6 s. The median over five neighboring starts excludes these steps.
+    """
+    damping, friction = np.array([20.0, 50.0, 100.0, 150.0, 400.0]), 10.0 ** np.arange(3, 6)
+    wheels = vrw.WheelParams(damping=np.repeat(damping, 20))
+    ground = vrw.UnilateralWheel(np.tile(np.repeat([*friction, math.inf], 5), 5), 4000, stoppers)
+    starts = np.tile(START, (100, 1)) + 1e-10 * np.tile(np.arange(5.0), 20)[:, None]
+    options = vrw.StepOptions.tight()
     batch_result = vrw.step_batch(wheels, starts, 10, model=ground, options=options)
     assert np.all(np.asarray(batch_result.outcome) == vrw.Outcome.STEPPED)
-    period = np.asarray(batch_result.durations).sum(-1).reshape(5, 4)
+    period = np.median(np.asarray(batch_result.durations).sum(-1).reshape(5, 4, 5), axis=-1)
     shares = friction * (period[:, :3] - period[:, 3:])  # s, of the first order in 1 / friction
     np.testing.assert_allclose(shares[:, 1:], shares[:, :2], rtol=0.03)
 
