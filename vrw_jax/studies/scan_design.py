@@ -37,6 +37,9 @@ JsonObject = dict[str, Any]
 MANIFEST_ATTRIBUTE = "scan"
 """Name of the attribute of a store that contains the settings of the scan."""
 
+REQUESTED_MEASURES_ATTRIBUTE = "asked"
+"""Name of the attribute of a store that lists the requested measures."""
+
 ParameterSamples = dict[str, np.ndarray]
 """Swept parameters by name, with one value per sample."""
 
@@ -429,9 +432,7 @@ in margins.
 """
 
 
-def sobol_indices(
-    scan: xr.Dataset, measures: Iterable[str] = ("dls_fraction", "speed")
-) -> xr.Dataset:
+def sobol_indices(scan: xr.Dataset, measures: Iterable[str] | None = None) -> xr.Dataset:
     """Return first-order and total Sobol' indices, shape (measure, parameter), dimensionless.
 
     The first-order index is the fraction of a measure's variance that one parameter causes by
@@ -454,7 +455,8 @@ def sobol_indices(
 
     Args:
         scan: dataset of a scan over a `saltelli` design.
-        measures: names of variables of the scan.
+        measures: names of variables of the scan; by default the measures that it was asked for
+            and that have one value per sample.
 
     Returns:
         A dataset of `first_order`, `total`, the bounds of their intervals, `is_constant_measure`.
@@ -509,7 +511,7 @@ def sobol_indices(
 
 
 def _check_index_arguments(
-    scan: xr.Dataset, measures: Iterable[str]
+    scan: xr.Dataset, measures: Iterable[str] | None
 ) -> tuple[JsonObject, list[str]]:
     """Return the design of a scan and the names of measures of which it has Sobol' indices."""
     check_type("scan", scan, xr.Dataset, "give what vrw.scan or vrw.open_scan returned")
@@ -524,6 +526,9 @@ def _check_index_arguments(
             f"the scan varies only {design['swept'][0]}, which causes all variance of a measure: "
             "give vrw.saltelli the ranges of two parameters or more."
         )
+    if measures is None:
+        requested_names = scan.attrs[REQUESTED_MEASURES_ATTRIBUTE].split(", ")
+        measures = [name for name in requested_names if scan[name].dims == ("sample",)]
     measure_names = list(check_names("measures", measures))
     if not measure_names:
         raise ValueError('measures is empty, but indices are of a measure: give ["speed"], say.')

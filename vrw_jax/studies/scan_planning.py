@@ -48,6 +48,7 @@ from vrw_jax.studies.measure_catalog import (
 )
 from vrw_jax.studies.scan_design import (
     MANIFEST_ATTRIBUTE,
+    REQUESTED_MEASURES_ATTRIBUTE,
     JsonObject,
     ParameterSamples,
     SampleDesign,
@@ -62,9 +63,6 @@ many samples.
 
 PROVENANCE_ATTRIBUTE = "provenance"
 """Name of the attribute of a store that describes the origin of the results."""
-
-REQUESTED_MEASURES_ATTRIBUTE = "asked"
-"""Name of the attribute of a store that lists the requested measures."""
 
 MAX_SCAN_SAMPLES = 1_000_000_000
 """Largest number of samples in a scan.

@@ -31,12 +31,13 @@ import numpy as np
 from vrw_jax.base.checks import check_bool, check_path
 from vrw_jax.base.results import xarray as xr
 from vrw_jax.studies.measure_catalog import ValuesByVariable, canonicalize_variable_name
-from vrw_jax.studies.scan_design import MANIFEST_ATTRIBUTE, JsonObject, read_scan_manifest
-from vrw_jax.studies.scan_planning import (
-    PROVENANCE_ATTRIBUTE,
+from vrw_jax.studies.scan_design import (
+    MANIFEST_ATTRIBUTE,
     REQUESTED_MEASURES_ATTRIBUTE,
-    ResultLayout,
+    JsonObject,
+    read_scan_manifest,
 )
+from vrw_jax.studies.scan_planning import PROVENANCE_ATTRIBUTE, ResultLayout
 
 CHECKSUM_GROUP_NAME = "bookkeeping"
 """Name of the Zarr group that contains the marks of chunks. Users of the store do not see it."""
