@@ -78,6 +78,17 @@ def test_arguments_of_a_curve_are_refused_in_one_sentence():
         (("damping", (150.0, 160.0)), "which is free"),
         (("slope", (0.3,)), "at least two"),
         (("incline", (0.3, 0.2)), "no parameter"),
+        (("slope", (0.3, np.nan)), "slope is nan, but"),
     ):
         with pytest.raises(ValueError, match=message):
             vrw.tune(vrw.WheelParams(), "dls_fraction", FREE, BOUNDS, along=along)
+
+
+def test_a_curve_without_a_first_gait_speaks_of_its_start():
+    """The velocity grows without end from a restitution of 1 on."""
+    sentence = "restitution 1.5, where the curve begins: The search finds no gait near its start."
+    with pytest.raises(ValueError, match=sentence):
+        vrw.tune(
+            BALL_PARAMS, "velocity", ["kick"], {"kick": (0.5, 1.0)}, {},
+            model=JuggledBall(), along=("ball.restitution", (1.5, 0.4)),
+        )  # fmt: skip

@@ -646,4 +646,7 @@ def check_along(problem: TuneProblem, along: Any) -> tuple[str, list[float]]:
             f"the values in along have shape {numbers.shape}, but a curve needs a row of at least "
             "two: write np.linspace(0.30, 0.05, 26)."
         )
-    return name, np.asarray(numbers).tolist()
+    row = np.asarray(numbers).tolist()
+    for value in row:
+        problem.gait_finder.model.parameter_domains[name].require_value_in_domain(name, value)
+    return name, row

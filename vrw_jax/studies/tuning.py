@@ -427,7 +427,8 @@ class OptimumCurve:
     - `dataset`: best free parameters, objective, and price of each limit by its name, over the
       dimension `point`, with the parameter as a coordinate. A price of 0 is that of an inactive
       limit. The two bounds of a measure are two limits;
-    - `changes`: changes of the set of active limits, as `ActiveSetChange`;
+    - `changes`: changes of the set of active limits, as `ActiveSetChange`. Where the sets at two
+      neighboring points are equal, changes between these points are not found;
     - `ending`: sentence on how the curve ends.
 
     Examples:
@@ -484,7 +485,7 @@ def follow_optimum(
         # The branch of the neighbor is known at another value, so only its failures count.
         start = start._replace(is_on_branch=np.asarray(True))
         if not start.is_usable_trial:
-            failures.append("The wheel has no gait near that of the last optimum.")
+            failures.append("The search finds no gait near its start.")
             return None
         result = maximize_objective(local.evaluate_trial, start, tolerance, max_evaluations)
         if result.status != TuneStatus.CONVERGED:
