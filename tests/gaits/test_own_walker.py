@@ -338,6 +338,16 @@ def test_parameters_outside_their_domain_have_a_code():
     assert "outside its domain" in motion.outcome_meaning
 
 
+@pytest.mark.parametrize("walker", [BALL_SYSTEM, JuggledBall(), Henon()])
+def test_starts_that_are_not_finite_have_a_code(walker):
+    params = {**BALL_PARAMS, "a": 0.2, "b": 0.3}
+    starts = np.full((3, 2 if isinstance(walker, Henon) else 1), [[0.5], [np.nan], [np.inf]])
+    batch = vrw.step_batch(params, starts, 2, model=walker)
+    assert batch.outcome.tolist() == [vrw.Outcome.STEPPED] + [vrw.Outcome.BAD_INPUT] * 2
+    walk = vrw.walk(params, starts[1], 2, model=walker)
+    assert walk.steps.outcome.tolist() == [vrw.Outcome.BAD_INPUT] * 2
+
+
 class DampedBall(JuggledBall):
     """Juggled ball whose names have other meanings and units than those of the wheel."""
 

@@ -109,11 +109,14 @@ class AbstractWalker(abc.ABC):
         """Return the end of one step of one element from section coordinates `x`."""
 
     def advance_checked(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
-        """Return the end of one step, with BAD_INPUT if a parameter is outside its domain."""
+        """Return the end of one step, with BAD_INPUT if a parameter is outside its domain or the start
+        is not finite.
+        """
         result = self.advance(params, x, options)
         if self.is_wheel:  # Steps of wheels contain this check.
             return result
-        outcome = jnp.where(is_tree_in_domain(params), result.outcome, Outcome.BAD_INPUT)
+        is_valid = is_tree_in_domain(params) & jnp.all(jnp.isfinite(x))
+        outcome = jnp.where(is_valid, result.outcome, Outcome.BAD_INPUT)
         return dataclasses.replace(result, outcome=outcome)
 
     def take_step(self, params: Any, x: Any, options: StepOptions) -> Any:

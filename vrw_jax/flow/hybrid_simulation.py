@@ -116,7 +116,7 @@ class Termination(StatusCode):
     )
     SECTION_REACHED = 6, "The step is complete: it has reached the section."
     ENDED_BY_GUARD = 7, "A guard that ends the walk has fallen to zero."
-    BAD_INPUT = 8, "A parameter is not finite, or outside its domain."
+    BAD_INPUT = 8, "A parameter or the start is not finite, or outside its domain."
 
 
 STATUS_RUNNING_CODE = -1
