@@ -184,7 +184,7 @@ DIFFERENTIATION_ADVICE = "differentiate vrw.limit_cycle"
 MAX_BRANCH_MESH_REFINEMENTS = 3
 
 
-@announce_wait("gaits, their derivatives and special points", "30 s")
+@announce_wait("gaits, their derivatives and special points", "15 s")
 def continue_branch(
     params: Any,
     name: str,
@@ -294,7 +294,7 @@ def continue_branch(
     return branch
 
 
-@announce_wait("gaits, their derivatives and special points", "30 s")
+@announce_wait("gaits, their derivatives and special points", "15 s")
 def continue_branches(
     params: WheelParams,
     name: str,

@@ -424,7 +424,7 @@ def resolve_model_with_reason(
     return model_choice.model.with_laws(selected_model.laws), model_choice.why
 
 
-@announce_wait("the gait with its derivatives", "15 s")
+@announce_wait("the gait with its derivatives", "10 s")
 def sensitivities(
     params: Any,
     *,

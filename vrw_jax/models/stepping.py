@@ -639,7 +639,7 @@ def start_walk_toward_gait(model: AbstractWheel, params: WheelParams, options: S
     return walk(params, model.compute_default_start(params), 100, model=model, options=options)
 
 
-@announce_wait("a gait step of each model", "20 s")
+@announce_wait("a gait step of each model", "5 s")
 def choose_model(
     params: WheelParams,
     start: SectionStateLike,

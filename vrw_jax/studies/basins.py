@@ -532,7 +532,7 @@ class BasinShare(AbstractPrintable):
         ]
 
 
-@announce_wait("gaits and walks", "20 s")
+@announce_wait("gaits and walks", "10 s")
 def basin_share(
     params: Any,
     box: StartBox,

@@ -145,7 +145,7 @@ def _describe_norms(outcome: int, spectral_radius: float) -> str:
     return "The gait is not stable: deviations grow from step to step, and no norm is finite."
 
 
-@announce_wait("the gait and its response to slopes", "15 s")
+@announce_wait("the gait and its response to slopes", "10 s")
 def gait_sensitivity(
     params: Any,
     measures: str | Sequence[str],
@@ -252,7 +252,7 @@ def compute_gait_sensitivity(
     )
 
 
-@announce_wait("gaits and walks", "20 s")
+@announce_wait("gaits and walks", "10 s")
 def measure_basins(
     branch: Branch,
     box: StartBox | None = None,
@@ -337,7 +337,7 @@ def measure_basins(
     return _make_branch_dataset(branch, points, rows, variables, "Basins of the gaits")
 
 
-@announce_wait("gaits and their response to slopes", "20 s")
+@announce_wait("gaits and their response to slopes", "10 s")
 def measure_gait_sensitivity(
     branch: Branch,
     measures: str | Sequence[str],

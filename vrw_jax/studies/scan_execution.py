@@ -93,7 +93,7 @@ class ScanProgress:
 
 
 @with_default_jax_settings
-@announce_wait("batches of gaits and gait steps", "15 s")
+@announce_wait("batches of gaits and gait steps", "10 s")
 def scan(
     design: SampleDesign,
     measures: Iterable[str | Measure] | Measure | None = None,

@@ -113,7 +113,7 @@ class SmallestDisturbance(AbstractPrintable):
         ]
 
 
-@announce_wait("gaits, walks and derivatives", "20 s")
+@announce_wait("gaits, walks and derivatives", "15 s")
 def smallest_disturbance(
     params: Any,
     *,
@@ -514,7 +514,7 @@ class PhaseResponse(AbstractPrintable):
         return rows
 
 
-@announce_wait("steps and their derivatives", "30 s")
+@announce_wait("steps and their derivatives", "15 s")
 def phase_response(
     params: Any,
     *,

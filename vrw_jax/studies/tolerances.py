@@ -254,7 +254,7 @@ def _format_rounded_number(measure_value: float) -> str:
 MIN_TOL_FOR_TIGHT_STEPS = 1e-7
 
 
-@announce_wait("gait steps of each model", "30 s")
+@announce_wait("gait steps of each model", "15 s")
 def measure_to_tolerance(
     measures: str | Sequence[str],
     params: WheelParams,
@@ -445,7 +445,7 @@ GAIT_ERROR_FRACTION = 0.1
 MIN_PILOT_GAITS = 8
 
 
-@announce_wait("gaits of each model", "30 s")
+@announce_wait("gaits of each model", "20 s")
 def multifidelity_mean(
     measure: str,
     params: WheelParams,

@@ -560,7 +560,7 @@ def _make_optimum_dataset(
     )
 
 
-@announce_wait("the gait, objective and constraints with derivatives", "25 s")
+@announce_wait("the gait, objective and constraints with derivatives", "15 s")
 def tune(
     params: Any,
     objective: ObjectiveSpecification,
