@@ -109,9 +109,7 @@ class AbstractWalker(abc.ABC):
         """Return the end of one step of one element from section coordinates `x`."""
 
     def advance_checked(self, params: Any, x: Any, options: StepOptions) -> AdvanceResult:
-        """Return the end of one step, with BAD_INPUT if a parameter is outside its domain or the start
-        is not finite.
-        """
+        """Return the end of one step, with BAD_INPUT if a parameter or the start is not valid."""
         result = self.advance(params, x, options)
         if self.is_wheel:  # Steps of wheels contain this check.
             return result
