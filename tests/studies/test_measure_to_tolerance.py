@@ -147,6 +147,9 @@ def test_a_missing_gait_is_reported_instead_of_a_small_number():
     assert math.isnan(measured.value)
     assert math.isinf(measured.error)
     assert measured.why.startswith("no such gait with unilateral contact: ")
+    wheels = vrw.WheelParams(damping=[np.nan, -5.0, 200.0])
+    outcomes = vrw.measure_to_tolerance("speed", wheels, 1e-2, friction=50.0).outcomes
+    assert outcomes.tolist() == [vrw.Outcome.BAD_INPUT] * 2 + [vrw.Outcome.STEPPED]
 
 
 def test_a_measure_result_prints_one_line():

@@ -560,8 +560,10 @@ class MeasureRequest:
         np.add.at(self.result_arrays["n_steps"], wheel_indices, walk_ends.n_steps)
         # A step cannot begin if a wheel has turned more than once in flight.
         is_reason_unknown = np.isin(walk_ends.walk_outcomes, (Outcome.STEPPED, Outcome.BAD_INPUT))
+        is_in_domain = select_rows_on_device(self.params, wheel_indices).is_in_domain()
+        failures = np.where(is_in_domain, Outcome.NO_CYCLE_FOUND, Outcome.BAD_INPUT)
         self.result_arrays["outcomes"][wheel_indices] = np.where(
-            is_reason_unknown, Outcome.NO_CYCLE_FOUND, walk_ends.walk_outcomes
+            is_reason_unknown, failures, walk_ends.walk_outcomes
         )
         wheel_indices = wheel_indices[walk_ends.has_settled]
         states = walk_ends.section_states[walk_ends.has_settled]
