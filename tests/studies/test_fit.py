@@ -223,6 +223,15 @@ def test_a_bound_holds_and_is_named():
     assert result.converged
 
 
+def test_fitted_parameters_contain_their_offset():
+    """The reference is the slope of the wheel whose gait is measured."""
+    cycle = vrw.limit_cycle(vrw.WheelParams(damping=150.0, slope=0.32))
+    data = {"period": [cycle.period], "period_error": [0.001]}
+    result = vrw.fit(data, WHEEL, ["slope_offset"], n_starts=1)
+    assert result["slope_offset"] == pytest.approx(0.32 - float(WHEEL.slope), abs=1e-6)
+    assert result.params.slope == pytest.approx(0.32, abs=1e-6)
+
+
 def test_what_sensors_report_is_fitted_too():
     """The reference is the delay that is added to the durations."""
     slopes = np.array([0.28, 0.32])
@@ -427,6 +436,7 @@ BAD_DATA = {
         "slope has shape",
     ),
     "no table": (3, "table"),
+    "errors of nothing": (SMALL_GAIT | {"sped_error": [0.1]}, "no sped .did you mean 'speed'"),
 }
 
 
@@ -506,6 +516,39 @@ def test_a_csv_file_may_begin_with_a_byte_order_mark(tmp_path):
     path.write_text("period [m]\n0.7\n", encoding="utf-8-sig")
     with pytest.raises(ValueError, match=r"^period has the unit 'm'"):
         vrw.fit(path, SMALL_WHEEL)
+
+
+BAD_ARGUMENTS = {
+    "a prior of no width": ({"priors": {"damping": (12.0, 0.0)}}, "positive"),
+    "no columns": ({"observe": lambda measures, extra: [1.0]}, "result of observe"),
+    "two errors": ({"covariance": np.diag([0.004, 0.02, 0.02]) ** 2}, "covariance= contains"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ARGUMENTS)
+def test_bad_arguments_get_one_sentence(name):
+    keywords, message = BAD_ARGUMENTS[name]
+    with pytest.raises((TypeError, ValueError), match=message) as error:
+        vrw.fit(SMALL_GAIT, SMALL_WHEEL, n_starts=1, **keywords)
+    assert str(error.value).count(". ") == 0
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [({"start": [0.1, 1.6]}, "start has 2 entries"), ({"start": START, "window": -1.0}, "window")],
+)
+def test_bad_starts_and_windows_get_one_sentence(keywords, message):
+    data = {"time": [0.1, 0.2, 0.3], "lambda_2": [100.0], "lambda_2_error": [5.0]}
+    with pytest.raises(ValueError, match=message):
+        vrw.fit(data, WHEEL, n_starts=1, **keywords)
+
+
+def test_a_fit_without_any_gait_says_so():
+    """A slope of 17 rad, which was meant in degrees, has no gait, and so no direction."""
+    result = vrw.fit(SMALL_GAIT | {"slope": [17.0]}, SMALL_WHEEL, n_starts=1)
+    assert not result.converged
+    assert result.unidentifiable == ()
+    assert "no walker with all measured gaits" in str(result)
 
 
 def test_names_of_unknowns_are_checked():

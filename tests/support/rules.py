@@ -18,7 +18,7 @@ SHARED_LIBRARIES = {"equinox", "jax", "jaxtyping", "numpy", "scipy", "xarray"}
 ALLOWED_IMPORTERS = {
     "PIL": "app", "anywidget": "app", "cycler": "app", "dask": "studies.scan_execution",
     "diffrax": "flow.phase_integration", "distributed": "studies.scan_execution",
-    "llvmlite": "lanes", "matplotlib": "app", "optax": "studies", "optimistix": "studies",
+    "llvmlite": "lanes", "matplotlib": "app", "optax": "studies",
     "pydantic": "app.config", "pydantic_core": "app.config", "rich": "app", "traitlets": "app",
     "typer": "app", "zarr": "studies",
 }  # fmt: skip

@@ -666,6 +666,19 @@ def register_wrong_calls() -> None:
         lambda: vrw.compare_laws({"period": [1.0], "period_error": [0.1]}, {"gravity": 9.81}),
         "TypeError", "vrw.WheelParams",
     )  # fmt: skip
+    for name, keywords, words in (
+        ("a prior without its width", {"priors": {"damping": 12.0}}, "(mean, standard deviation)"),
+        ("text as extra unknown", {"extra": {"delay": "long"}}, "one real number"),
+        ("a number as observe", {"observe": 3}, "observe is 3"),
+    ):
+        add_wrong_call(
+            f"fit with {name}",
+            lambda keywords=keywords: vrw.fit(
+                {"period": [0.7], "period_error": [0.1]}, vrw.WheelParams(), ["damping"], **keywords
+            ),
+            "TypeError",
+            words,
+        )
     add_wrong_call(
         "a step of a HybridSystem from single numbers",
         lambda: make_drop().step({}, np.ones(2, np.float32)), "ValueError", "np.asarray(x, float)",

@@ -247,6 +247,7 @@ class _SpecialPointLocator(NamedTuple):
             for indices in np.array([request.pair for request in requests]).T
         )
         every = np.arange(len(requests))
+
         def solve(
             fractions: np.ndarray,
             indices: np.ndarray,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from vrw_jax.base.checks import (
+    check_callable,
     check_choice,
     check_int,
     check_names,
@@ -28,6 +29,13 @@ from vrw_jax.base.results import Outcome
 from vrw_jax.base.results import xarray as xr
 from vrw_jax.base.walker import is_own_walker, propose_starts
 from vrw_jax.gaits.gait_search import limit_cycle, limit_cycles, resolve_finder, resolve_model
+from vrw_jax.studies.fit_data import (
+    DATASET_DIMENSION,
+    STEP_COLUMN,
+    TIME_COLUMN,
+    FitData,
+    read_data,
+)
 from vrw_jax.studies.fit_problem import (
     HEIGHT_COLUMN,
     OFFSET_SUFFIX,
@@ -37,17 +45,11 @@ from vrw_jax.studies.fit_problem import (
     FitProblem,
     FitTarget,
     describe_unknowns,
-    measure_candidates,
+    evaluate_fits,
     solve_fits,
+    whiten,
 )
-from vrw_jax.studies.fit_result import (
-    DATASET_DIMENSION,
-    FitData,
-    FitResult,
-    make_result,
-    read_data,
-    summarize,
-)
+from vrw_jax.studies.fit_result import FitResult, make_result
 
 N_STARTS = 8
 """Default number of starts. The first start is the given walker."""
@@ -93,9 +95,9 @@ def fit(
     with names of parameters, as "slope", describe each row. A column "walk" distinguishes walks. A
     dimension "dataset" is a batch of data sets, which are fitted in one call.
 
-    The Levenberg-Marquardt method of optimistix minimizes the sum of squared residuals, with exact
-    derivatives of gaits, steps and events. Standard errors follow from the derivatives and from the
-    errors of the data. Wheels without a gait are rejected during the search.
+    The method of Levenberg and Marquardt minimizes the sum of squared residuals within bounds, with
+    exact derivatives of gaits, steps and events. Standard errors follow from the derivatives and
+    from the errors of the data. Wheels without a gait are rejected during the search.
 
     Args:
         data: an xarray Dataset, a pandas DataFrame, a dictionary of columns or a CSV file.
@@ -132,17 +134,91 @@ def fit(
     """
     require_untraced_arguments("vrw.fit", "use result.log_likelihood", params)
     free = check_names("free", free, '"damping", "stiffness"')
-    bounds, priors, extra = dict(bounds or {}), dict(priors or {}), dict(extra or {})
+    bounds, priors = dict(bounds or {}), dict(priors or {})
+    extra = {name: check_real(f"extra[{name!r}]", x) for name, x in (extra or {}).items()}
+    if observe is not None:
+        check_callable("observe", observe, "of the predicted columns and of extra")
     options = StepOptions() if options is None else options
     check_type("options", options, StepOptions, "give vrw.StepOptions()")
     n_starts = check_int("n_starts", n_starts)
     finder, units, entries = _resolve_walker(params, model, start, options)
+    units = {**units, HEIGHT_COLUMN: units.get(HEIGHT_COLUMN, "m"), TIME_COLUMN: "s"}
     table = _read_table(data, params, finder, covariance, units)
-    problem, targets, first = _make_problem(
-        table, params, free, finder, entries, bounds, priors, start, extra, observe, window, options
+    walks, row_walks = np.unique(
+        table.labels.get("walk", np.zeros(table.values.shape[1])), return_inverse=True
     )
-    starts = _choose_starts(problem, targets, first, {*bounds}, {*free}, n_starts)
-    return _fit_from_starts(problem, targets, starts, table, units, params, start is None)
+    starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
+    states: Any = _find_first_states(table, params, finder, start, len(walks))
+    start_names: list[str] = []
+    if start is None and table.kind != "gaits":
+        if finder.model.is_wheel and states.shape[1] > 3:
+            # Of a full section state, Leg 1 stands on the ground, and the others on their stoppers.
+            states = states[:, [0, 1, 4 + params.n_legs]]
+        endings = [f"[{walk}]" for walk in range(len(walks))] if len(walks) > 1 else [""]
+        start_names = [START_PREFIX + entry + end for end in endings for entry in entries]
+    row_steps, n_steps, window = _arrange_steps(
+        table, finder, params, None if starts_from_gait else states, window, options
+    )
+    base_values = np.asarray(finder.model.collect_parameter_values(params), float)
+    known = dict(zip(finder.model.parameter_names, base_values, strict=True)) | extra
+    first_starts = states[:, : len(entries)] if start_names else []
+    first = np.append([known.get(name, 0.0) for name in (*free, *extra)], first_starts)
+    _check_unknowns(table, finder, free, (*free, *extra, *start_names), bounds, priors, observe)
+    unknowns, prior_means, prior_weights = describe_unknowns(
+        (*free, *extra, *start_names), first, bounds, priors, finder.model.parameter_domains, units
+    )
+    arrays = {
+        "base_values": tuple(base_values),
+        "conditions": _arrange_conditions(table, finder, walks, row_walks, row_steps, n_steps),
+        "row_walks": row_walks,
+        "row_steps": row_steps,
+        "times": table.labels.get("time"),
+        "window": window,
+        "starts": states,
+    }
+    problem = FitProblem(
+        finder=finder,
+        **jax.tree.map(jnp.asarray, arrays),
+        unknowns=unknowns,
+        options=options,
+        names=table.names,
+        extra_names=tuple(extra),
+        kind=table.kind,
+        n_steps=n_steps,
+        n_start_entries=len(entries) if start_names else 0,
+        starts_from_gait=starts_from_gait,
+        observe=observe,
+    )
+    target = FitTarget(table.values, table.whitener[None], prior_means[None], prior_weights[None])
+    mean = target._replace(values=target.values.mean(0, keepdims=True))
+    starts = _choose_starts(problem, mean, first, [*bounds], free, n_starts)
+    result = make_result(problem, mean, starts, table, is_batch=False)
+    if is_own_walker(model) and table.kind == "gaits" and start is None:
+        result = _improve_with_new_guesses(result)
+    if table.is_batch:
+        starts = np.tile(result.values, (len(table.values), 1))
+        result = make_result(result.problem, target, starts, table, is_batch=True)
+    return result
+
+
+def _resolve_walker(
+    params: Any, model: Any, start: Any, options: StepOptions
+) -> tuple[Any, dict[str, str], tuple[str, ...]]:
+    """Return the finder of gaits, the units of quantities by name, and the entries of a start that
+    may be unknown.
+    """
+    if is_own_walker(model):
+        guess = None if start is None or isinstance(start, str) else np.atleast_2d(start)[0]
+        finder: Any = resolve_finder(params, model, options, guess=guess)
+        own_units = [(measure.name, measure.unit) for measure in finder.described_measures]
+        own_units += [(name, x.unit) for name, x in finder.model.named_domains]
+        # Without a declaration, the unit is unknown.
+        units = {name: unit for name, unit in own_units if unit != "1"}
+        return finder, units, finder.coordinates
+    model = resolve_model(params, model)
+    finder = resolve_finder(params, model, None, getattr(model, "leg_period", 1))
+    # The landing on both feet of the paper's wheel leaves two of the three entries.
+    return finder, finder.model.units, START_NAMES[:2]
 
 
 def _read_table(
@@ -165,228 +241,12 @@ def _read_table(
     return table
 
 
-def _make_problem(
-    table: FitData,
-    params: Any,
-    free: Sequence[str],
-    finder: Any,
-    entries: tuple[str, ...],
-    bounds: Mapping[str, Any],
-    priors: Mapping[str, Any],
-    start: Any,
-    extra: dict[str, float],
-    observe: Any,
-    window: float | None,
-    options: StepOptions,
-) -> tuple[FitProblem, FitTarget, np.ndarray]:
-    """Return the problem, what its predictions are compared with, and first values of unknowns.
-
-    - `entries`: entries of the start of a walk that may be unknown.
-    """
-    model, n_rows = finder.model, table.values.shape[1]
-    walks, row_walks = np.unique(table.labels.get("walk", np.zeros(n_rows)), return_inverse=True)
-    starts_from_gait = isinstance(start, str) and check_choice("start", start, ("gait",)) == "gait"
-    first_states: Any = _find_first_states(
-        table.kind, params, finder, start, len(walks), table.conditions
-    )
-    has_unknown_starts = start is None and table.kind != "gaits"
-    if has_unknown_starts and model.is_wheel and first_states.shape[1] > 3:
-        # Of a full section state, Leg 1 stands on the ground, and the others on their stoppers.
-        first_states = first_states[:, [0, 1, 4 + params.n_legs]]
-    start_names = [
-        f"{START_PREFIX}{entry}{f'[{walk}]' if len(walks) > 1 else ''}"
-        for walk in range(len(walks))
-        for entry in entries
-        if has_unknown_starts
-    ]
-    row_steps, n_steps, window = _arrange_steps(
-        table, finder, params, None if starts_from_gait else first_states, window, options
-    )
-    unknown_names = (*free, *extra, *start_names)
-    _check_unknowns(table, finder, free, unknown_names, (*bounds, *priors), observe)
-    base_values = np.asarray(model.collect_parameter_values(params), float)
-    known_values = dict(zip(model.parameter_names, base_values, strict=True)) | extra
-    first = np.array([float(known_values.get(name, 0.0)) for name in (*free, *extra)])
-    if start_names:
-        first = np.append(first, first_states[:, : len(entries)])
-    n_numbers = table.values[0].size + len(priors)
-    lower, upper, scale, prior_means, prior_weights = describe_unknowns(
-        unknown_names, first, bounds, priors, model.parameter_domains
-    )
-    if n_numbers < len(first):
-        raise ValueError(
-            f"data contain {n_numbers} numbers for {len(first)} unknowns ("
-            f"{', '.join(unknown_names)}), which cannot be estimated from fewer: measure more, or "
-            "give start= or fewer free parameters."
-        )
-    arrays = {
-        "base_values": tuple(base_values),
-        "conditions": _arrange_conditions(table, model, walks, row_walks, row_steps, n_steps),
-        "row_walks": row_walks,
-        "row_steps": row_steps,
-        "times": table.labels.get("time"),
-        "window": window,
-        "starts": first_states,
-        "whitener": table.whitener,
-    }
-    problem = FitProblem(
-        finder=finder,
-        **jax.tree.map(jnp.asarray, arrays),
-        lower=lower,
-        upper=upper,
-        scale=scale,
-        options=options,
-        names=table.names,
-        unknown_names=unknown_names,
-        extra_names=tuple(extra),
-        kind=table.kind,
-        n_steps=n_steps,
-        n_start_entries=len(entries) if start_names else 0,
-        starts_from_gait=starts_from_gait,
-        observe=observe,
-    )
-    ones = np.ones((1, n_rows))
-    targets = FitTarget(table.values, ones, prior_means[None], prior_weights[None])
-    return problem, targets, first
-
-
-def _fit_from_starts(
-    problem: FitProblem,
-    targets: FitTarget,
-    starts: np.ndarray,
-    table: FitData,
-    units: dict[str, str],
-    params: Any,
-    can_replace_guesses: bool,
-) -> FitResult:
-    """Return the best fit from all starts, and for a batch the fit of each data set from there.
-
-    - `can_replace_guesses`: whether a fit to gaits may replace the guesses from which they are
-      found.
-    """
-    domains = problem.finder.model.parameter_domains
-    units = {**units, **{name: domain.unit for name, domain in domains.items()}, "time": "s"}
-    quantities = [
-        name.removesuffix(OFFSET_SUFFIX).removeprefix(START_PREFIX)
-        for name in problem.unknown_names
-    ]
-    unknown_units = tuple(units.get(name.partition("[")[0], "1") for name in quantities)
-    walker = problem.unpack(problem.base_values)[0]
-    arguments = table, unknown_units, params, walker
-    mean_targets = targets._replace(values=targets.values.mean(0, keepdims=True))
-    fit_mean = lambda problem, starts: make_result(
-        problem, mean_targets, starts, *arguments, is_batch=False
-    )
-    mean_fit = fit_mean(problem, starts)
-    if is_own_walker(walker) and table.kind == "gaits" and can_replace_guesses:
-        mean_fit = _improve_with_new_guesses(mean_fit, fit_mean)
-    if not table.is_batch:
-        return mean_fit
-    starts = np.tile(mean_fit.values, (len(table.values), 1))
-    return make_result(mean_fit.problem, targets, starts, *arguments, is_batch=True)
-
-
-def _resolve_walker(
-    params: Any, model: Any, start: Any, options: StepOptions
-) -> tuple[Any, dict[str, str], tuple[str, ...]]:
-    """Return the finder of gaits, the units of quantities by name, and the entries of a start that
-    may be unknown.
-    """
-    if is_own_walker(model):
-        guess = None if start is None or isinstance(start, str) else np.atleast_2d(start)[0]
-        finder: Any = resolve_finder(params, model, options, guess=guess)
-        own_units = [(measure.name, measure.unit) for measure in finder.described_measures]
-        own_units += [(name, x.unit) for name, x in finder.model.named_domains]
-        # Without a declaration, the unit is unknown.
-        units = {"period": "s"} | {name: unit for name, unit in own_units if unit != "1"}
-        return finder, units, finder.coordinates
-    model = resolve_model(params, model)
-    finder = resolve_finder(params, model, None, getattr(model, "leg_period", 1))
-    # The landing on both feet of the paper's wheel leaves two of the three entries.
-    return finder, finder.model.units, START_NAMES[:2]
-
-
-def _arrange_steps(
-    table: Any,
-    finder: Any,
-    params: Any,
-    first_states: np.ndarray | None,
-    window: float | None,
-    options: StepOptions,
-) -> tuple[np.ndarray | None, int, float | None]:
-    """Return the index of the step of each row, the number of steps, and the window of a series.
-
-    - `first_states`: section states at which the walks begin, None for the steady gait.
-    """
-    row_steps, times = table.labels.get("step"), table.labels.get("time")
-    n_steps = 1
-    if row_steps is not None:
-        if (parts := row_steps[row_steps % 1.0 != 0.0]).size:
-            raise ValueError(
-                f"step is {parts[0]:g}, but the steps of a walk are numbered: give whole numbers."
-            )
-        row_steps = row_steps.astype(int) - int(row_steps.min())
-        n_steps = int(row_steps.max()) + 1
-    if times is None:
-        return row_steps, n_steps, None
-    spacing = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
-    window = spacing if window is None else float(check_real("window", window))
-    if first_states is None:
-        return row_steps, finder.leg_period, window
-    if times.min() < window:
-        raise ValueError(
-            f"the series begins {times.min():g} s after the first touchdown, but its samples are "
-            f"means over {window:g} s before and after them: begin later, or give window=."
-        )
-    last_time = float(times.max()) + window
-    n_steps = max(n_steps, _count_steps(finder, params, first_states, last_time, options))
-    return row_steps, n_steps, window
-
-
-def _check_unknowns(
-    table: Any,
-    finder: Any,
-    free: Sequence[str],
-    unknown_names: tuple[str, ...],
-    described_names: Sequence[str],
-    observe: Any,
-) -> None:
-    """Raise an error unless the names of unknowns and of columns are known.
-
-    - `described_names`: names of unknowns with bounds or a prior.
-    """
-    parameter_names = finder.model.parameter_names
-    offset_names = [f"{name}{OFFSET_SUFFIX}" for name in parameter_names]
-    if table.kind == "series":
-        offset_names.append(TIME_OFFSET)
-    for name in free:
-        require_known_name(name, (*parameter_names, *offset_names), "parameter of the walker")
-        if name in table.conditions:
-            raise ValueError(
-                f"{name} is free and a column of data, but a column describes what is known: free "
-                f"{name}_offset, or remove one of them."
-            )
-    if not unknown_names or len(set(unknown_names)) < len(unknown_names):
-        raise ValueError(f"the unknowns are {unknown_names}, but each is named once: change free.")
-    for name in described_names:
-        require_known_name(name, unknown_names, "unknown")
-    if table.kind == "gaits" and observe is None:
-        for name in table.names:
-            require_known_name(name, finder.differentiable_measures, "measure of gaits")
-
-
 def _find_first_states(
-    kind: str,
-    params: Any,
-    finder: Any,
-    start: Any,
-    n_walks: int,
-    conditions: Mapping[str, np.ndarray],
+    table: FitData, params: Any, finder: Any, start: Any, n_walks: int
 ) -> np.ndarray | None:
-    """Return the section state at the start of each walk, or a guess of it or of each gait.
-
-    - `conditions`: known parameters of each row of gaits.
-    """
+    """Return the section state at the start of each walk, or a guess of it or of each gait."""
+    model, is_of_gaits = finder.model, table.kind == "gaits"
+    walker = model if model.is_wheel else model.walker
     if start is not None and not isinstance(start, str):
         states = np.atleast_2d(check_numpy_reals("start", start))
         if states.shape[0] not in (1, n_walks):
@@ -394,29 +254,40 @@ def _find_first_states(
                 f"start has shape {states.shape}, but there are {n_walks} walks: give one "
                 "section state, or one for each walk."
             )
-    elif finder.model.is_wheel:
-        if kind == "gaits" and finder.supports_cold_start:
-            return None
-        cycle: Any = limit_cycle(params, model=finder.model, period_n=finder.leg_period)
-        default_start = finder.model.compute_default_start(params)
-        states = np.asarray(cycle.section_state if bool(cycle.found) else default_start)[None]
+        sizes = (
+            (3, model.count_section_entries(params))
+            if model.is_wheel
+            else (len(finder.coordinates),)
+        )
+        if states.shape[1] not in sizes:
+            raise ValueError(
+                f"start has {states.shape[1]} entries, but a section state has {sizes[-1]}: give "
+                "the section_state of a gait or of a step."
+            )
+    elif is_of_gaits and finder.supports_cold_start:
+        return None
+    elif is_of_gaits and not model.is_wheel:
+        get_value = lambda name: table.conditions.get(name, model.get_parameter(params, name))
+        gaits = _find_row_gaits(finder, list(map(get_value, model.parameter_names)))
+        missing = np.flatnonzero(~np.asarray(gaits.found))
+        if len(missing):
+            raise ValueError(
+                f"the search begins at the given parameters, but gait {missing[0]} of the data "
+                "was not found there: give parameters that have the gaits, or start=, section "
+                "coordinates near them."
+            )
+        return np.asarray(gaits.section_state)
     else:
-        walker, model = finder.model.walker, finder.model
-        if kind == "gaits":
-            get_value = lambda name: conditions.get(name, model.get_parameter(params, name))
-            gaits = _find_row_gaits(finder, list(map(get_value, model.parameter_names)))
-            missing = np.flatnonzero(~np.asarray(gaits.found))
-            if len(missing):
-                raise ValueError(
-                    f"the search begins at the given parameters, but gait {missing[0]} of the data "
-                    "was not found there: give parameters that have the gaits, or start=, section "
-                    "coordinates near them."
-                )
-            return np.asarray(gaits.section_state)
-        gait: Any = limit_cycle(params, model=walker, options=finder.step_options)
-        states = np.asarray(gait.section_state)[None]
-        if not bool(gait.found):
-            states = np.asarray(propose_starts(walker, params))[:1]
+        cycle_options = None if model.is_wheel else finder.step_options
+        cycle: Any = limit_cycle(
+            params, model=walker, period_n=finder.leg_period, options=cycle_options
+        )
+        state: Any = cycle.section_state
+        if not bool(cycle.found) and model.is_wheel:
+            state = model.compute_default_start(params)
+        elif not bool(cycle.found):
+            state = propose_starts(walker, params)[0]
+        states = np.asarray(state)[None]
     return np.broadcast_to(states, (n_walks, states.shape[1])).astype(float)
 
 
@@ -428,57 +299,61 @@ def _find_row_gaits(finder: Any, row_values: Sequence[Any]) -> Any:
     return limit_cycles(params, model=finder.model.walker, options=finder.step_options)
 
 
-# Largest number of times that the guesses of gaits are replaced by the gaits of the last fit.
-MAX_GUESS_UPDATES = 20
-# Smallest relative decrease of chi2 after which the guesses are replaced again.
-MIN_CHI2_DECREASE = 1e-6
+def _arrange_steps(
+    table: FitData,
+    finder: Any,
+    params: Any,
+    first_states: np.ndarray | None,
+    window: float | None,
+    options: StepOptions,
+) -> tuple[np.ndarray | None, int, float | None]:
+    """Return the index of the step of each row, the number of steps, and the window of a series.
 
-
-def _improve_with_new_guesses(
-    fit: FitResult, repeat: Callable[[FitProblem, Any], FitResult]
-) -> FitResult:
-    """Return a fit to gaits of a walker whose guesses are the gaits of the fit itself.
-
-    A gait that is far from its guess may not be found, which would hold the search back.
-
-    - `repeat`: function of a problem and starts that returns their fit.
+    - `first_states`: section states at which the walks begin, None for the steady gait.
     """
-    for _ in range(MAX_GUESS_UPDATES):
-        problem = fit.problem
-        values, others = problem.place_unknowns(jnp.asarray(fit.values))
-        gaits = _find_row_gaits(
-            problem.finder, problem.set_conditions(values, problem.conditions, others)
+    row_steps, times = table.labels.get(STEP_COLUMN), table.labels.get(TIME_COLUMN)
+    n_steps = 1
+    if row_steps is not None:
+        if (parts := row_steps[row_steps % 1.0 != 0.0]).size:
+            raise ValueError(
+                f"step is {parts[0]:g}, but the steps of a walk are numbered: give whole numbers."
+            )
+        row_steps = (row_steps - row_steps.min()).astype(int)
+        n_steps = int(row_steps.max()) + 1
+    if times is None:
+        return row_steps, n_steps, None
+    spacing = float(np.median(np.diff(np.unique(times)))) if len(times) > 1 else 0.0
+    window = spacing if window is None else float(check_real("window", window))
+    if window < 0.0:
+        raise ValueError(
+            f"window is {window:g} s, but it is a time before and after a sample: give 0 for "
+            "instantaneous values, or more."
         )
-        if not np.all(gaits.found):
-            break
-        problem = eqx.tree_at(lambda p: p.starts, problem, jnp.asarray(gaits.section_state))
-        previous, fit = fit, repeat(problem, fit.values[None])
-        if not fit.chi2 < previous.chi2 * (1.0 - MIN_CHI2_DECREASE):
-            break
-    return fit
-
-
-def _count_steps(
-    finder: Any, params: Any, first_states: np.ndarray, last_time: float, options: StepOptions
-) -> int:
-    """Return a number of steps that takes longer than a series, also for slightly faster walks."""
+    if first_states is None:
+        return row_steps, finder.leg_period, window
+    if times.min() < window:
+        raise ValueError(
+            f"the series begins {times.min():g} s after the first touchdown, but its samples are "
+            f"means over {window:g} s before and after them: begin later, or give window=."
+        )
     walker = finder.model if finder.model.is_wheel else finder.model.walker
-    n_needed = 1
+    # Walks may become somewhat faster during the search.
+    end_time = DURATION_MARGIN * (float(times.max()) + window)
     for x in jnp.asarray(np.unique(first_states, axis=0)):
         x = walker.complete_section_state(params, x) if walker.is_wheel else x
-        time, n_steps = 0.0, 0
-        while time < DURATION_MARGIN * last_time and n_steps < MAX_STEPS:
+        time, n_taken = 0.0, 0
+        while time < end_time and n_taken < MAX_STEPS:
             step = walker.advance(params, x, options)
             if int(step.outcome) != Outcome.STEPPED:
                 break
-            x, time, n_steps = step.section_state, time + float(step.duration), n_steps + 1
-        n_needed = max(n_needed, n_steps)
-    return n_needed
+            x, time, n_taken = step.section_state, time + float(step.duration), n_taken + 1
+        n_steps = max(n_steps, n_taken)
+    return row_steps, n_steps, window
 
 
 def _arrange_conditions(
     table: FitData,
-    model: Any,
+    finder: Any,
     walks: np.ndarray,
     row_walks: np.ndarray,
     row_steps: np.ndarray | None,
@@ -490,67 +365,130 @@ def _arrange_conditions(
     """
     if table.kind == "gaits":
         return dict(table.conditions)
-    n_walks = len(walks)
-    arranged = {}
+    first_rows, arranged = np.unique(row_walks, return_index=True)[1], {}
     for name, column in table.conditions.items():
-        by_walk = [column[row_walks == walk] for walk in range(n_walks)]
-        if name != HEIGHT_COLUMN and all(np.ptp(x) == 0.0 for x in by_walk):
-            arranged[name] = np.array([x[0] for x in by_walk])
+        of_walks = column[first_rows]
+        if name != HEIGHT_COLUMN and (column == of_walks[row_walks]).all():
+            arranged[name] = of_walks
             continue
-        if row_steps is None or (model.is_wheel and name not in ("slope", HEIGHT_COLUMN)):
+        if row_steps is None or (finder.model.is_wheel and name not in ("slope", HEIGHT_COLUMN)):
             raise ValueError(
                 f"{name} varies within a walk, but only the ground may, from step to step: give "
                 "one value for each walk, or number the steps in a column 'step'."
             )
-        values = np.full((n_walks, n_steps), np.nan)
+        label_step = lambda step: f"step {step + table.labels[STEP_COLUMN].min():g}"
+        values = np.full((len(walks), n_steps), np.nan)
         values[row_walks, row_steps] = column
-        if not (is_same := values[row_walks, row_steps] == column).all():
-            row = is_same.argmin()
+        for row in np.flatnonzero(values[row_walks, row_steps] != column):
             raise ValueError(
-                f"{name} differs between the rows of step {table.labels['step'][row]:g} of walk "
+                f"{name} differs between the rows of {label_step(row_steps[row])} of walk "
                 f"{walks[row_walks[row]]:g}, but a step has one ground: give these rows one value."
             )
-        last_steps = [row_steps[row_walks == walk].max() for walk in range(n_walks)]
-        for walk, last_step in enumerate(last_steps):
-            missing = np.flatnonzero(np.isnan(values[walk, :last_step]))
-            if missing.size:
-                raise ValueError(
-                    f"{name} of step {missing[0] + table.labels['step'].min():g} of walk "
-                    f"{walks[walk]:g} is missing, but later steps depend on this ground: give a "
-                    "row for each step, with large errors where nothing was measured."
-                )
-            # The ground goes on with the last value where a walk has fewer steps.
-            values[walk, last_step:] = values[walk, last_step]
-        if name == HEIGHT_COLUMN:
-            values = np.concatenate([np.zeros((n_walks, 1)), values], 1)
-        arranged[name] = values
+        last_steps = np.zeros(len(walks), int)
+        np.maximum.at(last_steps, row_walks, row_steps)
+        is_walked = np.arange(n_steps) <= last_steps[:, None]
+        for walk, step in np.argwhere(is_walked & np.isnan(values)):
+            raise ValueError(
+                f"{name} of {label_step(step)} of walk {walks[walk]:g} is missing, but later steps "
+                "depend on this ground: give a row for each step, with large errors where nothing "
+                "was measured."
+            )
+        # The ground goes on with the last value where a walk has fewer steps.
+        values = np.where(is_walked, values, np.take_along_axis(values, last_steps[:, None], 1))
+        is_height = name == HEIGHT_COLUMN  # Heights begin with that of the first foothold.
+        arranged[name] = np.pad(values, ((0, 0), (int(is_height), 0)))
     return arranged
+
+
+def _check_unknowns(
+    table: FitData,
+    finder: Any,
+    free: Sequence[str],
+    unknown_names: tuple[str, ...],
+    bounds: Mapping[str, Any],
+    priors: Mapping[str, Any],
+    observe: Any,
+) -> None:
+    """Raise an error unless names are known, and numbers as many as unknowns."""
+    parameter_names = finder.model.parameter_names
+    offset_names = [f"{name}{OFFSET_SUFFIX}" for name in parameter_names]
+    offset_names += [TIME_OFFSET] * (table.kind == "series")
+    for name in free:
+        require_known_name(name, (*parameter_names, *offset_names), "parameter of the walker")
+        if name in table.conditions:
+            raise ValueError(
+                f"{name} is free and a column of data, but a column describes what is known: free "
+                f"{name}_offset, or remove one of them."
+            )
+    if not unknown_names or len(set(unknown_names)) < len(unknown_names):
+        raise ValueError(f"the unknowns are {unknown_names}, but each is named once: change free.")
+    for name in (*bounds, *priors):
+        require_known_name(name, unknown_names, "unknown")
+    if table.kind == "gaits" and observe is None:
+        for name in table.names:
+            require_known_name(name, finder.differentiable_measures, "measure of gaits")
+    n_numbers = table.values[0].size + len(priors)
+    if n_numbers < len(unknown_names):
+        raise ValueError(
+            f"data contain {n_numbers} numbers for {len(unknown_names)} unknowns ("
+            f"{', '.join(unknown_names)}), which cannot be estimated from fewer: measure more, or "
+            "give start= or fewer free parameters."
+        )
 
 
 def _choose_starts(
     problem: FitProblem,
-    targets: FitTarget,
+    target: FitTarget,
     first: np.ndarray,
-    bounded: Collection[str],
-    free: Collection[str],
+    bounded: Sequence[str],
+    free: Sequence[str],
     n_starts: int,
 ) -> np.ndarray:
     """Return the starts of searches: the given walker, and the best of random ones around it."""
+    unknowns = problem.unknowns
     n_candidates = 1 if n_starts == 1 else max(n_starts, N_CANDIDATES)
     shares = np.random.default_rng(0).random((n_candidates, len(first)))
-    candidates = np.tile(first, (n_candidates, 1))
-    for i, name in enumerate(problem.unknown_names):
-        if name in bounded:
-            width = problem.upper[i] - problem.lower[i]
-            candidates[1:, i] = problem.lower[i] + shares[1:, i] * width
-        elif name in free and first[i] != 0.0:
-            candidates[1:, i] = first[i] * START_RANGE_FACTOR ** (2.0 * shares[1:, i] - 1.0)
-    candidates = np.clip(candidates, problem.lower, problem.upper)
+    is_bounded = np.isin(unknowns.names, bounded)
+    widths = np.where(is_bounded, unknowns.upper - unknowns.lower, 0.0)
+    candidates = np.select(
+        [is_bounded, np.isin(unknowns.names, free)],
+        [unknowns.lower + shares * widths, first * START_RANGE_FACTOR ** (2.0 * shares - 1.0)],
+        first,
+    )
+    candidates[0] = first
+    candidates = np.clip(candidates, unknowns.lower, unknowns.upper)
     if n_candidates == n_starts:
         return candidates
-    chi2 = measure_candidates(problem, targets, candidates)
-    best = 1 + np.argsort(np.asarray(chi2)[1:], kind="stable")[: n_starts - 1]
-    return candidates[np.append(0, best)]
+    chi2 = evaluate_fits(problem, target, candidates).chi2
+    chi2[0] = -np.inf
+    return candidates[np.argsort(chi2, kind="stable")[:n_starts]]
+
+
+# Largest number of times that the guesses of gaits are replaced by the gaits of the last fit.
+MAX_GUESS_UPDATES = 20
+# Smallest relative decrease of chi2 after which the guesses are replaced again.
+MIN_CHI2_DECREASE = 1e-6
+
+
+def _improve_with_new_guesses(result: FitResult) -> FitResult:
+    """Return a fit to gaits of a walker whose guesses are the gaits of the fit itself.
+
+    A gait that is far from its guess may not be found, which would hold the search back.
+    """
+    for _ in range(MAX_GUESS_UPDATES):
+        problem = result.problem
+        unknowns = problem.name_unknowns(jnp.asarray(result.values))
+        gaits = _find_row_gaits(
+            problem.finder, problem.collect_values(unknowns, problem.conditions)
+        )
+        if not np.all(gaits.found):
+            break
+        problem = eqx.tree_at(lambda p: p.starts, problem, jnp.asarray(gaits.section_state))
+        previous = result
+        result = make_result(problem, result.target, result.values[None], result.data, False)
+        if not result.chi2 < previous.chi2 * (1.0 - MIN_CHI2_DECREASE):
+            break
+    return result
 
 
 class QuadraticDamper(eqx.Module):
@@ -651,25 +589,23 @@ def compare_laws(
         law_names = [x.name for x in list_parameters(law_model.leg_force, "leg")]
         fits[name] = fit(data, params, (*free, *law_names), model=law_model, **fit_options)
         prediction_errors.append(_predict_left_out(fits[name], n_folds))
-    stack = lambda name: np.array([getattr(x, name) for x in fits.values()])
-    chi2, n_unknowns = stack("chi2"), np.array([len(x.names) for x in fits.values()])
-    dims = ("law", DATASET_DIMENSION)[: chi2.ndim]
-    aic = (chi2.T + 2.0 * n_unknowns).T
-    columns = {
-        "chi2": chi2,
-        "n_unknowns": n_unknowns,
-        "p_value": stack("p_value"),
-        "prediction_error": np.array(prediction_errors),
-        "converged": stack("converged"),
-        "aic": aic,
-        "aic_difference": aic - aic.min(0),
-    }
-    names = np.array(list(laws))
-    return xr.Dataset(
-        {name: (dims[: x.ndim], x) for name, x in columns.items()},
-        {"law": names},
-        {"best": names[aic.argmin(0)] if chi2.ndim > 1 else str(names[aic.argmin()]), "fits": fits},
+    is_batch = any(result.values.ndim > 1 for result in fits.values())
+    dims = ("law", DATASET_DIMENSION) if is_batch else ("law",)
+    collect = lambda name: [getattr(result, name) for result in fits.values()]
+    table = xr.Dataset(
+        {
+            "chi2": (dims, collect("chi2")),
+            "n_unknowns": ("law", [len(names) for names in collect("names")]),
+            "p_value": (dims, collect("p_value")),
+            "prediction_error": (dims, prediction_errors),
+            "converged": (dims, collect("converged")),
+        },
+        {"law": list(laws)},
     )
+    table["aic"] = table.chi2 + 2.0 * table.n_unknowns
+    table["aic_difference"] = table.aic - table.aic.min("law")
+    best = table.law.values[table.aic.argmin("law").values]
+    return table.assign_attrs(best=best if is_batch else str(best), fits=fits)
 
 
 def _predict_left_out(result: FitResult, n_folds: int) -> Any:
@@ -678,18 +614,16 @@ def _predict_left_out(result: FitResult, n_folds: int) -> Any:
     The rows are divided into parts, of which each is left out in turn. One part would leave out all
     rows, so that the result is NaN.
     """
-    n_rows = result.data.values.shape[1]
-    targets = result.target
-    if result.values.ndim == 1:
-        targets = FitTarget(*(x[None] for x in targets))
-    squares = np.zeros(result.values.shape[:-1])
+    target, starts = result.target, np.atleast_2d(result.values)
+    n_rows, n_columns = target.values.shape[1:]
     if (n_folds := min(n_folds, n_rows)) < 2:
-        return squares + np.nan
+        return np.full(result.values.shape[:-1], np.nan)[()]
+    sum_of_squares: Any = 0.0
     for fold in range(n_folds):
-        is_left_out = np.arange(n_rows)[None] % n_folds == fold
-        kept = targets._replace(row_weights=1.0 - is_left_out)
-        solution = solve_fits(result.problem, kept, np.atleast_2d(result.values))
-        left_out = targets._replace(row_weights=1.0 * is_left_out)
-        whitened = summarize(result.problem, left_out, solution).whitened
-        squares = squares + (whitened**2).sum((-2, -1)).reshape(squares.shape)
-    return np.sqrt(squares / result.data.values[0].size)[()]
+        is_left_out = np.arange(n_rows) % n_folds == fold
+        whitener = np.where(is_left_out[:, None, None], 0.0, target.whitener)
+        fits = solve_fits(result.problem, target._replace(whitener=whitener), starts)
+        residuals = whiten(target, fits.unknowns, fits.prediction[0])[0][:, is_left_out]
+        sum_of_squares += np.sum(residuals**2, (-2, -1))
+    errors = np.sqrt(sum_of_squares / (n_rows * n_columns))
+    return errors if result.values.ndim > 1 else errors[0]
