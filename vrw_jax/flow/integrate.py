@@ -66,14 +66,14 @@ from vrw_jax.lanes.autodiff import apply_batched_jvp_rule
 class PhaseEnd(NamedTuple):
     """State at the end of a phase, duration, triggered guard, failure flags and margin minima."""
 
-    state: Any  # a StageState, or an array
+    state: Any  # a StageState, positions and rates, or an array
     duration: Array  # s
     end_guard_index: Array  # index of the guard that ended the phase; -1 if none did
     is_timed_out: Array
     # whether the element is a straggler, see `integrate_batch_phase`
     is_unfinished: Array
     solver_steps: Array  # number of tried solver steps, accepted or not
-    next_solver_dt: Array  # next step length that the controller proposes, s
+    next_solver_dt: Array  # a first step length for the next phase, s
     margin_minima: Any  # minima of the margins, (margins, batch) or (margins,)
     kink_log: Any = None  # a `tangents.KinkLog` without tangents, if requested
 
@@ -114,9 +114,10 @@ def integrate_batch_phase(
     - `straggler_count`: largest number of elements that may be cut off; None for no cut-off.
 
     Each active element is integrated to its earliest event. Errors are those of
-    `hybrid.integrate_phase`. Stragglers are the last `straggler_count` elements of a large batch
-    that take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the batch. Their
-    integration stops early, and the caller integrates them again in a batch of stragglers.
+    `phase_integration.integrate_phase`. Stragglers are the last `straggler_count` elements of a
+    large batch that take `STRAGGLER_ITERATION_FACTOR` times as many iterations as half of the
+    batch. Their integration stops early, and the caller integrates them again in a batch of
+    stragglers.
 
     The result is differentiable with respect to `equation_constants`, `held_constants`, `q` and
     `v`, see `tangents`.
@@ -245,15 +246,18 @@ def integrate_to_event(
 
     The arguments are those of `integrate_batch_phase` and of `integrate_over_kinks`.
 
+    Without kinks, `take_steps` moves each element to the solver step in which a guard falls to
+    zero, and `locate` shortens this step. `integrate_over_kinks` repeats both between kinks.
+
     - `phase_tangents`: a `PhaseTangents` or an object with the same methods, or None;
     - `interruption`: when the integration is interrupted, and elements that continue after one.
     """
     phase = phase.wrap_functions(lanes.mark_noinline if phase.is_compiled_separately else jax.jit)
     n_guards: Any = None
-    phase_with_kinks, enter_sides = phase, None
+    whole_phase, enter_sides = phase, None
     if phase.evaluate_kinks is not None:
         phase, enter_sides, n_guards = _enter_first_sides(
-            phase, phase_tangents, phase.make_state(q, v), tableau, options
+            whole_phase, phase_tangents, phase.make_state(q, v), tableau, options
         )
     solver = make_solver_step_function(phase, tableau, options)
     start_state = phase.make_state(q, v)
@@ -282,7 +286,7 @@ def integrate_to_event(
             has_last_step = phase_tangents is not None and phase.take_solver_step is not None
             # The functions are called, not inlined, because the program is already long.
             if not has_last_step:
-                phase = phase_with_kinks = phase.wrap_functions(lanes.mark_noinline)
+                phase = whole_phase = phase.wrap_functions(lanes.mark_noinline)
                 solver = make_solver_step_function(phase, tableau, options)
         if phase.take_last_step is not None:
             take_last_step = phase.take_last_step
@@ -296,7 +300,7 @@ def integrate_to_event(
                 make_loop(phase, solver, tangents), functools.partial(locate, phase, solver), state
             ),
             enter_sides, sides, n_guards, tableau, integrator_state, options, attach_derivatives,
-            phase_with_kinks.n_logged_kinks,
+            whole_phase.n_logged_kinks,
         )  # fmt: skip
         phase, solver, _ = enter_sides(sides)
     phase_end, located_guard_index = _make_phase_end(
@@ -315,7 +319,7 @@ def integrate_to_event(
         search_end = search_end._replace(kink_tangents=log.tangents)
     if integrator_state.margin_minima_state is None:
         return phase_end, search_end
-    start_margins = jnp.stack(phase_with_kinks.evaluate_margins(start_state))
+    start_margins = jnp.stack(whole_phase.evaluate_margins(start_state))
     return _add_margin_minima(phase, start_margins, event_search, phase_end, search_end, options)
 
 

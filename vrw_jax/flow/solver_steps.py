@@ -276,7 +276,7 @@ class StageAccelerations(NamedTuple):
 
     sin: Any  # sine of theta
     cos: Any
-    acceleration: Any  # accelerations of all three coordinates, those of the phase first
+    acceleration: Any  # accelerations, those of the phase's coordinates first
 
 
 @functools.cache
@@ -432,7 +432,7 @@ class BatchPhase(NamedTuple):
     evaluate_margins: Callable[[StageState], Vector] = lambda stage_state: ()
     """Function that returns the margins whose minima are computed."""
     margins_include_start: tuple[bool, ...] = ()
-    """Whether each margin counts at the phase's start, see `hybrid.GuardsAndMargins`."""
+    """Whether each margin counts at the phase's start, see `phase_integration.GuardsAndMargins`."""
     implicit_dynamics: ImplicitDynamics = None  # type: ignore[assignment]
     """Equations of motion in implicit form. Only derivatives need them."""
     is_compiled_separately: bool = False
@@ -465,7 +465,7 @@ class BatchPhase(NamedTuple):
     errors of inner stages are as large as its values. By default, such guards start at zero.
     """
     guard_scales: Array | None = None
-    """Magnitudes of the guards' terms if events are exact, see `hybrid.GuardsAndMargins`."""
+    """Magnitudes of the guards' terms if events are exact, see `phase_integration`."""
     evaluate_armed_guards: Callable[[StageState], tuple[Array, Array]] | None = None
     """Function that returns values and minus `armed` of the guards that have it."""
     guards_met_at_start: Array | None = None

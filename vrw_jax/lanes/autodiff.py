@@ -489,7 +489,8 @@ def compute_each_jvp(function: Callable[..., Any], primals: tuple, directions: t
 def with_batched_jvp(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return `function` with a JVP rule that computes the tangents of all directions together.
 
-    The rule differentiates with respect to all floating-point arrays among the arguments.
+    The values are those of `function`. The rule differentiates with respect to all floating-point
+    arrays among the arguments.
     """
 
     def call_with_batched_jvp(*arguments: Any) -> Any:

@@ -127,7 +127,7 @@ def run_step_phases(
     )
     # A landing that releases the rear foot continues in SLS-I.
     is_double_support_active = is_valid_step & landing_result.is_rear_foot_planted
-    remaining_phases = _run_remaining_phases(
+    run_results = _run_phases(
         phase_runner,
         step_phases,
         landing_result.theta_after_landing,
@@ -136,26 +136,25 @@ def run_step_phases(
         is_double_support_active,
         options,
     )
-    return PhaseSequenceResult(s, landing_result, step_phases, *remaining_phases, ground_ahead)
+    return PhaseSequenceResult(s, landing_result, step_phases, *run_results, ground_ahead)
 
 
-def _run_remaining_phases(
+def _run_phases(
     phase_runner: PhaseRunner,
-    remaining_phases: tuple[AbstractPhase, ...],
+    phases: tuple[AbstractPhase, ...],
     wheel_angle: Elementwise,
     wheel_motion: Motion,
     is_valid_step: Array,
     is_phase_active: Array,
     options: StepOptions,
 ) -> tuple[tuple[tuple[Vector, Vector], ...], tuple[PhaseEnd, ...], tuple[Array, ...], Array]:
-    """Integrate the remaining phases of a step, starting from a motion in the first remaining
-    phase.
+    """Integrate the phases of a step from a motion in the first of them, to the end of the step.
 
     Return the starts and ends of the phases, whether each phase occurred, and the outcome, as in
     `PhaseSequenceResult`.
 
     - `is_valid_step`: whether the inputs are valid, so that a step takes place;
-    - `is_phase_active`: whether the first remaining phase takes place.
+    - `is_phase_active`: whether the first phase takes place.
     """
     step_outcome = jnp.where(
         is_valid_step, jnp.int32(Outcome.STEPPED), jnp.int32(Outcome.BAD_INPUT)
@@ -171,13 +170,14 @@ def _run_remaining_phases(
         fallback_theta,
         Motion.from_angle(fallback_theta, *fallback_lengths_and_rates),
     )
-    for previous_phase, phase in zip((None, *remaining_phases), remaining_phases, strict=False):
+    for previous_phase, phase in zip((None, *phases), phases, strict=False):
         if previous_phase is not None:
             q, v, *_ = phase_end_results[-1].state
             end_state = q[0], previous_phase.compute_motion(q, v)
             wheel_angle, wheel_motion = select_trees_by_condition(
                 is_phase_active, end_state, (wheel_angle, wheel_motion)
             )
+            # Until a phase fails, the outcome is STEPPED.
             is_phase_active = step_outcome == Outcome.STEPPED
             wheel_angle, wheel_motion = select_trees_by_condition(
                 is_phase_active, (wheel_angle, wheel_motion), fallback_state
@@ -198,9 +198,7 @@ def _run_remaining_phases(
         phase_end_results.append(phase_end)
         # The start of the last phase is itself an event: Leg 2 hits its stopper.
         has_phase_occurred.append(
-            is_phase_active
-            if phase is remaining_phases[-1]
-            else is_phase_active & (phase_end.duration > 0.0)
+            is_phase_active if phase is phases[-1] else is_phase_active & (phase_end.duration > 0.0)
         )
     starts, ends = tuple(phase_start_states), tuple(phase_end_results)
     return starts, ends, tuple(has_phase_occurred), step_outcome
@@ -230,7 +228,7 @@ def finish_gait_step(
         is_valid_state, params, phase_state, FALLBACK_SINGLE_SUPPORT_STATE
     )
     phases = make_paper_phases(params.symbols(), foot_distance, stop_at_lift_off)
-    _, phase_end_results, _, step_outcome = _run_remaining_phases(
+    _, phase_end_results, _, step_outcome = _run_phases(
         phase_runner,
         phases[phase_index:],
         phase_state[0],

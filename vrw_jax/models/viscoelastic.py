@@ -322,7 +322,7 @@ def take_steps_of_lanes(
     )
     float_phase_sequence = phase_sequence._replace(
         phases=(), phase_start_states=(), phase_end_results=phase_end_results
-    )  # only floats
+    )  # only floats: `make_step_result` makes the phases anew
     return with_batched_jvp(
         lambda phase_sequence: make_step_result(phase_sequence, friction, "lanes")
     )(float_phase_sequence)
@@ -634,20 +634,23 @@ def _make_phase_runner(
                 )
                 stiff_dt0 = jnp.minimum(MAX_FIRST_STEP_RATIO * dt0, max_transient_dt)
                 dt0 = jnp.where(has_occurred, stiff_dt0, dt0)
-        float_leaves, nonarray_leaves = eqx.partition((phase.s, phase.ground_ahead), eqx.is_array)
+        # Rules for derivatives must get all arrays as arguments, and not by closures.
+        equation_constants, other_constants = eqx.partition(
+            (phase.s, phase.ground_ahead), eqx.is_array
+        )
 
-        def make_phase(float_leaves: Any, phase_constants: Vector) -> BatchPhase:
-            s, ground_ahead = eqx.combine(float_leaves, nonarray_leaves)
-            phase_with_traced_inputs = dataclasses.replace(
-                phase, s=s, phase_constants=phase_constants, ground_ahead=ground_ahead
+        def make_phase(equation_constants: Any, held_constants: Vector) -> BatchPhase:
+            s, ground_ahead = eqx.combine(equation_constants, other_constants)
+            phase_of_arguments = dataclasses.replace(
+                phase, s=s, phase_constants=held_constants, ground_ahead=ground_ahead
             )
             return make_batch_phase(
-                phase_with_traced_inputs, records_margins, is_compiled_separately
+                phase_of_arguments, records_margins, is_compiled_separately
             )._replace(n_logged_kinks=n_logged_kinks)
 
         return integrate_batch_phase(
             make_phase,
-            float_leaves,
+            equation_constants,
             phase.phase_constants,
             tableau,
             q,

@@ -320,9 +320,7 @@ def solve_single_support_2(s: Symbols, motion: Motion) -> Acceleration:
 
 
 class SingleDofEquation(NamedTuple):
-    """Equation of motion for one degree of freedom: inertia_factor * ddtheta =
-    generalized_force.
-    """
+    """Equation of motion: `generalized_inertia` * ddtheta = `generalized_force`."""
 
     generalized_inertia: Elementwise  # kg m^2
     generalized_force: Elementwise  # N m
@@ -358,18 +356,20 @@ def compute_double_support_equation(
     sin_squared_coefficient = -squared_bisector_factor * weight_factor * s.sin_phi
 
     rear_leg, dtheta = rotate_to_rear_leg(s, motion.sin_theta, motion.cos_theta), motion.dtheta
-    sin, cos = motion.sin_theta + rear_leg.sin, motion.cos_theta + rear_leg.cos
+    sin_sum, cos_sum = motion.sin_theta + rear_leg.sin, motion.cos_theta + rear_leg.cos
     sin_torque_factor = (
         sin_coefficient
-        + sin_cos_coefficient * cos
-        + sin_squared_coefficient * sin
+        + sin_cos_coefficient * cos_sum
+        + sin_squared_coefficient * sin_sum
         + sin_squared_rate_coefficient * dtheta * dtheta
     )
-    slope_torque = weight_factor * s.sin_phi + leg_weight_moment * s.sin_phi * cos
+    slope_torque = weight_factor * s.sin_phi + leg_weight_moment * s.sin_phi * cos_sum
     damping_coefficient = (
         1.0 - s.cos_alpha
-    ) * damping_factor + squared_bisector_factor * s.cos_alpha * damping_factor * (sin * sin)
-    generalized_force = slope_torque + sin * sin_torque_factor - damping_coefficient * dtheta
+    ) * damping_factor + squared_bisector_factor * s.cos_alpha * damping_factor * (
+        sin_sum * sin_sum
+    )
+    generalized_force = slope_torque + sin_sum * sin_torque_factor - damping_coefficient * dtheta
     if has_own_law:
         leg_force_1, leg_force_2 = compute_leg_forces(s, motion)
         generalized_force = generalized_force - hub_circle_diameter * (
@@ -380,7 +380,7 @@ def compute_double_support_equation(
             s, dtheta, motion.sin_theta, motion.cos_theta
         )
     return SingleDofEquation(
-        constant_inertia + 2.0 * sin_squared_rate_coefficient * cos, generalized_force
+        constant_inertia + 2.0 * sin_squared_rate_coefficient * cos_sum, generalized_force
     )
 
 

@@ -188,7 +188,8 @@ def resolve_landing(
     )
     is_rear_foot_planted = rear_impulse.normal >= 0.0
 
-    # (A3) If only the landing foot stays on the ground, M rates = p.
+    # (A3) If only the landing foot stays on the ground, M rates = p. Momenta take the place of
+    # forces, so that the results are rates instead of accelerations.
     rates_without_rear_foot = solve_unconstrained_dynamics(s, s.L0, EquationTerms(M, p1, p2, p3))
     motion_after = motion_on_both_feet._replace(
         dtheta=jnp.where(is_rear_foot_planted, dtheta_both_feet, rates_without_rear_foot.ddtheta),
