@@ -328,6 +328,9 @@ def test_measures_of_gaits_of_any_walker_are_fitted(walker):
     assert [period.get_ylabel(), height.get_ylabel()] == ["$T$ [s]", "height [m]"]
     # Names of parameters of the wheel do not have its symbols and units here.
     assert [ellipse.get_xlabel(), ellipse.get_ylabel()] == ["damping [N·s/m²]", "stiffness"]
+    batch = dataclasses.replace(result, values=np.ones((2, 1)), standard_errors=np.ones((2, 1)))
+    with pytest.raises(ValueError, match="have one unknown"):
+        vrw.plot.fit_figure(batch)
 
 
 def test_gaits_far_from_the_starts_of_a_walker_are_fitted():

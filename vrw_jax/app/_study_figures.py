@@ -538,6 +538,11 @@ def fit_figure(result: FitResult, *, level: float = 0.95, width: FigureWidth = N
     check_type("result", result, FitResult, "give vrw.fit(data, params)")
     level = check_real("level", level)
     is_batch = result.values.ndim > 1
+    if is_batch and len(result.names) == 1:
+        raise ValueError(
+            "the fits of several data sets have one unknown, but their figure shows pairs of "
+            "unknowns: draw result.values."
+        )
     table = result.residuals
     correlation = np.abs(np.nan_to_num(result.correlation.values)).reshape(
         -1, len(result.names), len(result.names)

@@ -64,7 +64,7 @@ may become so much faster during the search."""
 MAX_STEPS = 1000
 
 
-@announce_wait("predictions with derivatives, and their fit", "30 s")
+@announce_wait("predictions with derivatives, and their fit", "15 s")
 def fit(
     data: Any,
     params: Any,
@@ -529,7 +529,7 @@ def make_leg_laws(params: Any) -> dict[str, Any]:
     }
 
 
-@announce_wait("predictions with derivatives, and their fit for each law", "60 s")
+@announce_wait("predictions with derivatives, and their fit for each law", "35 s")
 def compare_laws(
     data: Any,
     params: Any,
