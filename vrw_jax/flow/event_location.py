@@ -285,10 +285,16 @@ class _EventLocator(NamedTuple):
         lower_bound = jnp.where(is_before_event, step_length, search.lower_step_length_bound)
         upper_bound = jnp.where(is_before_event, search.upper_step_length_bound, step_length)
         proposed_step_length = step_length + time_to_event
-        # From an end of the bracket, Newton's method would return, as at the kink of a guard.
         is_proposal_in_bracket = (
-            (proposed_step_length > lower_bound) & (proposed_step_length < upper_bound)
-        ) | (jnp.abs(time_to_event) <= self.max_extrapolation_time)
+            proposed_step_length >= lower_bound - self.max_extrapolation_time
+        ) & (proposed_step_length <= upper_bound + self.max_extrapolation_time)
+        # From an end where it has been, Newton's method would return, as at the kink of a guard.
+        is_return = ((proposed_step_length <= lower_bound) & (lower_bound > 0.0)) | (
+            (proposed_step_length >= upper_bound) & (upper_bound < self.step_start.next_step_length)
+        )
+        is_proposal_in_bracket &= ~is_return | (
+            jnp.abs(time_to_event) <= self.max_extrapolation_time
+        )
         bisected_length = 0.5 * (lower_bound + upper_bound)
         if self.phase.guards_rising_at_start is not None:
             # A guard that rises at the start of the phase and falls soon after it has two roots

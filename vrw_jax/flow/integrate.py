@@ -552,6 +552,7 @@ def _try_solver_step(
     if phase.evaluate_armed_guards is not None:
         stages = (stage_states[i] for i in (0, *tableau.guard_stage_indices, -1))
         armed_guards = lax.stop_gradient([phase.evaluate_armed_guards(stage) for stage in stages])
+        # Value and minus `armed` take both roles in turn.
         for values, others in itertools.permutations(map(list, zip(*armed_guards, strict=True))):
             guard_minimum_fraction = jnp.minimum(
                 guard_minimum_fraction, find_hidden_event_fraction(tableau, values, others)

@@ -201,28 +201,29 @@ def find_earliest_guard_minimum_fraction(
 def find_hidden_event_fraction(
     tableau: ButcherTableau, values: list[Array], others: list[Array]
 ) -> Array:
-    """Return where values that the maximum with others may hide fall through zero, or are minimal.
+    """Return where guards with `armed` may be negative within a solver step that does not show it.
 
-    A guard with `armed` is such a maximum, of its value and minus `armed`. Within a solver step it
-    may be negative for a short time, which neither its sign at the end nor a polynomial through it
-    shows, because it has a kink. The location is a fraction of the step, or 1 if there is none. A
-    zero is exact in the limit of short steps. The times of `values` and `others`, (guards, batch),
-    are those of `find_earliest_guard_minimum_fraction`.
+    Such a guard is the maximum of its value and minus `armed`. It may be negative for a short time,
+    which neither its sign at the end of the step nor a polynomial through it shows, because it has
+    a kink. The result is the earliest zero or minimum of `values`, one of the two functions, while
+    `others` may be negative, as a fraction of the step, or 1 if there is none. A zero is exact in
+    the limit of short steps. The times of both, (guards, batch), are those of
+    `find_earliest_guard_minimum_fraction`.
     """
     coefficients = [*_compute_bernstein_coefficients(tableau, others), others[-1]]
-    may_count = functools.reduce(jnp.minimum, coefficients) < 0.0
-    may_hide = may_count & (functools.reduce(jnp.maximum, coefficients) >= 0.0)
+    may_be_negative = functools.reduce(jnp.minimum, coefficients) < 0.0
+    changes_sign = may_be_negative & (functools.reduce(jnp.maximum, coefficients) >= 0.0)
     fraction = jnp.ones_like(values[0])
     nodes = [0.0, *map(float, tableau.stage_nodes[list(tableau.guard_stage_indices)]), 1.0]
     for (left_node, left), (right_node, right) in itertools.pairwise(
         zip(nodes, values, strict=True)
     ):
-        is_bracket = may_hide & (left > 0.0) & (right <= 0.0)
+        is_bracket = changes_sign & (left > 0.0) & (right <= 0.0)
         share = left / jnp.where(is_bracket, left - right, 1.0)
         zero = left_node + (right_node - left_node) * share
         fraction = jnp.where(is_bracket, jnp.minimum(fraction, zero), fraction)
     overshoot = CROSSING_OVERSHOOT * jnp.maximum(fraction, CROSSING_OVERSHOOT)
-    minimum_fraction = find_earliest_guard_minimum_fraction(tableau, values, may_count)
+    minimum_fraction = find_earliest_guard_minimum_fraction(tableau, values, may_be_negative)
     return jnp.minimum(jnp.min(fraction + overshoot, axis=0), minimum_fraction)
 
 
