@@ -269,6 +269,10 @@ def test_ends_of_a_profile_interval_raise_chi2_by_the_quantile(small_fit):
     for end in (low, high):
         result = vrw.fit(SMALL_GAIT, SMALL_WHEEL, priors={"damping": (end, 1e-5)}, n_starts=1)
         assert result.chi2 - small_fit.chi2 == pytest.approx(1.0, abs=0.01)
+    bound = small_fit["damping"] + 0.5 * small_fit.error("damping")
+    bounds = {"damping": (1.0, bound)}
+    bounded = vrw.fit(SMALL_GAIT, small_fit.params, bounds=bounds, n_starts=1)
+    assert bounded.profile_interval("damping", 0.6827) == pytest.approx((low, np.inf), abs=1e-3)
 
 
 def test_steps_of_a_hybrid_system_are_fitted():
@@ -415,6 +419,9 @@ def test_measurements_with_unilateral_contact_return_the_wheel_that_made_them(ki
     distance = (result.values - [200.0, 0.7]) / result.standard_errors
     assert np.abs(distance).max() < (0.05 if kind == "series" else 1e-2)
     assert result.model.friction == result["friction"]
+    # The likelihood is largest at the estimates.
+    slopes = jax.grad(result.log_likelihood)(jnp.asarray(result.values)) if kind == "series" else 0
+    assert np.all(np.abs(slopes * result.standard_errors) < 0.05)
 
 
 BAD_DATA = {

@@ -34,6 +34,11 @@ def test_minima_within_bounds_are_those_of_scipy(n):
         )
         # A fit ends 1e-6 above the smallest chi2, and its last change then makes it more exact.
         assert fits.chi2[i] == pytest.approx(2.0 * reference.cost, abs=1e-9)
+    for i in range(20):  # A fit does not depend on the others of its batch.
+        alone = minimize_squares(
+            lambda _, x, i=i: evaluate([i], x), starts[i : i + 1], lower, upper
+        )
+        np.testing.assert_allclose(fits.unknowns[i], alone.unknowns[0], atol=1e-13)  # round-off
 
 
 def test_a_fixed_unknown_keeps_its_value_and_a_missing_prediction_its_start():

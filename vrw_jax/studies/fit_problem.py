@@ -472,14 +472,18 @@ def _predict_with_differences(x: Array, problem: FitProblem) -> Prediction:
 
 @_predict_with_differences.def_jvp
 def _differentiate_by_differences(primals: tuple, tangents: tuple) -> tuple:
-    (x, problem), change = primals, tangents[0]
-    size = jnp.max(jnp.abs(change / problem.unknowns.scale))
-    length = DIFFERENCE_STEP / jnp.where(size > 0.0, size, 1.0)
-    points = x + length * jnp.array([[1.0], [-1.0], [2.0], [-2.0]]) * change
-    values = jax.vmap(lambda x: problem.predict_exactly(x).values)(points)
-    tangent = jnp.tensordot(jnp.array([8.0, -8.0, -1.0, 1.0]) / (12.0 * length), values, 1)
+    x, problem = primals
+    changes = DIFFERENCE_STEP * problem.unknowns.scale
+    # The differences stay within the bounds.
+    limits = problem.unknowns.lower + 2.0 * changes, problem.unknowns.upper - 2.0 * changes
+    points = jnp.clip(x, *limits) + jnp.array([1.0, -1.0, 2.0, -2.0])[:, None, None] * jnp.diag(
+        changes
+    )
+    values = jax.vmap(jax.vmap(lambda x: problem.predict_exactly(x).values))(points)
+    weights = jnp.array([8.0, -8.0, -1.0, 1.0]) / 12.0
+    jacobian = jnp.einsum("k,kurc,u->rcu", weights, values, 1.0 / changes)
     prediction: Any = problem.predict_exactly(x)
-    return prediction, prediction._replace(values=tangent, is_valid=None)
+    return prediction, prediction._replace(values=jacobian @ tangents[0], is_valid=None)
 
 
 def whiten(target: FitTarget, x: Any, predicted: Any) -> tuple[Any, Any]:
@@ -504,7 +508,9 @@ def evaluate_fits(problem: FitProblem, targets: FitTarget, x: np.ndarray) -> Fit
     """Return the residuals of a batch of fits at unknowns `x`, with their derivatives."""
     predict = functools.partial(_predict_with_jacobian, problem)
     prediction, jacobian = map_in_numpy_batches(predict, FIT_BATCH_SIZES, x)
-    is_valid, (n, n_unknowns) = prediction.is_valid[:, None], x.shape
+    n, n_unknowns = x.shape
+    is_finite = np.isfinite(jacobian).reshape(n, -1).all(-1)
+    is_valid = (prediction.is_valid & is_finite)[:, None]
     whitened, of_priors = whiten(targets, x, prediction.values)
     residuals = np.concatenate([whitened.reshape(n, -1), of_priors], -1)
     columns = -(targets.whitener @ jacobian).reshape(n, -1, n_unknowns)

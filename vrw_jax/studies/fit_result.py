@@ -142,11 +142,13 @@ class FitResult:
         error = self.standard_errors[index]
         if not np.isfinite(error):
             return -np.inf, np.inf
+        unknowns = self.problem.unknowns
         # Newton's method finds both ends in one batch.
         sides, widths = np.array([-1.0, 1.0]), np.full(2, error * quantile)
         points, is_fixed = np.tile(self.values, (2, 1)), np.arange(len(self.names)) == index
         for _ in range(N_PROFILE_ITERATIONS):
-            points[:, index] = self.values[index] + sides * widths
+            position = self.values[index] + sides * widths
+            points[:, index] = np.clip(position, unknowns.lower[index], unknowns.upper[index])
             solution = solve_fits(self.problem, self.target, points, is_fixed)
             roots = np.sqrt(np.maximum(solution.chi2 - self.chi2, 0.0))
             if np.all(np.abs(roots - quantile) < PROFILE_TOLERANCE):
@@ -160,7 +162,7 @@ class FitResult:
             widths = widths + np.clip((quantile - roots) / rates, -0.5 * widths, 2.0 * widths)
             points = np.array(solution.unknowns)
         is_found = np.abs(roots - quantile) < 0.1
-        low, high = np.where(is_found, self.values[index] + sides * widths, sides * np.inf)
+        low, high = np.where(is_found, solution.unknowns[:, index], sides * np.inf)
         return float(low), float(high)
 
     def log_likelihood(self, values: Array) -> Array:
@@ -368,5 +370,5 @@ def estimate_covariance(
     errors = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     errors = np.where(unknown_share > RELATIVE_RANK_TOLERANCE, np.inf, errors)
     # Without a prediction, no direction is known to be without information.
-    is_missing = ~is_known & (singular[:, :1] > 0.0)
+    is_missing = ~is_known & np.isfinite(fits.chi2)[:, None]
     return covariance, errors, [x[missing] for x, missing in zip(right, is_missing, strict=True)]

@@ -17,10 +17,10 @@ NEGLIGIBLE_REDUCTION = 1e-6
 FIRST_DAMPING = 1e-3
 """Damping of the first change, relative to the diagonal of the Hessian."""
 MIN_DAMPING = 1e-8
-"""Smallest damping. It limits changes of unknowns that the data do not identify, which would follow
-errors of derivatives."""
+"""Smallest damping. It limits changes of unknowns about which the data contain no information. Such
+changes are only errors of derivatives."""
 MAX_DAMPING = 1e10
-ROUND_OFF = 1e-12
+HESSIAN_ROUND_OFF = 1e-12
 """Error of a Hessian whose diagonal is 1, below which its eigenvalues are unknown."""
 
 
@@ -57,17 +57,17 @@ def propose_unknowns(
     sizes = np.linalg.norm(jacobian, axis=1)
     sizes = np.where(sizes > 0.0, sizes, 1.0)
     columns = jacobian / sizes[:, None, :]
-    damping_matrix = (np.reshape(damping, (-1, 1, 1)) + ROUND_OFF) * np.eye(x.shape[-1])
+    damping_matrix = (np.reshape(damping, (-1, 1, 1)) + HESSIAN_ROUND_OFF) * np.eye(x.shape[-1])
     # On a bound, an unknown rests if chi2 would decrease only beyond it.
     slopes = np.einsum("bmn,bm->bn", jacobian, first_residuals)
     rests = is_fixed | (x <= lower) & (slopes > 0.0) | (x >= upper) & (slopes < 0.0)
-    residuals, proposed = first_residuals, x
+    residuals, proposed, is_done = first_residuals, x, np.zeros((len(x), 1), bool)
     for _ in range(x.shape[-1]):
         moving = np.where(rests[:, None, :], 0.0, columns)
         transposed = np.swapaxes(moving, -1, -2)
         hessian, gradient = transposed @ moving + damping_matrix, transposed @ residuals[..., None]
         steps = -np.linalg.solve(hessian, gradient)[..., 0]
-        changes = np.where(rests, 0.0, steps / sizes)
+        changes = np.where(rests | is_done, 0.0, steps / sizes)
         # An unknown that reaches a bound stays there, and the others move on.
         bounds = np.where(changes > 0.0, upper, lower)
         room = bounds - proposed
@@ -76,7 +76,8 @@ def propose_unknowns(
         has_reached = (shares <= share) & (share < 1.0)
         proposed = np.where(has_reached, bounds, np.clip(proposed + share * changes, lower, upper))
         residuals = first_residuals + np.einsum("bmn,bn->bm", jacobian, proposed - x)
-        if (share == 1.0).all():
+        is_done |= share == 1.0
+        if is_done.all():
             break
         rests = rests | has_reached
     return proposed, np.sum(first_residuals**2 - residuals**2, -1)
