@@ -736,6 +736,10 @@ class AimedBall(JuggledBall):
             lambda: vrw.step(BALL_PARAMS, [1.0], model=AimedBall()),
             "the attribute 'aim' of a dict, but params is a dict, which contains ball.restitution",
         ),
+        (
+            lambda: vrw.walk(BALL_PARAMS | {"kick": [1.0, 1.0]}, [1.0], 2, model=JuggledBall()),
+            r"a parameter of its own: give a batch of values as np.array",
+        ),
         (lambda: vrw.step({"leg": Kick()}, [1.0], model=AimedBall()), "'aim' of a dict"),
         (lambda: vrw.step(Kick(), [1.0], model=AimedBall()), "'aim' of a Kick.*contains kick: add"),
         (lambda: vrw.step(Kick(), [1.0], model=JuggledBall()), "an entry of a Kick in brackets"),

@@ -333,7 +333,7 @@ def test_derivatives_of_a_step_with_slip_and_flight_are_central_differences(law)
 # XLA compiles the step of diffrax, with its derivatives, for two minutes.
 @pytest.mark.slow
 def test_diffrax_computes_contacts_and_derivatives_of_machine_code():
-    """The law has all three kinks, since XLA needs minutes and gigabytes for each program."""
+    """One law has all three kinks, because XLA needs minutes and gigabytes for each program."""
     law = KinkedLeg(k2=300.0, c2=40.0, friction=5.0)
     lanes, diffrax = (
         differentiate_contact_step(law, 0.5, PARAMS_WITH_FLIGHT, START_OF_FLIGHT, engine)

@@ -163,7 +163,7 @@ def test_invalid_requests_for_indices_are_refused_in_one_sentence() -> None:
         vrw.saltelli(ISHIGAMI_RANGES, 100)
     with pytest.raises(ValueError, match="did you mean 'speed'"):
         vrw.sobol_indices(scan, ["sped"])
-    with pytest.raises(ValueError, match="measures is empty"):
+    with pytest.raises(ValueError, match="there are no measures"):
         vrw.sobol_indices(scan, [])
     of_legs = scan.assign(force=scan.speed.expand_dims(leg=2, axis=1))
     with pytest.raises(ValueError, match="'force' has the axes sample, leg, but"):

@@ -252,6 +252,12 @@ def name_missing_parameters(params: Any) -> Iterator[None]:
     except (KeyError, AttributeError, TypeError) as error:
         names = [parameter.name for parameter in list_tree_parameters(params)]
         name, kind = error.args[0] if error.args else None, type(params).__name__
+        is_list = lambda node: isinstance(node, list)
+        if "'list'" in str(name) and any(map(is_list, jax.tree.leaves(params, is_leaf=is_list))):
+            raise TypeError(
+                "params contains a list, each entry of which is a parameter of its own: give a "
+                "batch of values as np.array([...])."
+            ) from error
         if isinstance(error, AttributeError) and _is_node(error.obj, jax.tree.structure(params)):
             missing = f"the attribute {error.name!r} of a {type(error.obj).__name__}"
         elif isinstance(error, KeyError) and isinstance(name, str) and name not in names:

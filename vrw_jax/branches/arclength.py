@@ -359,8 +359,8 @@ MAX_RANGE_EXCESS = 1e-12
 
 SUSPICIOUS_STEP_TOLERANCE = 1e-10
 """Tolerance of the points up to a suspicious one. The value is chosen because Newton's method may
-turn onto a crossing branch at a distance of some thousand tolerances, and does not reach smaller
-ones there.
+turn onto a crossing branch at a distance of some thousand tolerances, and can't meet a smaller
+tolerance there.
 """
 
 Plane = tuple[np.ndarray, np.ndarray]
@@ -602,8 +602,8 @@ class ArclengthDriver:
         previous, ds, is_range_end, takes_other_plane = points[0], options.initial_ds, False, False
         # A suspicious step may have reached another branch; shorter steps then avoid the jump. If
         # they stall within its length, as at a crossing, its point is accepted.
-        suspicious, length_to_suspicious, is_point_new = None, 0.0, True
-        near_crossing = self.with_tolerance(SUSPICIOUS_STEP_TOLERANCE)
+        suspicious_step, length_to_suspicious, is_point_new = None, 0.0, True
+        crossing_driver = self.with_tolerance(SUSPICIOUS_STEP_TOLERANCE)
         while True:
             trial_z, trial_fraction, plane, length_to_end, is_next_range_end = self.predict(
                 previous, points[-1], ds, takes_other_plane
@@ -614,14 +614,14 @@ class ArclengthDriver:
                     points[-1] = points[0]
                 return Track(points, status)
             if ds < options.min_ds:
-                if suspicious is None:
+                if suspicious_step is None:
                     return Track(points, ContinuationStatus.STEP_SIZE_UNDERFLOW)
-                previous, ds, is_range_end = suspicious
+                previous, ds, is_range_end = suspicious_step
                 points.append(previous)
-                suspicious, takes_other_plane, is_point_new = None, False, True
+                suspicious_step, takes_other_plane, is_point_new = None, False, True
                 continue
             is_range_end = is_next_range_end
-            driver = self if suspicious is None else near_crossing
+            driver = self if suspicious_step is None else crossing_driver
             correction = yield from driver.correct(trial_z, trial_fraction, plane, ds)
             current = points[-1]
             tangent = self.coordinates(current.arclength_tangent, current.fraction_rate)
@@ -655,12 +655,12 @@ class ArclengthDriver:
                     )
                 )
             is_point_new &= not is_suspicious
-            if is_suspicious and suspicious is None:
-                suspicious, length_to_suspicious = (point, ds, is_range_end), ds
+            if is_suspicious and suspicious_step is None:
+                suspicious_step, length_to_suspicious = (point, ds, is_range_end), ds
             if is_point_new:
                 length_to_suspicious -= ds
                 if length_to_suspicious <= 0.0:
-                    suspicious = None
+                    suspicious_step = None
                 # The cubic prediction must not cross a kink.
                 previous, takes_other_plane = point if is_kink else current, False
                 points.append(point)

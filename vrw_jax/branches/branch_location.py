@@ -176,8 +176,8 @@ RETRY_CHORD_FRACTIONS = (0.99, 0.9)
 # keeps the errors of round-off and interpolation below 1e-9. The second is for crossings that are
 # nearer to another special point.
 CROSSING_DISTANCES = (1e-2, 1e-3)
-# Tolerance of these points. The value is above their amplified round-off, to which two converged
-# Newton iterations reduce their errors.
+# Tolerance of these points. The value is chosen above their amplified round-off. Two converged
+# Newton iterations reduce the errors to this round-off.
 CROSSING_TOLERANCE = 1e-8
 # Largest absolute value of a margin to the fold whose sign is only round-off. The value is chosen
 # above the round-off of a determinant of numbers of order one, which is 1e-15. Points so near to a

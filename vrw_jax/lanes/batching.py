@@ -172,8 +172,9 @@ def concatenate_tree_rows(*trees: PyTree) -> PyTree:
 def map_in_batches(function: Callable, batch_sizes: tuple[int, ...], *trees: PyTree) -> PyTree:
     """Apply `function` to trees of arrays in batches along the leading axis, and join the results.
 
-    Each batch is padded to a size in `batch_sizes`, so that the function is compiled for few shapes
-    only. Inputs and outputs are JAX arrays.
+    Each batch is padded to the smallest size in `batch_sizes` that can contain it, so that the
+    function is compiled once for each size. A larger batch costs less for each element, and a
+    smaller one wastes less on padding. Inputs and outputs are JAX arrays.
     """
     if len(jax.tree.leaves(trees)[0]) in batch_sizes:
         return function(*jax.device_put(trees))

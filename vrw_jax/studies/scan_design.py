@@ -527,11 +527,17 @@ def _check_index_arguments(
             "give vrw.saltelli the ranges of two parameters or more."
         )
     if measures is None:
-        requested_names = scan.attrs[REQUESTED_MEASURES_ATTRIBUTE].split(", ")
-        measures = [name for name in requested_names if scan[name].dims == ("sample",)]
+        requested_names = str(scan.attrs.get(REQUESTED_MEASURES_ATTRIBUTE, "")).split(", ")
+        measures = [
+            name
+            for name in requested_names
+            if name in scan and name != "outcome" and scan[name].dims == ("sample",)
+        ]
     measure_names = list(check_names("measures", measures))
     if not measure_names:
-        raise ValueError('measures is empty, but indices are of a measure: give ["speed"], say.')
+        raise ValueError(
+            'there are no measures, but indices are of a measure: give measures=["speed"], say.'
+        )
     for name in ("outcome", *measure_names):
         if name not in scan:
             raise ValueError(
