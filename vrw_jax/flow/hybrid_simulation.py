@@ -350,10 +350,12 @@ def _simulate_one_event(
         for guard, offset in zip(mode.guards, guard_offset, strict=True)
         if guard.armed is not None
     ]
-    evaluate_armed_guards: Any = lambda y: (
-        jnp.stack([value(y) + offset for value, offset, _ in armed_guards]),
-        -jnp.stack([armed(y) for _, _, armed in armed_guards]),
-    )
+
+    def evaluate_armed_guards(y: StateArray) -> tuple[Array, Array]:
+        values = jnp.stack([value(y) + offset for value, offset, _ in armed_guards])
+        disarmed = -jnp.stack([armed(y) for _, _, armed in armed_guards])
+        return jnp.append(values, disarmed), jnp.append(disarmed, values)
+
     guards_and_margins = GuardsAndMargins(
         lambda y: jnp.append(mode.guard_values(y) + guard_offset, evaluate_margins(y)),
         len(mode.guards),

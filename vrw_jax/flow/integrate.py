@@ -7,7 +7,6 @@ depends on the other elements.
 """
 
 import functools
-import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -552,11 +551,10 @@ def _try_solver_step(
     if phase.evaluate_armed_guards is not None:
         stages = (stage_states[i] for i in (0, *tableau.guard_stage_indices, -1))
         armed_guards = lax.stop_gradient([phase.evaluate_armed_guards(stage) for stage in stages])
-        # Value and minus `armed` take both roles in turn.
-        for values, others in itertools.permutations(map(list, zip(*armed_guards, strict=True))):
-            guard_minimum_fraction = jnp.minimum(
-                guard_minimum_fraction, find_hidden_event_fraction(tableau, values, others)
-            )
+        values, others = map(list, zip(*armed_guards, strict=True))
+        guard_minimum_fraction = jnp.minimum(
+            guard_minimum_fraction, find_hidden_event_fraction(tableau, values, others)
+        )
     is_within_tolerance = mean_squared_error <= 1.0
     # A step inside which a guard may be negative is repeated up to the guard's minimum.
     may_cross_inside = (

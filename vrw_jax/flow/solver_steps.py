@@ -468,7 +468,10 @@ class BatchPhase(NamedTuple):
     guard_scales: Array | None = None
     """Magnitudes of the guards' terms if events are exact, see `phase_integration`."""
     evaluate_armed_guards: Callable[[StageState], tuple[Array, Array]] | None = None
-    """Function that returns values and minus `armed` of the guards that have it."""
+    """Function for guards with `armed`, the maximum of two functions: value and minus `armed`.
+
+    It returns these functions of all guards, and for each of them the other one.
+    """
     guards_met_at_start: Array | None = None
     """Whether each guard ends the phase at its start; by default, its value and rate decide."""
     evaluate_kinks: Callable[[StageState], Vector] | None = None

@@ -18,7 +18,7 @@ import functools
 import math
 import operator
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -512,10 +512,12 @@ def multifidelity_mean(
             f"a mean needs {MIN_PILOT_GAITS}: give other wheels, or a larger pilot."
         )
     pilot_values, n_mean_steps = _zero_missing(pilot_results), np.mean(pilot_results.n_steps)
-    plan_sampling = lambda name: _plan_sampling(
-        *pilot_values, evaluate_control(pilot_wheels, name), tol, len(other_wheels)
-    )
-    plans = _list_sampling_plans(plan_sampling, float(n_mean_steps), len(other_wheels))
+    plans = []
+    for name, cost in CONTROL_VARIATES.items():
+        regressors = evaluate_control(pilot_wheels, name)
+        n_drawn, weights = _plan_sampling(*pilot_values, regressors, tol, len(other_wheels))
+        total_cost = n_drawn * float(n_mean_steps) + cost * len(other_wheels)
+        plans.append((total_cost, n_drawn, weights, name))
     _, n_drawn, weights, control = min(plans, key=operator.itemgetter(0))
     drawn_results = measure_wheels(other_wheels[:n_drawn])
     regressors, results = evaluate_control(other_wheels, control), (pilot_results, drawn_results)
@@ -584,23 +586,6 @@ def _evaluate_control(
 # Fraction of the largest singular value below which a singular value of the control columns is
 # treated as zero.
 SINGULAR_VALUE_TOLERANCE = 1e-12
-
-
-def _list_sampling_plans(
-    plan_with_control: Callable[[str], tuple[int, np.ndarray]],
-    n_mean_steps: float,
-    n_remaining: int,
-) -> list[tuple[float, int, np.ndarray, str]]:
-    """Return a plan for each control variate, to select the cheapest.
-
-    A plan contains its cost in steps with contact, the number of the remaining wheels that are
-    computed with contact, the weights of the control variate, and its name.
-    """
-    plans = []
-    for name, cost in CONTROL_VARIATES.items():
-        n_drawn, weights = plan_with_control(name)
-        plans.append((n_drawn * n_mean_steps + cost * n_remaining, n_drawn, weights, name))
-    return plans
 
 
 def _plan_sampling(
